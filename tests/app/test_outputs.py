@@ -43,6 +43,8 @@ FOLDER_WRITERS = {
     "export": (".", "--to", "csv"),
     "batch": ("measure", "f.yml"),
     "budget": ("arm.toml",),
+    "hub": ("--listen", "nonsense"),
+    "hub keys": ("my lab",),
 }
 SUFFIXES = {
     "arm show": ".png",

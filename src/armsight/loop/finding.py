@@ -65,6 +65,11 @@ class HealthFinding:
     pose_sigma_mm: float | None = None
 
     @property
+    def subject(self) -> tuple[str, str]:
+        """What it is about: its cause, and its words before it says by how much."""
+        return self.cause, self.what.partition(" by ")[0]
+
+    @property
     def forbids(self) -> bool:
         """Whether results must not be trusted because of it: not where it displaces them by less than is known of them."""
         return self.cost_mm is None or self.cost_mm > max(1e3 * COSTS_M, self.pose_sigma_mm or 0.0)

@@ -6,11 +6,12 @@ import subprocess
 import sys
 import urllib.error
 import urllib.request
+from datetime import datetime, timedelta
 
 import numpy as np
 import pytest
 
-from armsight.app.hub.keys import make_keys
+from armsight.app.hub.keys import make_keys, sign_hold
 from armsight.app.hub.router import hold
 from armsight.app.hub.service import Hub
 from armsight.app.stream.cell import open_cell, tilt_and_size
@@ -96,7 +97,7 @@ def test_events_arrive_once_although_the_hub_is_killed(hub_at, cell_at, port, tm
         hub = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, env=os.environ)
         assert hub.stdout.readline() == "up\n"
         cell.put(NoteDatum(0.0, f"before {killed}", "warning"))
-        wait(lambda: not cell._outbox.waiting(9))
+        wait(lambda: not cell._outbox.waiting(999))
         hub.kill()
         hub.communicate()
         cell.put(NoteDatum(0.0, f"while it is gone {killed}", "warning"))
@@ -123,7 +124,7 @@ def test_a_killed_cell_is_lost_and_one_that_ends_is_not(hub_at, port, tmp_path, 
 
 def test_one_name_is_one_process(cell_at, port, hub_at, wait, monkeypatch, tmp_path):
     cell_at(f"a@127.0.0.1:{port}")
-    with pytest.raises(InputError, match="another process on this computer is this cell"):
+    with pytest.raises(InputError, match="another command of this cell runs"):
         cell_at(f"a@127.0.0.1:{port}")
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "another computer"))
     cell_at(f"a@127.0.0.1:{port}")
@@ -149,7 +150,7 @@ def test_a_cell_writes_below_its_own_name_alone(hub_at, cell_at, port, tmp_path,
     assert {each["cell"] for each in hub._store.events()} == {"a"}
 
 
-def test_a_cell_holds_for_the_key_of_its_site_alone(hub_at, cell_at, port, tmp_path, wait):
+def test_a_cell_holds_for_the_key_of_its_site_alone(hub_at, cell_at, port, tmp_path, wait, monkeypatch):
     keys = tmp_path / "keys"
     make_keys(keys, "lab", ["arm", "shy"], "127.0.0.1", port)
     hub, held = hub_at(port, keys), []
@@ -165,6 +166,19 @@ def test_a_cell_holds_for_the_key_of_its_site_alone(hub_at, cell_at, port, tmp_p
     with pytest.raises(InputError, match="no cell of site lab"):
         hold(keys, "nobody", "", f"127.0.0.1:{port}")
     assert len(held) == 1
+    again = sign_hold(keys, "arm", "again")
+    assert hub._router.ask("lab", "arm", "hold", again) == b"held"
+    assert hub._router.ask("lab", "arm", "hold", again) == b"rejected: it was done before"
+
+    class Earlier(datetime):
+        @classmethod
+        def now(cls, tz=None):
+            return datetime.now(tz) - timedelta(seconds=90)
+
+    monkeypatch.setattr("armsight.app.hub.keys.datetime", Earlier)
+    monkeypatch.setattr("armsight.app.hub.keys._check_valid", lambda path: None)
+    assert b"it is old" in hub._router.ask("lab", "arm", "hold", sign_hold(keys, "arm", "old"))
+    assert len(held) == 2
 
 
 def test_an_address_beyond_this_computer_needs_keys(tmp_path):

@@ -11,14 +11,14 @@ import math
 import re
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from datetime import date
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.special import stdtr
-from scipy.stats import binomtest, theilslopes
+from scipy.stats import kendalltau, theilslopes
 
 from armsight.app.batch.run import RECORDINGS, SHOTS
 from armsight.data import Array
@@ -69,9 +69,14 @@ class CellRow:
     chance_trend: float | None
 
     @property
+    def least(self) -> float:
+        """The smaller chance of the two."""
+        return min((each for each in (self.chance, self.chance_trend) if each is not None), default=1.0)
+
+    @property
     def named(self) -> bool:
         """Whether somebody should look."""
-        return min(self.chance or 1.0, self.chance_trend or 1.0) < CHANCE
+        return self.least < CHANCE
 
 
 @dataclass(frozen=True)
@@ -98,14 +103,9 @@ def report(folder: Path) -> list[CellRow]:
             f"{folder}: no recording lies as SITE/DAY/CELL/RUN, as armsight hub push has it: nothing to compare"
         )
     rows = [row for metric in sorted({name for run in runs for name in run.values}) for row in _compared(runs, metric)]
-    different, trends = _holm([row.chance for row in rows]), _holm([row.chance_trend for row in rows])
-    rows = [
-        CellRow(**{**asdict(row), "chance": a, "chance_trend": b})
-        for row, a, b in zip(rows, different, trends, strict=True)
-    ]
-    return sorted(
-        rows, key=lambda row: (not row.named, min(row.chance or 1.0, row.chance_trend or 1.0), row.metric, row.cell)
-    )
+    chances = _holm([*(row.chance for row in rows), *(row.chance_trend for row in rows)])
+    rows = [replace(row, chance=chances[n], chance_trend=chances[n + len(rows)]) for n, row in enumerate(rows)]
+    return sorted(rows, key=lambda row: (not row.named, row.least, row.metric, row.cell))
 
 
 def _runs(folder: Path) -> Iterator[_PushedRun]:
@@ -160,42 +160,42 @@ def _compared(runs: Sequence[_PushedRun], metric: str) -> Iterator[CellRow]:
         if metric in run.values:
             cells[run.site, run.cell].append(run)
     medians = {key: float(np.median([run.values[metric] for run in own])) for key, own in cells.items()}
+    if metric == MISSED:  # of all shots together
+        medians = {key: sum(r.missed for r in own) / sum(r.shots for r in own) for key, own in cells.items()}
     for (site, cell), own in sorted(cells.items()):
         others = [key for key in medians if key[0] == site and key[1] != cell]
+        values, least = np.array([medians[site, cell], *(medians[key] for key in others)]), 0.0
+        if metric == MISSED:  # an angle whose scatter by chance alone does not depend on the share (Anscombe)
+            values, least = np.arcsin(np.sqrt(values)), 0.5 / math.sqrt(sum(run.shots for run in own))
+        chance = _chance(float(values[0]), values[1:], least) if len(others) >= _CELLS - 1 else None
         siblings = float(np.median([medians[key] for key in others])) if others else None
-        chance = None
-        if len(others) >= _CELLS - 1:
-            if metric == MISSED:
-                chance = _chance_of_share(own, [run for key in others for run in cells[key]])
-            else:
-                chance = _chance(medians[site, cell], np.array([medians[key] for key in others]))
         slope, chance_trend = _trend(own, metric)
         yield CellRow(site, cell, metric, len(own), medians[site, cell], siblings, chance, slope, chance_trend)
 
 
-def _chance(value: float, others: Array) -> float | None:
-    """Return how probable a value as far off others is: Student's, with their median and their median deviation."""
+def _chance(value: float, others: Array, least: float) -> float | None:
+    """Return how probable a value as far off others is: Student's, with their median and their median deviation.
+
+    Args:
+        value: of one cell.
+        others: (N,) of its siblings.
+        least: sigma of the value by itself: the spread is no smaller.
+    """
     middle = float(np.median(others))
-    spread = float(np.median(np.abs(others - middle))) / 0.6745  # of a normal variable: its sigma
+    spread = max(float(np.median(np.abs(others - middle))) / 0.6745, least)  # of a normal variable: its sigma
     if not spread > 0.0:
         return None
     freedom = max(0.37 * len(others), 1.0)  # efficiency of the median deviation for normal variables
     return float(2.0 * stdtr(freedom, -abs(value - middle) / (spread * math.sqrt(1.0 + math.pi / (2 * len(others))))))
 
 
-def _chance_of_share(own: Sequence[_PushedRun], others: Sequence[_PushedRun]) -> float | None:
-    """Return the chance of a sign test: as many runs that miss more than the median run of the others does."""
-    middle = float(np.median([run.missed / max(run.shots, 1) for run in others]))
-    off = [run.missed / max(run.shots, 1) - middle for run in own if run.missed / max(run.shots, 1) != middle]
-    return float(binomtest(sum(each > 0 for each in off), len(off)).pvalue) if off else None
-
-
 def _trend(own: Sequence[_PushedRun], metric: str) -> tuple[float | None, float | None]:
-    """Return a number's change a day, by the median of slopes, and its chance by Kendall's tau."""
-    from scipy.stats import kendalltau
-
-    day, value = np.array([run.day for run in own], float), np.array([run.values[metric] for run in own])
-    if len(set(day)) < _DAYS or not np.ptp(value) > 0.0:
+    """Return a number's change a day, by the median of slopes of the days' medians, and its chance by Kendall's tau."""
+    days: dict[int, list[float]] = defaultdict(list)
+    for run in own:
+        days[run.day].append(run.values[metric])
+    day, value = np.array(sorted(days), float), np.array([float(np.median(days[each])) for each in sorted(days)])
+    if len(day) < _DAYS or not np.ptp(value) > 0.0:
         return None, None
     return float(theilslopes(value, day)[0]), float(kendalltau(day, value).pvalue)
 

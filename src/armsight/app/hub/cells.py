@@ -22,6 +22,10 @@ _BAR_S, _BARS = 300.0, 288
 #: sigmas of a slope that count as much as an error at its limit, in the order of cells that are well; half: slopes
 #: first, double: errors first.
 _STEEP = 4.0
+#: s after which a cell that is gone is not shown; half: a cell of a holiday is missing, double: dismantled ones stay.
+_FORGOTTEN_S = 14 * 86400.0
+#: s for which a message that cannot be read is worth a look; half: missed by who looks away, double: long past.
+_REJECTED_S = 60.0
 #: s by which a cell's clock may differ from the hub's; half: a slow network is called a clock, double: times are
 #: compared wrongly.
 _CLOCK_S = 2.0
@@ -41,6 +45,17 @@ _CLOCK = "clock_s"
 ENDED, WELL, LOOK, DRIFTING, FINDING, LOST = range(-1, 5)
 
 
+def number(value: object) -> float | None:
+    """Return a number of JSON; None where it is none, or not finite."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    try:
+        found = float(value)
+    except OverflowError:
+        return None
+    return found if math.isfinite(found) else None
+
+
 @dataclass
 class CellView:
     """One cell as the hub knows it."""
@@ -53,9 +68,10 @@ class CellView:
     state_s: float = 0.0  # arrival of the newest state, by the hub's clock
     alive_s: float = 0.0  # since when it is connected
     lost_s: float | None = None  # since when it is not; None while it is
+    asked_s: float = -math.inf  # when it was asked who it is
     ended: bool = True  # whether its command said that it ends
     offset_s: float = math.nan  # its clock less the hub's
-    rejected: int = 0
+    rejected_s: float = -math.inf  # when the newest message that could not be read came
     why_rejected: str = ""
     slopes: dict[str, Slopes] = field(default_factory=lambda: {key: Slopes() for key in (*DRIFTS, _CLOCK)})
     drifts: dict[str, Drift] = field(default_factory=dict)
@@ -65,7 +81,10 @@ class CellView:
     def token(self, session: str, came: bool, at_s: float) -> None:
         """Take that a process of this cell connected, or is gone."""
         if came:
-            self.alive_s = at_s if not self.sessions else self.alive_s
+            if not self.sessions:  # another command, perhaps another rig: not to be compared with what was before
+                self.alive_s, self.drifts = at_s, {}
+                for each in self.slopes.values():
+                    each.begin_anew()
             self.sessions.add(session)
             self.lost_s, self.ended = None, False
             self.state_s = max(self.state_s, at_s)
@@ -76,15 +95,13 @@ class CellView:
 
     def take(self, state: Any, at_s: float) -> dict[str, Any] | None:  # noqa: ANN401 - whatever JSON holds
         """Take a state; return the row to be stored, None where it is none."""
-        if not isinstance(state, dict) or not isinstance(state.get("t"), int | float) or not math.isfinite(state["t"]):
-            self.reject(state if isinstance(state, str) else "a state without a time t")
+        if not isinstance(state, dict) or (t := number(state.get("t"))) is None:
+            self.rejected_s = at_s
+            self.why_rejected = state if isinstance(state, str) else "a state without a time t"
             return None
         self.state_s = at_s
-        row: dict[str, Any] = {"t": float(state["t"]), "arrived": at_s, "mode": str(state.get("mode", ""))[:20]}
-        for key in NUMBERS:
-            value = state.get(key)
-            known = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-            row[key] = float(value) if known else None  # type: ignore[arg-type]
+        row: dict[str, Any] = {"t": t, "arrived": at_s, "mode": str(state.get("mode", ""))[:20]}
+        row |= {key: number(state.get(key)) for key in NUMBERS}
         health = state.get("health")
         row["health"] = [str(each)[:300] for each in health[:5]] if isinstance(health, list) else []
         self.state, self.offset_s = row, row["t"] - at_s
@@ -95,11 +112,6 @@ class CellView:
                 del self.day[min(self.day)]
         self._add(row, at_s)
         return row
-
-    def reject(self, why: str) -> None:
-        """Count a message that could not be read."""
-        self.rejected += 1
-        self.why_rejected = why
 
     def _add(self, row: dict[str, Any], at_s: float) -> None:
         """Add a state to the newest block; the mean of a complete one is kept."""
@@ -122,7 +134,7 @@ class CellView:
                 now_s - (self.lost_s or now_s),
                 "lost: the connection closed, and its command did not say that it ends",
             )
-        if (silent := now_s - self.state_s) > _SILENT_S:
+        if (silent := abs(now_s - self.state_s)) > _SILENT_S:  # where the hub's clock was set, until the next state
             return LOST, silent, f"silent for {silent:.0f} s although connected: frozen, or the network is cut"
         state = self.state
         if state.get("health"):
@@ -132,12 +144,12 @@ class CellView:
             chance, key, found = min(significant)
             unit, text = DRIFTS[key]
             return DRIFTING, -math.log(chance), f"{text}: {found.per_h:+.3g} ± {found.sigma_per_h:.2g} {unit}/h"
-        odd, limit = self._odd(), self.about.get("limit_mm") or math.inf
+        odd, limit = self._odd(now_s), self.about.get("limit_mm") or math.inf
         sigmas = [abs(each.per_h) / each.sigma_per_h for each in self.drifts.values() if each.sigma_per_h > 0.0]
         size = max(max(sigmas, default=0.0) / _STEEP, (state.get("error_mm") or 0.0) / limit)
         return LOOK if odd else WELL, size, odd
 
-    def _odd(self) -> str:
+    def _odd(self, now_s: float) -> str:
         """Return what is worth a look and forbids nothing."""
         state, limit = self.state, self.about.get("limit_mm")
         error, missed = state.get("error_mm"), state.get("missed")
@@ -149,8 +161,8 @@ class CellView:
             return f"error {error:.2f} mm, more than its limit of {limit:.2f}"
         if missed is not None and missed > _MISSED:
             return f"{100 * missed:.0f} % of the shots miss the body"
-        if self.rejected:
-            return f"{self.rejected} messages could not be read: {self.why_rejected}"
+        if now_s - self.rejected_s < _REJECTED_S:
+            return f"a message could not be read: {self.why_rejected}"
         return ""
 
     def to_json(self, now_s: float) -> dict[str, Any]:
@@ -170,20 +182,23 @@ class CellView:
             "alive_s": round(now_s - self.alive_s) if self.sessions else None,
             "state_age_s": round(now_s - self.state_s, 1) if self.state_s else None,
             "clock_s": None if math.isnan(self.offset_s) else round(self.offset_s, 3),
-            "clock_s_per_h": self.slopes[_CLOCK].per_h(),
+            "clock_s_per_h": self.slopes[_CLOCK].per_h(now_s, self.slopes[_CLOCK].count(now_s)),
             "day": [[bar - first, round(error, 4)] for bar, error in sorted(self.day.items()) if bar >= first],
         }
 
 
-def look_for_drifts(cells: Mapping[tuple[str, str], CellView]) -> None:
+def look_for_drifts(cells: Mapping[tuple[str, str], CellView], now_s: float) -> None:
     """Compare the slopes of cells that are connected; to be called once a minute."""
     alive = {f"{each.site}/{each.name}": each for each in cells.values() if each.sessions}
     for key in DRIFTS:
-        for name, found in drifts({name: each.slopes[key] for name, each in alive.items()}).items():
-            alive[name].drifts[key] = found
+        found = drifts({name: each.slopes[key] for name, each in alive.items()}, now_s)
+        for name, each in alive.items():
+            each.drifts = {k: d for k, d in each.drifts.items() if k != key} | (
+                {key: found[name]} if name in found else {}
+            )
 
 
 def ranked(cells: list[CellView], now_s: float) -> list[dict[str, Any]]:
     """Return the cells as the page shows them, first the one that somebody should look at first."""
-    shown = [each.to_json(now_s) for each in cells]
+    shown = [each.to_json(now_s) for each in cells if each.lost_s is None or now_s - each.lost_s < _FORGOTTEN_S]
     return sorted(shown, key=lambda cell: (-cell["level"], -cell["size"], cell["site"], cell["name"]))

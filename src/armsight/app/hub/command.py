@@ -46,8 +46,10 @@ def command(ctx: click.Context, listen: str, http: str, keys: Path | None, outpu
     from armsight.app.hub.service import Hub
     from armsight.app.show.messages import require
     from armsight.app.stream.cell_file import endpoint
+    from armsight.files import check_folder
 
     require("a hub", "cells", "zenoh", "pyarrow")
+    check_folder(output, problem="no hub can be kept here")
     hub = Hub(output, endpoint(listen, "--listen"), http, keys, lambda line: click.echo(f"note: {line}", err=True))
     try:
         if as_json:
@@ -73,8 +75,9 @@ def keys_command(site: str, cells: tuple[str, ...], output: Path, host: str, por
     secret: who has it can make cells, and ask cells to hold.
     """
     from armsight.app.hub.keys import make_keys
+    from armsight.files import check_folder
 
-    made = make_keys(output, site, cells, host, port)
+    made = make_keys(check_folder(output, problem="no keys can be made here"), site, cells, host, port)
     if as_json:
         click.echo(json.dumps({"directory": str(output), "cells": [str(each) for each in made]}))
         return

@@ -45,7 +45,7 @@ class Drift:
 
 @dataclass
 class Slopes:
-    """The recent means of one number, their slope, and earlier slopes."""
+    """The recent means of one number, and the slopes of earlier windows."""
 
     blocks: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=BLOCKS))
     past: deque[float] = field(default_factory=lambda: deque(maxlen=144))  # of a day, of windows that do not overlap
@@ -55,32 +55,46 @@ class Slopes:
         """Take the mean of a block at its time, s."""
         self.blocks.append((t_s, mean))
         self._number += 1
-        if self._number % BLOCKS == 0 and (slope := self.per_h()) is not None:
+        if self._number % BLOCKS == 0 and (slope := self.per_h(t_s, BLOCKS)) is not None:
             self.past.append(slope)
 
-    def per_h(self) -> float | None:
-        """Return the slope of a line through the blocks, an hour; None where they are too few."""
-        if len(self.blocks) < _LEAST:
+    def begin_anew(self) -> None:
+        """Forget the window: what follows is not to be compared with it."""
+        self.blocks.clear()
+        self._number = 0
+
+    def count(self, now_s: float) -> int:
+        """Return how many blocks of the last window there are."""
+        return sum(now_s - t < BLOCKS * BLOCK_S for t, _ in self.blocks)
+
+    def per_h(self, now_s: float, count: int) -> float | None:
+        """Return the slope of a line through the newest ``count`` blocks, an hour; None where they are too few."""
+        if count < _LEAST or self.count(now_s) < count:
             return None
-        t, mean = np.array(self.blocks).T
+        t, mean = np.array(self.blocks)[-count:].T
         t = (t - t.mean()) / 3600.0
         return float(t @ mean / (t @ t))
 
 
-def drifts(cells: Mapping[str, Slopes]) -> dict[str, Drift]:
-    """Compare the slopes of one number of all cells.
+def drifts(cells: Mapping[str, Slopes], now_s: float) -> dict[str, Drift]:
+    """Compare the slopes of one number of all cells, each with those of as many blocks.
 
     Args:
         cells: name -> its means.
+        now_s: the time now, s.
 
     Returns:
         Name -> its drift; those of too few means are left out.
     """
-    now = {name: slope for name, each in cells.items() if (slope := each.per_h()) is not None}
-    return {
-        name: _against(slope, cells[name].past, [other for each, other in now.items() if each != name])
-        for name, slope in now.items()
-    }
+    found: dict[str, Drift] = {}
+    counts = {name: each.count(now_s) for name, each in cells.items()}
+    for count in sorted(set(counts.values())):
+        slopes = {name: each.per_h(now_s, count) for name, each in cells.items()}
+        for name, slope in slopes.items():
+            if slope is not None and counts[name] == count:
+                siblings = [other for each, other in slopes.items() if each != name and other is not None]
+                found[name] = _against(slope, siblings, list(cells[name].past) if count == BLOCKS else [])
+    return found
 
 
 def _against(slope: float, *sources: Sequence[float]) -> Drift:

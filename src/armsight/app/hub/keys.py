@@ -57,13 +57,13 @@ def make_keys(folder: Path, site: str, cells: Sequence[str], host: str, port: in
         at = folder / _CELLS / name
         if _ensure(at / "cell", authority, f"{site}.{name}", []):
             write_text(at / "ca.pem", (folder / "ca.pem").read_text())
-            named = [("name", name), ("site", site), ("router", f"tls/{host}:{port}"), ("ca", "ca.pem")]
-            named += [("certificate", "cell.pem"), ("key", "cell.key")]
-            lines = [f"{key} = {json.dumps(value)}" for key, value in named]
-            write_text(
-                at / "cell.toml",
-                "\n".join([*lines, "holds = false  # true: the hub may ask this cell to hold its arm"]) + "\n",
-            )
+            router = f"tls/[{host}]:{port}" if ":" in host else f"tls/{host}:{port}"
+            named = {"name": name, "site": site, "router": router}
+            named |= {"ca": "ca.pem", "certificate": "cell.pem", "key": "cell.key"}
+            lines = [f"{key} = {json.dumps(value)}" for key, value in named.items()]
+            if not (at / "cell.toml").exists():  # what its owner changed in it stays
+                last = "holds = false  # true: the hub may ask this cell to hold its arm"
+                write_text(at / "cell.toml", "\n".join([*lines, last]) + "\n")
             made.append(at / "cell.toml")
     return made
 
@@ -121,8 +121,11 @@ def _ensure(
     from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
     pem = path.with_suffix(".pem")
-    if pem.exists() and not _ends_soon(_certificate(pem)) and set(hosts) <= _hosts(_certificate(pem)):
-        return False
+    if pem.exists() and path.with_suffix(".key").exists():
+        found = _certificate(pem)
+        if not _ends_soon(found) and set(hosts) <= _hosts(found):
+            return False
+        hosts = sorted({*hosts, *_hosts(found)} if hosts else ())
     path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
     key = ec.generate_private_key(ec.SECP256R1())
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
@@ -138,10 +141,11 @@ def _ensure(
         .add_extension(x509.BasicConstraints(ca=own, path_length=0 if own else None), critical=True)
     )
     if not own:
-        uses = [ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]
+        uses = [ExtendedKeyUsageOID.CLIENT_AUTH, *([ExtendedKeyUsageOID.SERVER_AUTH] if hosts else [])]
         builder = builder.add_extension(x509.ExtendedKeyUsage(uses), critical=False)
-        names = x509.SubjectAlternativeName([_alternative(each) for each in hosts or [name]])
-        builder = builder.add_extension(names, critical=False)
+        if hosts:
+            names = x509.SubjectAlternativeName([_alternative(each) for each in hosts])
+            builder = builder.add_extension(names, critical=False)
     certificate = builder.sign(key if authority is None else authority[1], hashes.SHA256())
     pkcs8 = serialization.PrivateFormat.PKCS8
     private = key.private_bytes(serialization.Encoding.PEM, pkcs8, serialization.NoEncryption())

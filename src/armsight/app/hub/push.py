@@ -62,7 +62,7 @@ def push(cell: Cell, folder: Path, store: str, rate_mb_s: float, advance: Callab
         fs, root = fsspec.core.url_to_fs(store)
         done, pace = Pushed(), _Pace(rate_mb_s, advance)
         for run in runs:
-            day = datetime.fromtimestamp(run.stat().st_mtime, UTC)
+            day = datetime.fromtimestamp(min(each.stat().st_mtime for each in _files(run)), UTC)
             _push_run(fs, f"{root}/{cell.site}/{day:%Y-%m-%d}/{cell.name}/{run.name}", run, done, pace)
         return done
     except (ImportError, ValueError) as error:
@@ -90,7 +90,7 @@ class _Pace:
 
 
 def _push_run(fs: Any, at: str, run: Path, done: Pushed, pace: _Pace) -> None:  # noqa: ANN401 - of fsspec
-    files = sorted(path for path in run.rglob("*") if path.is_file() and not path.is_symlink())
+    files = _files(run)
     manifest = {path.relative_to(run).as_posix(): _digest(path) for path in files}
     expected = json.dumps({"files": manifest}, indent=1).encode()
     if fs.exists(f"{at}/{_MANIFEST}") and fs.cat_file(f"{at}/{_MANIFEST}") == expected:
@@ -109,6 +109,10 @@ def _push_run(fs: Any, at: str, run: Path, done: Pushed, pace: _Pace) -> None:  
             done.sent_bytes += size
     fs.pipe_file(f"{at}/{_MANIFEST}", expected)
     done.runs += 1
+
+
+def _files(run: Path) -> list[Path]:
+    return sorted(path for path in run.rglob("*") if path.is_file() and not path.is_symlink())
 
 
 def _digest(path: Path) -> dict[str, Any]:

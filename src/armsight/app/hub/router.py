@@ -77,7 +77,7 @@ class Router:
         """Ask a cell for something, and return its answer; empty where it does not answer."""
         with suppress(Exception):  # of the library: a cell that is gone
             for reply in self._session.get(f"armsight/{site}/{cell}/{what}", payload=payload, timeout=_ANSWER_S):
-                if reply.ok is not None:
+                if reply.ok is not None and len(reply.ok.payload) < _LONGEST:
                     return bytes(reply.ok.payload.to_bytes())
         return b""
 
@@ -107,7 +107,7 @@ def _json(payload: Any) -> Any:  # noqa: ANN401 - whatever JSON holds
         return f"a message of {len(data)} bytes: at most {_LONGEST} are read"
     try:
         return json.loads(data)
-    except ValueError:
+    except (ValueError, RecursionError):
         return "a message that is no JSON"
 
 

@@ -13,7 +13,7 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
-from armsight.app.hub.cells import CellView, look_for_drifts, ranked
+from armsight.app.hub.cells import CellView, look_for_drifts, number, ranked
 from armsight.app.hub.router import Heard, Router
 from armsight.app.hub.store import FLUSH_S, Store
 from armsight.app.show.http import Answer, Pages, metrics_text
@@ -37,12 +37,10 @@ METRICS = {
     "hub_events_total": ("counter", "events stored"),
     "hub_dropped_total": ("counter", "states dropped because too many waited"),
 }
-#: What a cell says of itself, and of which kind it is.
-_ABOUT: dict[str, tuple[type, ...]] = {
-    **dict.fromkeys(("armsight", "host", "mode", "arm", "body", "rig_made_utc"), (str,)),
-    **dict.fromkeys(("rig_heldout_mm", "limit_mm"), (int, float)),
-    "holds": (bool,),
-}
+#: s after which a cell that did not say who it is is asked again; half: nothing, double: its limit is missing longer.
+_ASK_AGAIN_S = 10.0
+#: Texts that a cell says of itself.
+_TEXTS = ("armsight", "host", "mode", "arm", "body", "rig_made_utc")
 _OF_STATE = {
     "cell_error_millimetres": "error_mm",
     "cell_sigma_millimetres": "sigma_mm",
@@ -67,7 +65,7 @@ class Hub:
 
     def __init__(self, folder: Path, listen: str, http: str, keys: Path | None, say: Callable[[str], None]) -> None:
         self._say, self._cells = say, dict[tuple[str, str], CellView]()
-        self._heard: queue.Queue[Heard] = queue.Queue(_WAITING)
+        self._heard: queue.Queue[Heard] = queue.Queue()
         self._dropped, self._problem = 0, ""
         self._lock = threading.Lock()  # of the cells
         self._cached: tuple[float, bytes] = (0.0, b"")
@@ -96,10 +94,10 @@ class Hub:
         self._store.close()
 
     def _hear(self, heard: Heard) -> None:
-        try:
-            self._heard.put_nowait(heard)
-        except queue.Full:
+        if heard[2] == "state" and self._heard.qsize() > _WAITING:  # another follows in a second; of tokens none does
             self._dropped += 1
+        else:
+            self._heard.put(heard)
 
     def _stored(self, site: str, cell: str, message: Any) -> int:  # noqa: ANN401 - whatever JSON holds
         """Store events; called in a thread of the router."""
@@ -114,11 +112,15 @@ class Hub:
         flushed = looked = time.monotonic()
         while not (self._ended.is_set() and self._heard.empty()):
             with suppress(queue.Empty):
-                self._take(self._heard.get(timeout=0.2))
+                heard = self._heard.get(timeout=0.2)
+                try:
+                    self._take(heard)
+                except Exception as error:  # noqa: BLE001 - one message must not end the hub
+                    self._say(f"a message of {heard[0]}/{heard[1]} was not taken: {type(error).__name__}: {error}")
             if time.monotonic() - looked > _LOOK_S:
                 looked = time.monotonic()
                 with self._lock:
-                    look_for_drifts(self._cells)
+                    look_for_drifts(self._cells, time.time())
             if time.monotonic() - flushed > FLUSH_S:
                 flushed = time.monotonic()
                 self._store.flush()
@@ -137,20 +139,32 @@ class Hub:
                 session, came = content
                 cell.token(session, came, at_s)
                 if came:
-                    self._asking.submit(self._ask_about, cell)
+                    self._ask(cell, at_s)
             elif what == "ended":
                 cell.ended = len(cell.sessions) < 2
-            elif what == "state" and (row := cell.take(content, at_s)) is not None:
-                self._store.add_state(cell, row)
+            elif what == "state":
+                before_s = cell.state_s
+                row = cell.take(content, at_s)
+                if row is not None and at_s - before_s > _STATE_S:
+                    self._store.add_state(cell, row)
+                if not cell.about and at_s - cell.asked_s > _ASK_AGAIN_S:
+                    self._ask(cell, at_s)
+
+    def _ask(self, cell: CellView, at_s: float) -> None:
+        """Ask a cell who it is, beside the others."""
+        cell.asked_s = at_s
+        self._asking.submit(self._ask_about, cell)
 
     def _ask_about(self, cell: CellView) -> None:
         """Ask a cell that has connected who it is."""
         try:
             about = json.loads(self._router.ask(cell.site, cell.name, "about") or b"{}")
-        except ValueError:
+        except (ValueError, RecursionError):
             return
         if isinstance(about, dict) and about:
-            cell.about = {key: about[key] for key, kinds in _ABOUT.items() if isinstance(about.get(key), kinds)}
+            texts = {key: about[key][:200] for key in _TEXTS if isinstance(about.get(key), str)}
+            numbers = {key: number(about.get(key)) for key in ("rig_heldout_mm", "limit_mm")}
+            cell.about = {**texts, **numbers, "holds": about.get("holds") is True}
             self._store.keep_about(cell)
 
     def snapshot(self) -> dict[str, Any]:
@@ -196,9 +210,8 @@ class Hub:
             labels = f'{{site="{cell["site"]}",cell="{cell["name"]}"}}'
             rows["cell_up"][labels] = float(0 <= cell["level"] < 4)
             rows["cell_need"][labels] = cell["level"]
-            values = {name: cell["state"].get(key) for name, key in _OF_STATE.items()} | {
-                "cell_clock_seconds": cell["clock_s"]
-            }
+            values = {name: cell["state"].get(key) for name, key in _OF_STATE.items()}
+            values |= {"cell_clock_seconds": cell["clock_s"]}
             for name, value in values.items():
                 if value is not None:
                     rows[name][labels] = value

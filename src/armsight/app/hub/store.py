@@ -6,21 +6,27 @@ by DuckDB in one line (docs/howto/cells.md).
 
 from __future__ import annotations
 
+import fcntl
 import json
 import sqlite3
 import threading
+import time
 from collections import defaultdict
-from contextlib import suppress
+from contextlib import ExitStack, closing, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from armsight.app.hub.cells import NUMBERS, CellView
+from armsight.app.hub.cells import NUMBERS, CellView, number
 from armsight.errors import InputError
 from armsight.files import replacing
 
 #: s between two files of states of a cell; half: twice as many files, double: a crash loses twice as much history.
 FLUSH_S = 600.0
+#: s that a search may take; half: fewer old events are found, double: a tab costs twice.
+_SEARCH_S = 1.0
+#: Largest number of an event; half: nothing, double: more than the database holds.
+_MOST_N = 2.0**53
 #: events of a search at most; half: scroll less, double: a larger page.
 _FOUND = 200
 _TABLES = (
@@ -45,28 +51,35 @@ class Store:
         self._folder, self._lock = folder, threading.Lock()
         self._rows: dict[str, list[dict[str, Any]]] = defaultdict(list)
         self.problem = ""
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            self._db = sqlite3.connect(folder / "events.sqlite", timeout=0.2, check_same_thread=False)
-            self._db.execute("PRAGMA locking_mode = EXCLUSIVE")
-            for table in _TABLES:
-                self._db.execute(table)
-            self._db.execute("DELETE FROM cells WHERE site IS NULL")  # a write: it takes the lock
-            self._db.commit()
-        except (sqlite3.Error, OSError) as error:
-            why = "another hub uses it" if "locked" in str(error) else str(error)
-            raise InputError(f"{folder}: nothing can be kept here: {why}") from None
+        with ExitStack() as opened:
+            try:
+                folder.mkdir(parents=True, exist_ok=True)
+                alone = opened.enter_context((folder / "hub.lock").open("w"))
+                fcntl.flock(alone, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                self._db = sqlite3.connect(folder / "events.sqlite", timeout=5.0, check_same_thread=False)
+                opened.callback(self._db.close)
+                self._db.execute("PRAGMA journal_mode = WAL")  # who reads does not wait, other programs too
+                for table in _TABLES:
+                    self._db.execute(table)
+                self._db.commit()
+            except (sqlite3.Error, OSError) as error:
+                why = "another hub uses it" if isinstance(error, BlockingIOError) else str(error)
+                raise InputError(f"{folder}: nothing can be kept here: {why}") from None
+            self._opened = opened.pop_all()
 
     def add_events(self, site: str, cell: str, message: Any, arrived_s: float) -> int:  # noqa: ANN401 - whatever JSON holds
         """Store events of a cell, each once; return the number up to which they are stored, 0 where none is."""
+        rows, last = [], 0
         try:
-            outbox, rows, n = str(message["outbox"]), [], 0
-            for each in message["events"]:
-                n = int(each["n"])
-                texts = (str(each["kind"])[:20], str(each["level"])[:20], str(each["text"])[:2000])
-                rows.append((site, cell, outbox, n, float(each["t"]), arrived_s, *texts))
-        except (KeyError, TypeError, ValueError):
+            outbox, events = str(message["outbox"])[:40], list(message["events"])
+        except (KeyError, TypeError):
             return 0
+        for each in events:
+            if not isinstance(each, dict) or (n := number(each.get("n"))) is None or not 0 < n < _MOST_N:
+                continue
+            last = max(last, int(n))
+            texts = (str(each.get(key, ""))[:most] for key, most in (("kind", 20), ("level", 20), ("text", 2000)))
+            rows.append((site, cell, outbox, int(n), number(each.get("t")) or arrived_s, arrived_s, *texts))
         try:
             with self._lock, self._db:
                 self._db.executemany("INSERT OR IGNORE INTO events VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)", rows)
@@ -74,7 +87,7 @@ class Store:
             self.problem = f"events are not stored, the cells keep them: {error}"
             return 0
         self.problem = ""
-        return n
+        return last
 
     def keep_about(self, cell: CellView) -> None:
         """Remember who a cell is."""
@@ -84,13 +97,16 @@ class Store:
 
     def known(self) -> list[CellView]:
         """Return the cells of earlier days; one whose last event is not that it ended was lost."""
-        ends = (
-            "SELECT kind FROM events e WHERE e.site = c.site AND e.cell = c.cell AND kind IN ('began', 'ended')"
-            " ORDER BY arrived DESC, n DESC LIMIT 1"
-        )
+        query = (
+            "SELECT c.site, c.cell, about, kind, max(arrived) FROM cells c LEFT JOIN events e"
+            " ON e.site = c.site AND e.cell = c.cell AND kind IN ('began', 'ended') GROUP BY c.site, c.cell"
+        )  # of a group with max(), SQLite returns the row that has it
         with self._lock:
-            rows = self._db.execute(f"SELECT site, cell, about, ({ends}) FROM cells c").fetchall()
-        return [CellView(site, cell, json.loads(about), ended=last != "began") for site, cell, about, last in rows]
+            rows = self._db.execute(query).fetchall()
+        return [
+            CellView(site, cell, json.loads(about), ended=kind != "began", lost_s=at_s)
+            for site, cell, about, kind, at_s in rows
+        ]
 
     def events(self, words: str = "", site: str = "", cell: str = "") -> list[dict[str, Any]]:
         """Return the newest events that hold all words, of one cell where it is named."""
@@ -103,9 +119,16 @@ class Store:
                 where.append(f"{key} = ?")
                 values.append(value)
         names = ("site", "cell", "n", "t", "arrived", "kind", "level", "text")
-        query = f"SELECT {', '.join(names)} FROM events WHERE {' AND '.join(where)} ORDER BY t DESC LIMIT {_FOUND}"
-        with self._lock:
-            return [dict(zip(names, row, strict=True)) for row in self._db.execute(query, values)]
+        query = (
+            f"SELECT {', '.join(names)} FROM events WHERE {' AND '.join(where)} ORDER BY t DESC, n DESC LIMIT {_FOUND}"
+        )
+        with closing(sqlite3.connect(self._folder / "events.sqlite", timeout=0.2)) as db:
+            end = time.monotonic() + _SEARCH_S
+            db.set_progress_handler(lambda: time.monotonic() > end, 10_000)
+            found: list[dict[str, Any]] = []
+            with suppress(sqlite3.Error):  # the time is over: what was found until then
+                found.extend(dict(zip(names, row, strict=True)) for row in db.execute(query, values))
+            return found
 
     def count(self) -> int:
         """Return how many events there are."""
@@ -138,4 +161,4 @@ class Store:
         """Write what waits."""
         self.flush()
         with self._lock:
-            self._db.close()
+            self._opened.close()

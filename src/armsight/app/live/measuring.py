@@ -28,7 +28,7 @@ from armsight.geometry.pose import adjoint, inverse, transform
 from armsight.geometry.rotation import euler_zyx, skew
 from armsight.loop.handeye.pivot import MIN_POSES, Pivot, calibrate_pivot
 from armsight.loop.health import HealthMonitor
-from armsight.loop.running.data import ShotDatum
+from armsight.loop.running.data import HealthNotes, ShotDatum
 from armsight.loop.running.log import count
 from armsight.vision.follow.follower import follows, measurer
 from armsight.vision.markers.calibrated_board import is_print
@@ -208,6 +208,7 @@ class MeasureStep(PageStep[MeasureState]):
         self._missed: Counter[str] = Counter()
         self._recent: deque[tuple[float, PoseEstimate]] = deque(maxlen=_RECENT)
         self._health_s = 0.0
+        self._notes = HealthNotes()
         self.show(measured=0, health=())
 
     @property
@@ -302,7 +303,10 @@ class MeasureStep(PageStep[MeasureState]):
             self._write(live, result)
             self._streams.put(ShotDatum(live.shot, result, now))
             if now - self._health_s > 1.0:
-                self.show(health=tuple(found.line() for found in self._monitor.findings()))
+                findings = self._monitor.findings()
+                self.show(health=tuple(found.line() for found in findings))
+                for note in self._notes.of(now, findings):
+                    self._streams.put(note)
                 self._health_s = now + _HEALTH_REST * (time.monotonic() - now)
 
     def lately(self, within_s: float) -> list[PoseEstimate]:

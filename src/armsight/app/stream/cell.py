@@ -39,12 +39,15 @@ STATE_S = 1.0
 _POST_S = 0.25
 #: s, between two shots whose geometry is looked at: 0.2 ms each; half: twice the time, double: a drift shows later.
 _LOOK_S = 0.1
-#: events sent at once; half: more round trips after a long loss, double: longer messages (20 kB).
-_BATCH = 100
+#: bytes of events sent at once; half: more round trips after a long loss, double: more than a hub reads.
+_BATCH_BYTES = 50_000
 #: s that a reached hub may store nothing before that is said; half: said while a hub begins, double: said later.
 _UNHEARD_S = 10.0
 #: s; a hub has so long to store events; half: a busy disk has them sent again, double: a dead hub is noticed later.
 _STORE_S = 2.0
+#: s that the last events may take when the command ends; half: a slow network gets them later, double: a dead hub
+#: delays the end.
+_END_S = 0.5
 #: s, from a request to hold to its arrival by the cell's clock; half: clocks must agree better, double: an old request
 #: counts longer.
 _FRESH_S = 60.0
@@ -138,7 +141,7 @@ class CellSink(Sink):
         self._began = self._state_at = time.monotonic()
         self._looked = 0.0
         self._newest: Shot | None = None
-        self._held = 0.0
+        self._held, self._began_utc = set[float](), time.time()
         self._session: Any = None
         self._declared: list[Any] = []
         self._ending = threading.Event()
@@ -202,7 +205,7 @@ class CellSink(Sink):
         """Say that the command ended, send what waits, and leave."""
         self._event("ended", "info", f"armsight {self._mode} ended after {self._shots} shots")
         self._ending.set()
-        self._post.join(_STORE_S + 1.0)
+        self._post.join(2 * _END_S)
         self._put_state()
         if self._session is not None:
             with suppress(Exception):
@@ -212,7 +215,8 @@ class CellSink(Sink):
 
     def _event(self, kind: str, level: str, text: str) -> None:
         with self._lock:
-            self._outbox.add({"t": round(time.time(), 3), "kind": kind, "level": level, "text": text[:2000]})
+            event = {"t": round(time.time(), 3), "kind": kind, "level": level, "text": text[:2000]}
+            self._outbox.add(event, thin=kind == "health")
 
     def about(self) -> dict[str, Any]:
         """Return who the cell is."""
@@ -276,13 +280,15 @@ class CellSink(Sink):
         """Have waiting events stored, oldest first, until none waits, or False: the hub does not answer."""
         while True:
             with self._lock:
-                events = self._outbox.waiting(_BATCH)
+                events = self._outbox.waiting(_BATCH_BYTES)
             if not events:
                 return True
             content = json_text({"outbox": self._outbox.name, "events": events})
             stored = 0
             with suppress(Exception):  # no hub, or none that answers: they are sent again
-                for reply in self._session.get(self._cell.topic("events"), payload=content, timeout=_STORE_S):
+                for reply in self._session.get(
+                    self._cell.topic("events"), payload=content, timeout=_END_S if self._ending.is_set() else _STORE_S
+                ):
                     stored = int(reply.ok.payload.to_string()) if reply.ok is not None else stored
             if not stored:
                 return False
@@ -328,9 +334,11 @@ class CellSink(Sink):
             raise InputError("it is no request to hold") from None
         if not signed_by(self._cell.ca, signature, hold_bytes(self._cell.site, self._cell.name, t, text)):
             raise InputError("it is not signed by the key of this site")
-        if not abs(time.time() - t) < _FRESH_S or t <= self._held:
+        if not abs(time.time() - t) < _FRESH_S or t < self._began_utc:
             raise InputError(f"it is of {t - time.time():+.0f} s by this cell's clock: it is old, or a clock is wrong")
-        self._held = t
+        if t in self._held:
+            raise InputError("it was done before")
+        self._held.add(t)
         return text[:200]
 
 

@@ -17,7 +17,7 @@ from armsight.files import read_toml
 #: The router of a hub on this computer.
 ROUTER = "tcp/127.0.0.1:7447"
 #: Names of sites and cells: they are parts of keys, folders and certificates.
-NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,47}")
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,30}")
 _ENDPOINT = re.compile(r"(?:(tcp|tls)/)?(\[[0-9a-fA-F:]+\]|[\w.-]+):(\d{1,5})")
 _HERE = ("127.0.0.1", "localhost", "[::1]")
 _FILES = ("ca", "certificate", "key")
@@ -101,7 +101,7 @@ def _checked(cell: Cell, where: str) -> Cell:
 def check_name(name: str, what: str) -> None:
     """Raise an InputError where a name of a site or a cell cannot be part of a key."""
     if not NAME.fullmatch(name):
-        raise InputError(f"{what} is {name!r}: expected up to 48 letters, digits, - and _, such as table-3")
+        raise InputError(f"{what} is {name!r}: expected up to 31 letters, digits, - and _, such as table-3")
 
 
 def endpoint(text: str, where: str) -> str:

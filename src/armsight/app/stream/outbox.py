@@ -20,6 +20,8 @@ from armsight.errors import InputError
 #: events a second that are kept, and as many at once after a pause; half: a burst of findings is thinned, double:
 #: twice the disk.
 _RATE, _BURST = 10.0, 100.0
+#: bytes that the number of an event takes in a message, its key included; half, double: nothing.
+_NUMBER_BYTES = 20
 #: events that wait at most; half: two days without a hub at an event a second become one, double: twice the disk (0.2
 #: GB).
 _MOST = 200_000
@@ -59,7 +61,7 @@ class Outbox:
             self._db.execute("INSERT INTO outbox VALUES (?)", (self.name,))
         except (sqlite3.Error, OSError) as error:
             why = (
-                "another process on this computer is this cell: give each its own name"
+                "another command of this cell runs on this computer, or a push: each command needs a name of its own"
                 if "locked" in str(error)
                 else error
             )
@@ -68,18 +70,18 @@ class Outbox:
         self._at = time.monotonic()
         self.thinned = 0
 
-    def add(self, event: dict[str, Any]) -> None:
-        """Keep an event, unless too many come at once; on a full disk it is lost, and counted."""
+    def add(self, event: dict[str, Any], *, thin: bool) -> None:
+        """Keep an event; ``thin``: unless too many come at once. On a full disk it is lost, and counted."""
         now = time.monotonic()
         self._left = min(_BURST, self._left + (now - self._at) * _RATE)
         self._at = now
-        if self._left < 1.0:
+        if thin and self._left < 1.0:
             self.thinned += 1
             return
-        self._left -= 1.0
+        self._left = max(self._left - 1.0, 0.0)
         try:
-            if self.thinned and self._left > 1.0:
-                text = f"{self.thinned} events were left out: too many at once"
+            if self.thinned and (self._left > 1.0 or not thin):
+                text = f"{self.thinned} events were left out: too many at once, or the disk is full"
                 self._store({**event, "kind": "thinned", "level": "warning", "text": text})
                 self.thinned = 0
             self._store(event)
@@ -90,12 +92,16 @@ class Outbox:
         self._db.execute("INSERT INTO waiting (event) VALUES (?)", (json.dumps(event),))
         self._db.execute("DELETE FROM waiting WHERE n <= (SELECT max(n) FROM waiting) - ?", (_MOST,))
 
-    def waiting(self, most: int) -> list[dict[str, Any]]:
-        """Return the oldest events that wait, each with its number ``n``."""
+    def waiting(self, most_bytes: int) -> list[dict[str, Any]]:
+        """Return the oldest events that wait, each with its number ``n``: one at least, and no more than so many bytes."""
+        found: list[dict[str, Any]] = []
         with suppress(sqlite3.Error):
-            rows = self._db.execute("SELECT n, event FROM waiting ORDER BY n LIMIT ?", (most,))
-            return [{**json.loads(event), "n": n} for n, event in rows]
-        return []
+            for n, event in self._db.execute("SELECT n, event FROM waiting ORDER BY n"):
+                most_bytes -= len(event) + _NUMBER_BYTES
+                if found and most_bytes < 0:
+                    break
+                found.append({**json.loads(event), "n": n})
+        return found
 
     def confirm(self, n: int) -> None:
         """Forget the events up to a number: they are stored elsewhere."""

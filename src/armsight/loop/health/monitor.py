@@ -443,8 +443,8 @@ class HealthMonitor:
         now = _with_scene(now, () if self._scene is None else self._scene.findings())
         sigma_m = None if self._rig is None else self._rig.pose_sigma_m
         now = tuple(replace(each, pose_sigma_mm=None if sigma_m is None else 1e3 * sigma_m) for each in now)
-        again = {_subject(each) for each in now}
-        kept = (each for each in self._kept if each.corrected_s is not None or _subject(each) not in again)
+        again = {each.subject for each in now}
+        kept = (each for each in self._kept if each.corrected_s is not None or each.subject not in again)
         return (*kept, *now)
 
 
@@ -506,8 +506,3 @@ def _stamps_finding(since_s: float, shifted_s: float, rate: float) -> HealthFind
         unit,
         "stamp images by a clock that nothing sets (monotonic), and open the cameras once",
     )
-
-
-def _subject(found: HealthFinding) -> tuple[str, str]:
-    """Return what a finding is about: its cause, and its words before it says by how much."""
-    return found.cause, found.what.partition(" by ")[0]

@@ -189,20 +189,23 @@ Datum = ShotDatum | JointsDatum | NoteDatum | EventDatum
 
 
 class HealthNotes:
-    """Makes a note of each cause that a health monitor finds, and of each that it takes back."""
+    """Makes a note of each finding of a health monitor: when it begins, forbids results, is put right, or is taken back."""
 
     def __init__(self) -> None:
-        self._before: dict[str, HealthFinding] = {}
+        self._before: dict[tuple[object, ...], HealthFinding] = {}
 
     def of(self, time_s: float, findings: Sequence[HealthFinding]) -> Iterator[NoteDatum]:
-        """Yield what is new at a time, s: a warning where results must not be trusted because of it."""
-        now: dict[str, HealthFinding] = {each.cause: each for each in findings}
+        """Yield what changed at a time, s: a warning where results must not be trusted because of it."""
+        now: dict[tuple[object, ...], HealthFinding]
+        now = {(each.subject, each.forbids, each.corrected_s): each for each in findings}
         before, self._before = self._before, now
-        lines = tuple(each.line() for each in findings if each.forbids)
-        for each in (now[cause] for cause in now.keys() - before.keys()):
-            yield NoteDatum(time_s, each.line(), "warning" if each.forbids else "info", lines)
-        for each in (before[cause] for cause in before.keys() - now.keys()):
-            yield NoteDatum(time_s, f"no longer found: {each.line()}", "info", lines)
+        lines = tuple(each.line() for each in findings if each.forbids and each.corrected_s is None)
+        for key in now.keys() - before.keys():
+            wrong = now[key].forbids and now[key].corrected_s is None
+            yield NoteDatum(time_s, now[key].line(), "warning" if wrong else "info", lines)
+        for gone in (before[key] for key in before.keys() - now.keys()):
+            if gone.subject not in {each.subject for each in findings}:
+                yield NoteDatum(time_s, f"no longer found: {gone.line()}", "info", lines)
 
 
 class Publisher(Protocol):
