@@ -265,7 +265,7 @@ def test_the_hub_says_what_is_wrong(tmp_path, armsight):
     assert_rejected(armsight("hub", "keys", "my lab", "-o", tmp_path / "k"), "expected up to 31 letters")
     assert_rejected(armsight("hub", "hold", "a", "why", "--keys", tmp_path), "no keys of a site are here")
     (tmp_path / "file").write_text("")
-    assert_rejected(armsight("hub", "-o", tmp_path / "file"), "nothing can be kept here")
+    assert_rejected(armsight("hub", "-o", tmp_path / "file"), "no hub can be kept here")
 
 
 def test_a_clock_that_runs_fast_is_shown_with_its_rate():
