@@ -202,6 +202,9 @@ def shake_cases() -> Iterator[Case]:
         yield Case(f"rig shakes by 0.2 mm at {hz:g} Hz", motion, "fixed")
     for deg in (0.05, 0.15):
         yield Case(f"bracket bends by {deg:g} deg under gravity", {"slip": faults.bending(deg * DEG)}, "body")
+    for share in (5e-4, 1e-3, 2e-3):
+        name = f"both focal lengths longer by {100 * share:g} %, with an arm"
+        yield Case(name, {"zoom": lambda t, share=share: share}, "lens", 100 * share)
 
 
 def bump_cases() -> Iterator[Case]:
