@@ -65,7 +65,9 @@ def test_a_cell_that_misses_more_is_named(tmp_path):
     assert ("c07", "missed") in named(rows)
 
 
-@pytest.mark.parametrize("how", [{}, {"missed": lambda cell: 0.01}, {"a_day": 5, "runs": 30}], ids=str)
+@pytest.mark.parametrize(
+    "how", [{}, {"missed": lambda cell: 0.01}, {"a_day": 5, "runs": 30}], ids=["as it is", "few missed", "many a day"]
+)
 def test_where_no_cell_differs_few_reports_name_one(tmp_path, how):
     """5 % of reports may; of 40 more than 5 have a chance of 1.4 % (binomial)."""
     false = sum(bool(named(report(batch(tmp_path / "b", 100 + seed, **how)))) for seed in range(40))
