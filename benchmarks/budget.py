@@ -178,27 +178,26 @@ def buying_page() -> str:
     for title, (kit, limits) in KITS.items():
         found, better = armsight.budget(**BOUGHT, **kit), armsight.budget(**BOUGHT, **kit, **CALIPERS)
         at, cameras = found.states, found.plan.cameras
-        cells = [at["at_rest"], at["moving"], better.at_rest, at["one_camera"], at["three_cameras"]]
-        rows.append("| " + " | ".join(map(str, [title, cameras.price, *cells])) + " |")
-        text = (
-            f"The kit is {cameras.text}, {kit['baseline']} apart. In motion most is due to the {found.causes[0].cause}. "
-            f"{limits}"
-        )
+        moving = (at["at_rest"], at["moving"], found.causes[0].cause)
+        cells = (title, cameras.price, *moving, better.at_rest, at["one_camera"], at["three_cameras"])
+        rows.append("| " + " | ".join(map(str, cells)) + " |")
+        text = f"The kit is {cameras.text}, {kit['baseline']} apart. {limits}"
         kits += ["", f"## {title}", "", *textwrap.wrap(text, 116)]
     intro = (
         f"[`armsight budget`](howto/budget.md) predicts these figures for a volume of {BOUGHT['volume']} at "
         f"{BOUGHT['distance']}: 95 % of the errors are within them at the worst position. In motion the body moves at "
-        f"{BOUGHT['speed']}. Price classes reach from 1 (tens of euros a pair) to 5 (thousands). "
-        "`python benchmarks/budget.py page` writes this page."
+        f"{BOUGHT['speed']}; the next column says what most of that is due to. Price classes reach from 1 (tens of "
+        "euros a pair) to 5 (thousands). `python benchmarks/budget.py page` writes this page."
     )
     printed = (
         "Print the board with `armsight body draw chessboard:9x6:25mm -o board.pdf` and glue it to a stiff plate. "
         "`armsight budget -o kit` draws the body. Measure both after printing: that gains more than better cameras."
     )
     head = (
-        "| kit | price class | at rest | in motion | at rest, print measured | one camera, at rest | three, at rest |"
+        "| kit | price class | at rest | in motion | most of it | at rest, print measured | one camera, at rest | "
+        "three, at rest |"
     )
-    lines = ["# What to buy", "", *textwrap.wrap(intro, 116), "", head, "|" + "---|" * 7, *rows]
+    lines = ["# What to buy", "", *textwrap.wrap(intro, 116), "", head, "|" + "---|" * 8, *rows]
     lines += ["", *textwrap.wrap(printed, 116)]
     return "\n".join([*lines, *kits]) + "\n"
 
