@@ -117,17 +117,14 @@ class MeasureState:
     drawn: tuple[Drawn, ...] = ()
 
 
-Measured = PoseEstimate | Missed
-
-
 @dataclass(eq=False)
 class _Followed:
     """A body: what it is, what measures it, and how it was measured last."""
 
     spec: str
     target: Target
-    measure: Callable[[Shot], Measured] | None = None
-    newest: tuple[LiveShot, Measured] | None = None
+    measure: Callable[[Shot], PoseEstimate | Missed] | None = None
+    newest: tuple[LiveShot, PoseEstimate | Missed] | None = None
 
     def prepare(self, rig: StereoRig | None, sync_s: float) -> None:
         """Get ready for a rig, and for exposures that are so far apart, s."""
@@ -158,7 +155,7 @@ class _PoseFile:
         published = Published(rig, body, None, properties(rig, None, command="live"))
         self._mcap = LazyMcap(folder, published, say, path.with_suffix(".mcap").name)
 
-    def add(self, live: LiveShot, result: Measured) -> None:
+    def add(self, live: LiveShot, result: PoseEstimate | Missed) -> None:
         """Write a row; an OSError ends the recording with the rows before."""
         row = csv_text([shot_pose(live.shot.name, live.shot.t_s, self.body, result)]).partition("\n")[2]
         try:
@@ -217,7 +214,7 @@ class MeasureStep(PageStep[MeasureState]):
         return None if self._body is None else self._body.spec
 
     @property
-    def newest(self) -> tuple[LiveShot, Measured] | None:
+    def newest(self) -> tuple[LiveShot, PoseEstimate | Missed] | None:
         """The newest shot with its pose; None before."""
         return None if self._body is None else self._body.newest
 
@@ -282,7 +279,7 @@ class MeasureStep(PageStep[MeasureState]):
                 else:
                     body.newest = live, result
 
-    def take(self, live: LiveShot, result: Measured) -> None:
+    def take(self, live: LiveShot, result: PoseEstimate | Missed) -> None:
         """Take in what was measured in a shot, here or in a control loop."""
         now = time.monotonic()
         with self.lock:
@@ -370,7 +367,7 @@ class MeasureStep(PageStep[MeasureState]):
             else:
                 self._recording = _PoseFile(self.folder, self.rig, self._body.target.body, self.warn)
 
-    def _write(self, live: LiveShot, result: Measured) -> None:
+    def _write(self, live: LiveShot, result: PoseEstimate | Missed) -> None:
         """Write a row, whole; a full disk ends the recording."""
         if (recording := self._recording) is None:
             return
@@ -483,7 +480,7 @@ class MeasureStep(PageStep[MeasureState]):
         near = abs(second.newest[0].number - live.number) <= 1
         return (*drawn, *dots("second", rig.project(second.points(second.newest[1])))) if near else drawn
 
-    def _relative(self, rig: StereoRig, first: tuple[LiveShot, Measured]) -> RelativeShown | None:
+    def _relative(self, rig: StereoRig, first: tuple[LiveShot, PoseEstimate | Missed]) -> RelativeShown | None:
         """Return the second body relative to the first one; None without."""
         if self._second is None:
             return None

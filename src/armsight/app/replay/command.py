@@ -7,11 +7,15 @@ import tempfile
 from collections import Counter
 from dataclasses import asdict
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from armsight.app.arm_option import arm_option
 from armsight.app.stream_option import stream_options
+
+if TYPE_CHECKING:
+    from armsight.app.replay.run import Replayed
 
 #: Reasons of missed shots that are printed, the most frequent ones.
 _REASONS = 3
@@ -66,6 +70,21 @@ def command(
         check_folder(output, holding=(POSES, LIVE), apart_from=(other and other / POSES, other and other / LIVE))
     request = Request(recording, rig, target, arm, estimator, rate, references, stream)
     replayed = replay(request, lambda line: click.echo(line, err=True))
+    answer, lines = described(recording, replayed)
+    if output is not None:
+        write_tables(output.expanduser(), replayed)
+        lines.append(f"written to {output}")
+    if other is not None:
+        with tempfile.TemporaryDirectory() as temporary:
+            write_tables(Path(temporary), replayed)
+            found = compare(other, Path(temporary))
+        answer["compared"] = [each.to_json() for each in found]
+        lines += [line for each in found for line in each.lines()]
+    click.echo(json.dumps(answer) if as_json else "\n".join(lines))
+
+
+def described(recording: str, replayed: Replayed) -> tuple[dict[str, object], list[str]]:
+    """Return what was replayed, for ``--json`` and for the terminal."""
     measured = sum(pose.ok for pose in replayed.poses)
     reasons = Counter(pose.reason for pose in replayed.poses if not pose.ok)
     answer: dict[str, object] = {
@@ -91,13 +110,4 @@ def command(
     if (row := replayed.beside) is not None:
         answer["reference"] = asdict(row)
         lines.append(row.line)
-    if output is not None:
-        write_tables(output.expanduser(), replayed)
-        lines.append(f"written to {output}")
-    if other is not None:
-        with tempfile.TemporaryDirectory() as temporary:
-            write_tables(Path(temporary), replayed)
-            found = compare(other, Path(temporary))
-        answer["compared"] = [each.to_json() for each in found]
-        lines += [line for each in found for line in each.lines()]
-    click.echo(json.dumps(answer) if as_json else "\n".join(lines))
+    return answer, lines

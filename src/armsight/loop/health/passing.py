@@ -492,7 +492,11 @@ class Passing:
         times, focals = len(self.apart), len(self.focal)
         if max(times, focals) < _LEAST:
             return tuple(_besides(each, self.unsure) if each.cause in ("rig", "body") else each for each in stays)
-        found = self._time_finding(timed=timed) if times >= focals else self._lens_finding(timed=timed)
+        passes = self._time_finding(timed=timed) if times >= focals else self._lens_finding(timed=timed)
+        return self._once(passes, stays)
+
+    def _once(self, found: HealthFinding, stays: tuple[HealthFinding, ...]) -> tuple[HealthFinding, ...]:
+        """Return a finding of what passes with those of what stays: those of its cause are one with it."""
         same = [each for each in stays if each.cause == found.cause]
         if found.cause == "lens":  # one that stays is sized better
             found = next(iter(same), found)
@@ -502,7 +506,7 @@ class Passing:
         # What is left of it looks like what stays: that cannot be excluded, but what was found before.
         others = [each for each in stays if each not in same]
         before = [each for each in others if begins and each.since_s is not None and each.since_s < since_s - 1.0]
-        causes = [*(each.cause for each in others if each not in before), *(("lens",) if focals else ())]
+        causes = [*(each.cause for each in others if each not in before), *(("lens",) if self.focal else ())]
         return (*before, _besides(replace(found, since_s=since_s if begins else None), causes))
 
     def _time_finding(self, *, timed: bool) -> HealthFinding:
