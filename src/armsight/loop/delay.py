@@ -15,6 +15,7 @@ import numpy as np
 
 from armsight.data import Array, JointStates
 from armsight.errors import CalibrationError, InputError
+from armsight.estimate.chance import chi_square_limit
 from armsight.geometry.check import checked
 from armsight.geometry.rotation import log_so3
 from armsight.loop.estimators import Delay, KalmanEstimator, Outcome, PoseMeasurement, Prior
@@ -29,8 +30,6 @@ MIN_MEASUREMENTS = 20
 FIRST_SIGMA_S, PASSES = 5e-3, 2
 #: A delay worse known than this, s, is none: at 0.5 m/s it is 1 mm.
 MAX_SIGMA_S = 2e-3
-#: The median deviation of normal samples, in sigma.
-_MEDIAN_OF_NORMAL = 0.6745
 #: A stamp that is further off than this, in sigma, is no jitter but a hiccup.
 _OUTLIER = 4.0
 #: Readings given to the filter ahead of a measurement, s.
@@ -89,7 +88,7 @@ def _jitter(stamps: Array) -> float:
     apart = np.diff(stamps)
     periods = np.maximum(np.round(apart / np.median(apart)), 1.0)
     off = np.abs(apart - periods * (apart.sum() / periods.sum()))
-    usual = off[off <= _OUTLIER * np.median(off) / _MEDIAN_OF_NORMAL]
+    usual = off[off <= _OUTLIER * np.median(off) / np.sqrt(chi_square_limit(1, 0.5))]
     return float(np.sqrt(np.mean(usual**2) / 2))
 
 

@@ -23,11 +23,10 @@ from numpy.typing import NDArray
 from armsight.data import Array, Record
 from armsight.errors import InputError
 from armsight.kernels import kernel
-from armsight.robot.boards.link import Sensed
+from armsight.robot.boards.link import TICK_S, Sensed
 
 JOINTS = 6
 _SUBSTEPS = 4
-_TICK_S = 0.001
 #: One joint of a small arm on 12 V: 5 rad/s at full duty, 30 ms to get there, 2 A and 4.8 N m when held.
 RESISTANCE_OHM, CONSTANT_V_S, SUPPLY_V = 6.0, 2.4, 12.0
 INERTIA_KG_M2, VISCOUS_N_M_S, DRY_N_M = 0.03, 0.02, 0.2
@@ -218,7 +217,7 @@ def _move(
     blocked: NDArray[np.bool_],
 ) -> None:
     """Move the joints by one tick, in-place: motors q, qd, qdd (6,) rad, rad/s, rad/s^2; what they drive, link, linkd."""
-    h = _TICK_S / _SUBSTEPS
+    h = TICK_S / _SUBSTEPS
     before = 0.0
     for i in range(JOINTS):
         own, constant = model[2, i], model[1, i]
@@ -257,7 +256,7 @@ def _move(
                 q[i] = STOP_RAD if q[i] > 0 else -STOP_RAD
                 qd[i] = 0.0
         before = qdd[i]
-        qdd[i] = (qd[i] - start) / _TICK_S
+        qdd[i] = (qd[i] - start) / TICK_S
         if stiffness == 0:
             led = q[i] + drum * _sine(cycles_per_rad * q[i] + between[7, i])
             link[i] = min(max(link[i], led - half), led + half)
@@ -306,7 +305,7 @@ def _read(
         elif kind == 7:
             true -= min(max(0.5 * (true - kept), -size), size)
         elif kind == 8:
-            broken[2, i] += size * _TICK_S
+            broken[2, i] += size * TICK_S
             true += broken[2, i]
         elif kind == 9:
             true = kept + size * (true - kept)
@@ -396,7 +395,7 @@ class JointPlant:
             size: how much, as :class:`PotFault` says; a usual one without.
         """
         given = _USUAL_SIZE.get(fault, 0.0) if size is None else size
-        unit = {PotFault.SCALED: 1.0, PotFault.LAG: 1 / _TICK_S}.get(fault, COUNTS_PER_RAD)
+        unit = {PotFault.SCALED: 1.0, PotFault.LAG: 1 / TICK_S}.get(fault, COUNTS_PER_RAD)
         true = ZERO_COUNTS + COUNTS_PER_RAD * self.link[joint]
         if fault == PotFault.JUMP and size is None and true > ZERO_COUNTS:
             unit = -unit  # towards the middle, where there is room

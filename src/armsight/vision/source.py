@@ -11,6 +11,10 @@ from typing import Protocol, Self
 
 from armsight.data import Shot
 
+#: A shot that is younger by its own stamp was stamped by a live camera, s; half: a slow start passes for a recording,
+#: double: a recording that was just made passes for live.
+LIVE_S = 10.0
+
 
 class Source(Protocol):
     """Two cameras, or a recording of them.

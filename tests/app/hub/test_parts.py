@@ -288,8 +288,8 @@ def test_unreadable_events_do_not_hold_up_the_others(tmp_path):
 
 
 def test_a_batch_of_events_is_no_longer_than_a_hub_reads(tmp_path):
-    from armsight.app.hub.router import _LONGEST
     from armsight.app.stream.cell import _BATCH_BYTES
+    from armsight.app.stream.cell_file import LONGEST
     from armsight.app.stream.datum import json_text
 
     box = Outbox(tmp_path, "a")
@@ -297,7 +297,7 @@ def test_a_batch_of_events_is_no_longer_than_a_hub_reads(tmp_path):
         box.add({"kind": "health", "level": "warning", "text": '\u00e9"' * 999, "t": 1e9 + k}, thin=False)
     found = box.waiting(_BATCH_BYTES)
     assert 1 < len(found) < 80
-    assert len(json_text({"outbox": box.name, "events": found})) < _LONGEST
+    assert len(json_text({"outbox": box.name, "events": found})) < LONGEST
     assert len(box.waiting(1)) == 1  # one at least
     box.close()
 

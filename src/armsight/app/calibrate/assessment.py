@@ -16,6 +16,7 @@ from armsight.app.show.report import Grade
 from armsight.data import Array, Record
 from armsight.errors import InputError
 from armsight.geometry.pose import transform
+from armsight.vision.calibrate.heldout import LEAST_SIGMA_PX
 from armsight.vision.calibrate.result import Calibration
 from armsight.vision.markers.board import open_board
 from armsight.vision.rig import StereoRig
@@ -30,7 +31,6 @@ _DEEP, _WIDE, _RIM = 80, 120, 33  # points of the slice, and along each side of 
 _WIDEST_TANGENT = 3.0  # of half the field of view: the slice of a fisheye lens would be infinitely wide otherwise
 #: Relative to the distance: a point that triangulates elsewhere lies outside the valid range of the lens model.
 _ROUND_TRIP = 1e-6
-_LEAST_SIGMA_PX = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +47,7 @@ class Slice(Record):
 
 def corner_variance_px2(calibration: Calibration) -> Array:
     """Return (2,) the variance of a typical corner in the left and the right image, px^2: its own and the rig's share."""
-    observations, base = calibration.observations, max(calibration.rig.sigma_px, _LEAST_SIGMA_PX) ** 2
+    observations, base = calibration.observations, max(calibration.rig.sigma_px, LEAST_SIGMA_PX) ** 2
     image = np.trace(observations.cov_uv, axis1=1, axis2=2) / 2
     sides = [image[observations.camera == side] for side in (0, 1)]
     return np.array([base + (float(np.median(values)) if len(values) else 0.0) for values in sides])

@@ -13,12 +13,14 @@ from typing import Any
 import numpy as np
 
 from armsight.app.hub.drift import BLOCK_S, CHANCE, Drift, Slopes, drifts
+from armsight.app.stream.cell_file import STATE_S
 
 #: s without a state after which a connected cell is frozen, or its network cut; half: a busy computer is red now and
 #: then, double: a cut cable shows later.
-_SILENT_S = 3.0
+_SILENT_S = 3 * STATE_S
 #: s of a bar of the sparkline, and bars of a day; half: finer, double: coarser.
-_BAR_S, _BARS = 300.0, 288
+_BAR_S = 300.0
+_BARS = round(86400 / _BAR_S)
 #: sigmas of a slope that count as much as an error at its limit, in the order of cells that are well; half: slopes
 #: first, double: errors first.
 _STEEP = 4.0

@@ -13,19 +13,19 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.special import stdtr
+from scipy.special import chdtri, stdtr
 
 #: s of a block of means, and how many blocks a slope is taken over; half: noisier, double: later named.
 BLOCK_S, BLOCKS = 10.0, 60
 #: blocks that a slope needs; half: two minutes are enough and noisy, double: nothing is ranked in the first five.
-_LEAST = 15
-#: Chance of one look at one number; a look a minute at two numbers is 20,160 a week, so a false one a cell and week at
-#: most. Half: a drift is named later, double: two false alarms a week.
-CHANCE = 1 / (7 * 24 * 60 * 2)
+_LEAST = BLOCKS // 4
+#: s between two looks for drifts; half: chance is checked twice as often, double: named a minute later.
+LOOK_S = 60.0
+#: Chance of one look at one of two numbers: a false one a cell and week at most. Half: a drift is named later, double:
+#: two false alarms a week.
+CHANCE = LOOK_S / (2 * 7 * 86400)
 #: slopes that a scale needs; half: a scale that is a third off, double: a single cell says nothing for four hours.
 _SLOPES = 8
-#: Median size of a normal variable over its sigma.
-_MEDIAN = 0.6745
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,8 @@ def drifts(cells: Mapping[str, Slopes], now_s: float) -> dict[str, Drift]:
 
 def _against(slope: float, *sources: Sequence[float]) -> Drift:
     """Compare a slope with others: those of the source in which slopes are larger."""
-    known = [(float(np.median(np.abs(each))) / _MEDIAN, len(each)) for each in sources if len(each) >= _SLOPES]
+    of_sigma = math.sqrt(chdtri(1, 0.5))  # the median size of a normal variable
+    known = [(float(np.median(np.abs(each))) / of_sigma, len(each)) for each in sources if len(each) >= _SLOPES]
     scale, count = max(known, default=(0.0, 0))
     if not scale > 0.0:
         return Drift(slope, math.nan, 1.0)

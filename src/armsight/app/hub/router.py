@@ -14,14 +14,9 @@ from pathlib import Path
 from typing import Any
 
 from armsight.app.hub.keys import sign_hold, site_of
-from armsight.app.stream.cell_file import Cell, endpoint, require_here, zenoh_config
+from armsight.app.stream.cell_file import ANSWER_S, LONGEST, Cell, endpoint, require_here, zenoh_config
 from armsight.errors import InputError
 
-#: bytes of a state, or of events, that are read at most; half: long findings are rejected, double: a wrong cell costs
-#: more memory.
-_LONGEST = 65536
-#: s that an image or an answer is waited for; half: a slow network shows none, double: a click waits longer.
-_ANSWER_S = 2.0
 _ALLOWED = (
     "put", "delete", "declare_subscriber", "query", "reply", "declare_queryable", "liveliness_token",
     "liveliness_query", "declare_liveliness_subscriber",
@@ -76,8 +71,8 @@ class Router:
     def ask(self, site: str, cell: str, what: str, payload: bytes = b"") -> bytes:
         """Ask a cell for something, and return its answer; empty where it does not answer."""
         with suppress(Exception):  # of the library: a cell that is gone
-            for reply in self._session.get(f"armsight/{site}/{cell}/{what}", payload=payload, timeout=_ANSWER_S):
-                if reply.ok is not None and len(reply.ok.payload) < _LONGEST:
+            for reply in self._session.get(f"armsight/{site}/{cell}/{what}", payload=payload, timeout=ANSWER_S):
+                if reply.ok is not None and len(reply.ok.payload) < LONGEST:
                     return bytes(reply.ok.payload.to_bytes())
         return b""
 
@@ -103,8 +98,8 @@ class Router:
 def _json(payload: Any) -> Any:  # noqa: ANN401 - whatever JSON holds
     """Return the JSON of a message; a text that says why where it is none, or too long."""
     data = b"" if payload is None else payload.to_bytes()
-    if len(data) > _LONGEST:
-        return f"a message of {len(data)} bytes: at most {_LONGEST} are read"
+    if len(data) > LONGEST:
+        return f"a message of {len(data)} bytes: at most {LONGEST} are read"
     try:
         return json.loads(data)
     except (ValueError, RecursionError):
@@ -154,7 +149,7 @@ def hold(keys: Path, cell: str, reason: str, address: str) -> str:
         raise InputError(f"--hub {address}: no hub with the keys of {keys} answers there") from None
     with closing(session):
         topic = Cell(cell, site).topic("hold")
-        for reply in session.get(topic, payload=sign_hold(keys, cell, reason), timeout=_ANSWER_S):
+        for reply in session.get(topic, payload=sign_hold(keys, cell, reason), timeout=ANSWER_S):
             if reply.ok is not None:
                 return str(reply.ok.payload.to_string())
     return ""

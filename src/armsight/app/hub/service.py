@@ -14,15 +14,14 @@ from pathlib import Path
 from typing import Any
 
 from armsight.app.hub.cells import CellView, look_for_drifts, number, ranked
+from armsight.app.hub.drift import LOOK_S
 from armsight.app.hub.router import Heard, Router
 from armsight.app.hub.store import FLUSH_S, Store
 from armsight.app.show.http import Answer, Pages, metrics_text
-from armsight.app.stream.cell_file import NAME
+from armsight.app.stream.cell_file import NAME, STATE_S
 
 #: s that an answer of /state is served to all who ask; half: thirty tabs cost twice, double: a second of age.
-_STATE_S = 0.5
-#: s between two looks for drifts; half: twice as many false alarms, double: named a minute later.
-_LOOK_S = 60.0
+_STATE_S = STATE_S / 2
 #: messages that wait at most; half: a burst of 200 cells is dropped, double: more memory.
 _WAITING = 10_000
 #: Metric -> its kind and help; the labels are site and cell.
@@ -117,7 +116,7 @@ class Hub:
                     self._take(heard)
                 except Exception as error:  # noqa: BLE001 - one message must not end the hub
                     self._say(f"a message of {heard[0]}/{heard[1]} was not taken: {type(error).__name__}: {error}")
-            if time.monotonic() - looked > _LOOK_S:
+            if time.monotonic() - looked > LOOK_S:
                 looked = time.monotonic()
                 with self._lock:
                     look_for_drifts(self._cells, time.time())

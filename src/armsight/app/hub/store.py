@@ -25,8 +25,6 @@ from armsight.files import replacing
 FLUSH_S = 600.0
 #: s that a search may take; half: fewer old events are found, double: a tab costs twice.
 _SEARCH_S = 1.0
-#: Largest number of an event; half: nothing, double: more than the database holds.
-_MOST_N = 2.0**53
 #: events of a search at most; half: scroll less, double: a larger page.
 _FOUND = 200
 _TABLES = (
@@ -75,7 +73,8 @@ class Store:
         except (KeyError, TypeError):
             return 0
         for each in events:
-            if not isinstance(each, dict) or (n := number(each.get("n"))) is None or not 0 < n < _MOST_N:
+            # From 2^53 on a float skips numbers.
+            if not isinstance(each, dict) or (n := number(each.get("n"))) is None or not 0 < n < 2**53:
                 continue
             last = max(last, int(n))
             texts = (str(each.get(key, ""))[:most] for key, most in (("kind", 20), ("level", 20), ("text", 2000)))

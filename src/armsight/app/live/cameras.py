@@ -24,6 +24,7 @@ from armsight.app.live.capture import CameraCapture, LiveShot
 from armsight.app.live.records import asked
 from armsight.app.live.simulated import ACTIONS
 from armsight.app.live.step import SIM, PageStep, Shared
+from armsight.app.setup.finding import COVERED, NOT_COVERED
 from armsight.app.show.messages import Level, Note
 from armsight.data import Array
 from armsight.errors import DeviceError, InputError
@@ -34,8 +35,6 @@ from armsight.vision.sources.v4l2 import VideoDevice, find_cameras
 
 #: How often the images' quality is looked at, s; images older than this are late, s.
 _QUALITY_S, _LATE_S = 0.5, 0.5
-#: A lens is covered when its view is this much darker than before, and the other is not.
-_COVERED, _NOT_COVERED = 0.45, 0.75
 _SLOW = 0.8  # share of the requested rate below which cameras are slow
 Grey = NDArray[np.uint8]
 
@@ -293,9 +292,9 @@ class CamerasStep(PageStep[CamerasState]):
                 (0.0 if view.quality is None else view.quality.mean) / max(before, 1.0)
                 for view, before in zip(views, self._bright, strict=True)
             )
-            if left < _COVERED and right > _NOT_COVERED:
+            if left < COVERED and right > NOT_COVERED:
                 self._left_is_known("the left view is the left camera's")
-            elif right < _COVERED and left > _NOT_COVERED:
+            elif right < COVERED and left > NOT_COVERED:
                 self.swap()
 
     def _of_both(self, images: tuple[np.ndarray, np.ndarray]) -> list[Note]:

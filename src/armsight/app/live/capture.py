@@ -16,12 +16,12 @@ from dataclasses import dataclass, replace
 
 from armsight.data import Record, Shot
 from armsight.errors import ArmsightError
+from armsight.vision.source import LIVE_S
 from armsight.vision.sources import Source
 
 #: How long after a failure a source is opened again, s.
 AGAIN_S = 2.0
 _INTERVALS = 30
-_LIVE_S = 10.0  # a stamp on this computer's clock is at most so old
 _UNTIMED_S, _LONGEST_PAUSE_S = 0.1, 1.0  # between shots of a recording without times; at most
 
 
@@ -36,7 +36,7 @@ class LiveShot(Record):
     def age_s(self, now_s: float) -> float:
         """Return how old the images are, s: since their stamp if it is on this computer's clock, else since they came."""
         stamp = self.shot.t_s
-        live = stamp is not None and 0.0 <= self.arrived_s - stamp < _LIVE_S
+        live = stamp is not None and 0.0 <= self.arrived_s - stamp < LIVE_S
         return now_s - (stamp if live and stamp is not None else self.arrived_s)
 
 
@@ -152,7 +152,7 @@ class CameraCapture:
     def _pace(self, before: Shot | None, shot: Shot) -> None:
         """Wait until a recorded shot is due: a recording is shown at its own pace."""
         newest, now = self.newest, time.monotonic()
-        if before is None or newest is None or (shot.t_s is not None and 0.0 <= now - shot.t_s < _LIVE_S):
+        if before is None or newest is None or (shot.t_s is not None and 0.0 <= now - shot.t_s < LIVE_S):
             return
         apart_s = _UNTIMED_S if shot.t_s is None or before.t_s is None else shot.t_s - before.t_s
         self._ended.wait(min(max(newest.arrived_s + apart_s - now, 0.0), _LONGEST_PAUSE_S))

@@ -31,6 +31,7 @@ from armsight.vision.markers.targets import open_fixed
 from armsight.vision.match import gate
 from armsight.vision.pose.shot_pose import ANGLES, ShotPose, csv_text, shot_pose
 from armsight.vision.rig import StereoRig
+from armsight.vision.source import LIVE_S
 from armsight.vision.sources import open_rig
 
 #: Standard deviation of the time between the two exposures of a shot, s: of cameras that nothing synchronises to better.
@@ -39,8 +40,6 @@ _SYNC_S = 1e-3
 _WIDE_PX, _AGAIN = 2.0, 60
 #: What to do about repeated shots of a recording.
 _RECORDED = "they are no new measurements: leave them out, and record at the rate that the cameras really give"
-#: A shot that is younger by its own stamp was stamped by a live camera, s.
-_LIVE_S = 10.0
 #: Shots that are kept for the lines at the end where no file needs all of them; half, double: so much memory.
 _KEPT = 10_000
 #: s, between two looks at the health of live cameras; half: nothing, double: a warning comes later.
@@ -148,7 +147,7 @@ class MeasureRun:
                     record = replace(record, way=followed.way, jump=followed.jump, took_ms=followed.took_ms)
                 self._keep(record)
                 now = time.monotonic()  # the time by the clock of live cameras; a recording has none
-                arrival_s = now if shot.t_s is not None and 0.0 <= now - shot.t_s < _LIVE_S else None
+                arrival_s = now if shot.t_s is not None and 0.0 <= now - shot.t_s < LIVE_S else None
                 publisher.put(ShotDatum(shot, result, arrival_s))
                 if arrival_s is not None and arrival_s - looked_s > _HEALTH_S:
                     looked_s = arrival_s

@@ -21,7 +21,7 @@ from armsight.vision.sources.v4l2 import VideoDevice, find_cameras
 _LOOK_S = 0.2
 #: A covered lens: its view is this much darker than before, and no other by so much; half: a hand before it is not enough,
 #: double: a cloud is.
-_COVERED, _NOT_COVERED = 0.45, 0.75
+COVERED, NOT_COVERED = 0.45, 0.75
 _MOVED_RAD = np.radians(3.0)  # by a hand; half: backlash and noise pass for it, double: a stiff joint is pushed far
 _FRAMES = 8  # until a camera's exposure has settled; half: too dark an image, double: slower
 #: How boards are called -> what stands behind them, and the arm whose page has it.
@@ -89,7 +89,7 @@ def find_left_and_right(
             covered(ask)
             share = {device: look(device) / max(bright[device], 1.0) for device in devices}
             darkest, *others = sorted(devices, key=share.__getitem__)
-            if share[darkest] < _COVERED and share[others[0]] > _NOT_COVERED and darkest not in found:
+            if share[darkest] < COVERED and share[others[0]] > NOT_COVERED and darkest not in found:
                 found.append(darkest)
                 break
             ask = f"No view became dark, or more than one, or the same as before. Cover the {side} lens alone"

@@ -23,7 +23,7 @@ import click
 import cv2
 import numpy as np
 
-from armsight.app.stream.cell_file import Cell, hold_bytes, read_cell, zenoh_config
+from armsight.app.stream.cell_file import ANSWER_S, LONGEST, STATE_S, Cell, hold_bytes, read_cell, zenoh_config
 from armsight.app.stream.datum import Published, json_text
 from armsight.app.stream.outbox import Outbox, state_folder
 from armsight.app.stream.sink import Sink
@@ -33,18 +33,14 @@ from armsight.loop.running.data import Datum, NoteDatum, ShotDatum
 from armsight.vision.image import grey
 from armsight.vision.rig import StereoRig
 
-#: s, between two states; half: twice the network, double: a loss shows a second later.
-STATE_S = 1.0
 #: s, between two looks whether events wait or a hub can be reached; half: nothing, double: events come later.
 _POST_S = 0.25
 #: s, between two shots whose geometry is looked at: 0.2 ms each; half: twice the time, double: a drift shows later.
 _LOOK_S = 0.1
 #: bytes of events sent at once; half: more round trips after a long loss, double: more than a hub reads.
-_BATCH_BYTES = 50_000
+_BATCH_BYTES = 3 * LONGEST // 4
 #: s that a reached hub may store nothing before that is said; half: said while a hub begins, double: said later.
 _UNHEARD_S = 10.0
-#: s; a hub has so long to store events; half: a busy disk has them sent again, double: a dead hub is noticed later.
-_STORE_S = 2.0
 #: s that the last events may take when the command ends; half: a slow network gets them later, double: a dead hub
 #: delays the end.
 _END_S = 0.5
@@ -287,7 +283,7 @@ class CellSink(Sink):
             stored = 0
             with suppress(Exception):  # no hub, or none that answers: they are sent again
                 for reply in self._session.get(
-                    self._cell.topic("events"), payload=content, timeout=_END_S if self._ending.is_set() else _STORE_S
+                    self._cell.topic("events"), payload=content, timeout=_END_S if self._ending.is_set() else ANSWER_S
                 ):
                     stored = int(reply.ok.payload.to_string()) if reply.ok is not None else stored
             if not stored:

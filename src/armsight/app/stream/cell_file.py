@@ -16,6 +16,13 @@ from armsight.files import read_toml
 
 #: The router of a hub on this computer.
 ROUTER = "tcp/127.0.0.1:7447"
+#: s, between two states of a cell; half: twice the network, double: a loss shows a second later.
+STATE_S = 1.0
+#: s that hub and cell wait for an answer; half: a slow network or a busy disk gives none, double: a click waits longer.
+ANSWER_S = 2.0
+#: bytes of a state, or of events, that are read at most; half: long findings are rejected, double: a wrong cell costs
+#: more memory.
+LONGEST = 65536
 #: Names of sites and cells: they are parts of keys, folders and certificates.
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,30}")
 _ENDPOINT = re.compile(r"(?:(tcp|tls)/)?(\[[0-9a-fA-F:]+\]|[\w.-]+):(\d{1,5})")

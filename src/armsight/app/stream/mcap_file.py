@@ -31,6 +31,7 @@ from armsight.loop.running.data import Datum, EventDatum, JointsDatum, NoteDatum
 from armsight.processes import Process
 from armsight.robot.kinematics.arm import Arm
 from armsight.vision.rig import StereoRig
+from armsight.vision.source import LIVE_S
 from armsight.vision.sources.bag.camera_info import METADATA, RIG
 
 #: Name of the file in the folder of a run.
@@ -39,8 +40,6 @@ RUN_MCAP = "run.mcap"
 BODY, ARM = "body.toml", "arm.json"
 #: Topics of the data as JSON, by kind.
 TOPICS: dict[type, str] = {ShotDatum: "/armsight/shot", JointsDatum: "/armsight/joints", EventDatum: "/armsight/event"}
-#: A shot that is younger by its own stamp was stamped by a live camera, s.
-_LIVE_S = 10.0
 _WAKES = 64  # data that are written together, where they come fast
 #: By then a process has begun to write, on a computer under load, s; so many data, of some kB each, wait for it at most.
 _BEGUN_S, _WAITING = 60.0, 8192
@@ -248,7 +247,7 @@ class LazyMcap:
     def put_shot(self, shot: Shot) -> None:
         """Take a shot that was recorded and not measured."""
         now = time.monotonic()  # the clock of live cameras' stamps
-        live = shot.t_s is not None and 0.0 <= now - shot.t_s < _LIVE_S
+        live = shot.t_s is not None and 0.0 <= now - shot.t_s < LIVE_S
         self.put(ShotDatum(shot, None, now if live or shot.t_s is None else None))
 
     def close(self) -> None:

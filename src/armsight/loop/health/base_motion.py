@@ -26,8 +26,8 @@ from armsight.loop.estimators.errormodel import NOTHING
 
 #: A measurement is kept every so often, s, and so many: those between say nearly the same of the arm.
 _EVERY_S, _KEPT = 1.0 / 15.0, 900
-#: So close to its beginning a measurement may be from before or after a motion, s.
-_DATED_S = 0.7
+#: A change is dated to about so much, s: so close to its beginning a measurement may be from before or after it.
+DATED_S = 0.7
 #: Priors so wide that they decide nothing: of a motion, and of its speed in a second (m, rad).
 _WIDE, _SPEED = np.repeat([0.05, 0.1], 3), np.repeat([5e-4, 1e-3], 3)
 #: Of the poses that the arm visited at most so many are looked at.
@@ -148,7 +148,7 @@ class BaseMotion:
             if self.slow:
                 self._P[n + 6 :, n + 6 :] = np.diag(_SPEED**2)
         self._Ts.append(seen.T_base_tool)
-        if abs(since_s) < _DATED_S or seen.t_s <= self._right_s:
+        if abs(since_s) < DATED_S or seen.t_s <= self._right_s:
             return
         e, H = seen.residual()
         late, (offset_s, sigma_s) = H[:, self._delay], seen.clock_s
@@ -165,7 +165,7 @@ class BaseMotion:
     @property
     def moved(self) -> Moved | None:
         """The motion up to the newest measurement; None where none is known to be after its beginning."""
-        if not self._moves or self._t_s - self.begin_s < _DATED_S:
+        if not self._moves or self._t_s - self.begin_s < DATED_S:
             return None
         d = slice(self._n, self._n + 6)
         Ts = list(self._Ts)

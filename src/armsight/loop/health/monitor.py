@@ -13,6 +13,7 @@ from armsight.geometry.pose import transform
 from armsight.loop.estimators import Outcome
 from armsight.loop.finding import HealthFinding, Trust, displacement_m
 from armsight.loop.frame_clock import FrameClock
+from armsight.loop.health.base_motion import DATED_S
 from armsight.loop.health.change import Change, ToolView, doubtful, finding, happened_besides, suspected
 from armsight.loop.health.fixed import FixedWatch, ShakeWatch
 from armsight.loop.health.host import HostWatch
@@ -35,8 +36,6 @@ DOUBT_S = 2.0
 #: seconds, and of what is older each time whose age is by this factor less than that of the one before. half of what the
 #: factor exceeds 1 by: 5 MB more, double: what was learned just before an old change is lost.
 _KEEP_S, _ALL_S, _RATIO = 1.0, 20.0, 1.2
-#: A change is dated to about so much, s.
-_DATED_S = 0.7
 #: Stamps that ran fast are put right to about so much, s; half: joints are blamed for the rest, double: poses in motion are
 #: given too wide for some seconds.
 _RIGHT_S = 3e-3
@@ -268,7 +267,7 @@ class HealthMonitor:
         since_s = self.stamps.stepped[0]
         if self._estimator is None or self._clock is None:
             return None
-        if self._known and self._known[0][0] < since_s - _DATED_S:  # else as little would be known as at the beginning
+        if self._known and self._known[0][0] < since_s - DATED_S:  # else as little would be known as at the beginning
             self._go_back(since_s)
         self._clock.jumped(self._newest_s, _RIGHT_S)
         return self._estimator.remembered()
@@ -278,7 +277,7 @@ class HealthMonitor:
         self._doubted_s = -np.inf
         if self._estimator is None or self._arm is None:
             return None
-        self._known = [each for each in self._known if each[0] < since_s - _DATED_S]
+        self._known = [each for each in self._known if each[0] < since_s - DATED_S]
         before = self._known[-1][1] if self._known else self._estimator.nothing_known()
         self._estimator.restore(before)
         self._begin(self._estimator, self._arm)
@@ -299,7 +298,7 @@ class HealthMonitor:
         for each in self._tested(correction):
             if self._explained(each, correction):
                 continue
-            if each.since_s is not None and each.since_s < correction.since_s - _DATED_S:
+            if each.since_s is not None and each.since_s < correction.since_s - DATED_S:
                 left.append(each)
             elif correction.update is None or each.cause == "joint":
                 left.append(replace(each, alternatives=tuple(dict.fromkeys((*each.alternatives, cause)))))
@@ -335,7 +334,7 @@ class HealthMonitor:
 
         assert self._estimator is not None
         nothing = -np.inf, self._estimator.nothing_known()
-        known = next((each for each in reversed(self._known) if each[0] < begin_s - _DATED_S), nothing)
+        known = next((each for each in reversed(self._known) if each[0] < begin_s - DATED_S), nothing)
         return BaseMotion(self._estimator, known, begin_s, slow=slow)
 
     @property
@@ -355,7 +354,7 @@ class HealthMonitor:
             since_s.append(-np.inf if marks.of_cameras.since_s is None else marks.of_cameras.since_s)
         if self._rig is not None and self._rig.wrong_at_rest:
             since_s.append(self._cameras_s)
-        until_s = min(since_s, default=np.inf) - _DATED_S
+        until_s = min(since_s, default=np.inf) - DATED_S
         known = next((state for t_s, state in reversed(self._known) if t_s < until_s), None)
         return None if known is None or self._estimator is None else self._estimator.as_before(known)
 

@@ -21,14 +21,13 @@ from armsight.robot.boards.contract import MotionBoard
 from armsight.robot.kinematics.arm import Arm
 from armsight.vision.markers.marker import Target
 from armsight.vision.markers.targets import Composite
+from armsight.vision.source import LIVE_S
 from armsight.vision.sources import Source
 
 #: Bound on the relative drift of the two clocks: 50 ppm for each crystal, and the slewing of the host's clock.
 DRIFT = 2e-4
 #: The clocks' rate is that of so many seconds; the least transmission times of two seconds differ by about this, s.
 _WINDOW_S, _SCATTER_S = 60, 1e-3
-#: A live image's time stamp differs from the present time by at most this, s.
-_LIVE_S = 10.0
 
 
 class HostClock:
@@ -87,7 +86,7 @@ class HostClock:
         if shot.t_s is None and shot.problem is not None:
             return shot
         # The clock of cameras that were live may jump.
-        if shot.t_s is None or (abs(self._now() - shot.t_s) > _LIVE_S and not self._live):
+        if shot.t_s is None or (abs(self._now() - shot.t_s) > LIVE_S and not self._live):
             problem = (
                 "has no time" if shot.t_s is None else f"was taken {self._now() - shot.t_s:.0f} s ago by its own time"
             )

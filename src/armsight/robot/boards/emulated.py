@@ -28,9 +28,8 @@ from armsight.robot.boards.frames import (
     VERSION,
     WIRE_BYTES,
 )
-from armsight.robot.boards.link import Emulator, Plant
+from armsight.robot.boards.link import TICK_S, Emulator, Plant
 
-TICK_S = 0.001
 _BITS_PER_BYTE = 10
 _WRAP = 1 << 32
 _FLOAT = np.dtype("<f4")

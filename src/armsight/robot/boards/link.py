@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 
 from armsight.data import Array
 
+TICK_S = 1e-3  # of a board's control loop, which the firmware fixes
+
 
 class Sensed(NamedTuple):
     """What a board's converters read at the beginning of a tick; a tuple, as one is made every millisecond."""

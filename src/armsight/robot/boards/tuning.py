@@ -29,6 +29,7 @@ import numpy as np
 from armsight.data import Array
 from armsight.errors import InputError
 from armsight.robot.boards import headers
+from armsight.robot.boards.link import TICK_S
 
 #: Gain -> smallest and largest value.
 GAIN_RANGES = headers.ranges("joint_gains")
@@ -36,7 +37,6 @@ _PAIRS = 0.35
 #: Dry friction is compensated by a little less than it is, so that it never drives.
 _FRICTION_SHARE = 0.9
 _LEAST_ANTI_WINDUP_PER_S = 20.0
-_TICK_S = 1e-3
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ def tuned_gains(
     ki = filter_s * c0 * per_rad_s2
     kp = filter_s * c1 * per_rad_s2 - ki * filter_s
     kd = max(filter_s * c2 * per_rad_s2 - kp * filter_s - 0.5 * own / stall, 0.0)
-    ka = max(per_rad_s2 - kd * (filter_s + 0.5 * _TICK_S), 0.0)
+    ka = max(per_rad_s2 - kd * (filter_s + 0.5 * TICK_S), 0.0)
     kf = _FRICTION_SHARE * motor.dry_n_m / stall
     return np.array([kp, ki, kd, own / stall + kd, ka, kf, filter_s, max(3 * ki / kp, _LEAST_ANTI_WINDUP_PER_S)])
 
@@ -152,7 +152,7 @@ def _three_pole_gains(motor: MotorFigures, supply_v: float, bandwidth: float, th
     per_rad_s2, double = motor.inertia_kg_m2 / stall, 2 * _ELASTIC_DAMPING
     kp, ki = (1 + double * third) * bandwidth**2 * per_rad_s2, third * bandwidth**3 * per_rad_s2
     kd = max((double + third) * bandwidth * per_rad_s2 - 0.5 * own / stall, 0.0)
-    ka = max(per_rad_s2 - kd * (_MOTOR_SMOOTH_S + 0.5 * _TICK_S), 0.0)
+    ka = max(per_rad_s2 - kd * (_MOTOR_SMOOTH_S + 0.5 * TICK_S), 0.0)
     kf = _FRICTION_SHARE * motor.dry_n_m / stall
     windup = max(3 * ki / kp, _LEAST_ANTI_WINDUP_PER_S)
     return np.array([kp, ki, kd, own / stall + kd, ka, kf, _ELASTIC_FILTER_S, windup])
@@ -248,8 +248,8 @@ def _is_quiet(gains: Array, noise_rad: float, duty_noise: float) -> bool:
     if any(gain > most for gain, (_, most) in zip(gains, GAIN_RANGES.values(), strict=True)):
         return False
     kp, _, kd, *_, filter_s, _ = gains
-    share = _TICK_S / (filter_s + _TICK_S)
-    speed_noise = noise_rad * share / _TICK_S * np.sqrt(2 / (2 - share))
+    share = TICK_S / (filter_s + TICK_S)
+    speed_noise = noise_rad * share / TICK_S * np.sqrt(2 / (2 - share))
     return bool(np.hypot(kp * noise_rad, kd * speed_noise) <= duty_noise)
 
 

@@ -20,6 +20,7 @@ from armsight.data import Array, Image, Shot
 from armsight.errors import DeviceError, InputError
 from armsight.geometry.pose import exp_se3, inverse, log_se3, pose, transform
 from armsight.processes import Process
+from armsight.robot.boards.link import TICK_S
 from armsight.robot.kinematics.arm import Arm
 from armsight.sim.camera.pipeline import SimulatedCamera
 from armsight.sim.camera.stages import CameraPipeline, preset_names
@@ -30,7 +31,7 @@ from armsight.sim.render.scene import Pattern, PosedBody, plate
 from armsight.sim.workcell.controlled import ControlledArm
 from armsight.sim.workcell.images import ArmSeen, LedSeen, WorkcellCamera
 from armsight.sim.workcell.motors import Solids, row_frames
-from armsight.sim.workcell.plant import TICK_S, ArmPlant
+from armsight.sim.workcell.plant import ArmPlant
 from armsight.sim.workcell.raycast import arm_capsules, capsule_boxes
 from armsight.vision.rig import StereoRig
 from armsight.vision.sources import Source

@@ -28,7 +28,7 @@ from armsight.errors import InputError
 from armsight.geometry.pose import pose
 from armsight.geometry.rotation import exp_so3, quaternion_wxyz
 from armsight.kernels import kernel
-from armsight.robot.boards.link import Sensed
+from armsight.robot.boards.link import TICK_S, Sensed
 from armsight.robot.kinematics.arm import Arm
 from armsight.robot.kinematics.table import BASE, TOOL, link, rows_of
 from armsight.sim.workcell.arm import TrueArm, pot_travel
@@ -213,7 +213,6 @@ class Potentiometers:
         return counts
 
 
-TICK_S = 0.001
 #: Damping between shaft and link, of critical.
 _DAMPING = 0.08
 #: The arm hangs in its joints before time begins, s.

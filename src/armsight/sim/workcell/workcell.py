@@ -25,6 +25,7 @@ from armsight.robot.board_registry import configured, open_emulator, slowed
 from armsight.robot.boards.configuration import JOINTS
 from armsight.robot.boards.contract import MotionBoard
 from armsight.robot.boards.emulated import EmulatedLink
+from armsight.robot.boards.link import TICK_S
 from armsight.robot.kinematics.arm import Arm
 from armsight.sim.camera.stages import CameraPipeline
 from armsight.sim.example_rig import board_poses
@@ -46,7 +47,7 @@ from armsight.sim.workcell.cameras import (
 from armsight.sim.workcell.controlled import CONTROLLED, Controlled, ControlledArm, standing
 from armsight.sim.workcell.images import LENS, WorkcellCamera, picture
 from armsight.sim.workcell.motors import chosen, solids
-from armsight.sim.workcell.plant import TICK_S, ArmPlant
+from armsight.sim.workcell.plant import ArmPlant
 from armsight.vision.markers.targets import Composite
 from armsight.vision.rig import StereoRig
 

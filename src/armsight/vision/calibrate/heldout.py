@@ -26,7 +26,7 @@ from armsight.vision.pose.bundle import BundleSolution, Observations
 from armsight.vision.rig import StereoRig
 from armsight.vision.triangulate import optimal_points
 
-_LEAST_SIGMA_PX = 1e-6
+LEAST_SIGMA_PX = 1e-6
 #: The perspective bias depends on the pose and the pose on the bias: it shrinks a hundredfold each round.
 _BIAS_ROUNDS = 4
 #: A point this many times as far from the rigid fit as the usual one is an outlier, which a measurement drops by name.
@@ -87,7 +87,7 @@ def middles(rig: StereoRig, body: Array, seen: Correspondences, disc_radius_m: f
     """
     centres = seen
     for _ in range(_BIAS_ROUNDS):
-        p, _, _ = optimal_points(rig, centres.uv, centres.cov_uv + max(rig.sigma_px, _LEAST_SIGMA_PX) ** 2 * np.eye(2))
+        p, _, _ = optimal_points(rig, centres.uv, centres.cov_uv + max(rig.sigma_px, LEAST_SIGMA_PX) ** 2 * np.eye(2))
         good = np.isfinite(p).all(axis=1)
         if good.sum() < 3:
             break
@@ -110,7 +110,7 @@ def _pair_error(
     seen = Correspondences(seen.ids[seen.paired], seen.uv[seen.paired], seen.cov_uv[seen.paired])
     if disc_radius_m > 0:
         seen = middles(rig, estimated, seen, disc_radius_m)
-    cov = seen.cov_uv + max(rig.sigma_px, _LEAST_SIGMA_PX) ** 2 * np.eye(2)
+    cov = seen.cov_uv + max(rig.sigma_px, LEAST_SIGMA_PX) ** 2 * np.eye(2)
     p, cov_p, by_rig = optimal_points(rig, seen.uv, cov)
     good = np.flatnonzero(np.isfinite(p).all(axis=1))
     if len(good) >= 3:

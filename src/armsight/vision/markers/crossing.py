@@ -31,10 +31,10 @@ _STEPS = 25
 #: Neighbours up to so many pixels away have correlated noise; pixels of a window are at most so far from its origin.
 LAGS, REACH = 3, 20
 _LAMBDA = 1e-3
-_BLUR2_MIN = 0.03  # px^2; below it a pixel's width hides the blur, and the cost gets kinks
+BLUR2_MIN = 0.03  # px^2; below it a pixel's width hides the blur, and the cost gets kinks
 #: Weak prior on a squared blur, mean and sigma, px^2, as strong as one pixel with a noise of one grey level. It acts
 #: only on what the pixels do not determine: the blur of an edge that falls between two pixels.
-_BLUR2_PRIOR = (0.25, 0.25)
+BLUR2_PRIOR = (0.25, 0.25)
 
 #: Lever arm by which the rotation of an edge is converted to a shift, px.
 _ARM_PX = 10.0
@@ -146,13 +146,13 @@ def _assemble(
             w[m] = _ZERO
     products(full, rows(w), H)
     _add_plain(flat, x0, y0, q, H)
-    mean, weight = _BLUR2_PRIOR[0], 1.0 / _BLUR2_PRIOR[1] ** 2
+    mean, weight = BLUR2_PRIOR[0], 1.0 / BLUR2_PRIOR[1] ** 2
     cost = H[PARAMETERS, PARAMETERS]
     for i in (4, 5):
         H[i, i] += weight
         H[PARAMETERS, i] += weight * (mean - q[i])
         cost += weight * (mean - q[i]) ** 2
-        if q[i] < 1.001 * _BLUR2_MIN and H[PARAMETERS, i] < 0.0:  # at its bound: held there for this step
+        if q[i] < 1.001 * BLUR2_MIN and H[PARAMETERS, i] < 0.0:  # at its bound: held there for this step
             H[i, i] *= 1e9
             H[PARAMETERS, i] = 0.0
     return float(cost)
@@ -228,7 +228,7 @@ def fit_crossing(
         g = H[PARAMETERS, :PARAMETERS]
         solve(L, g, x)
         trial[:] = q + x
-        trial[4], trial[5] = max(trial[4], _BLUR2_MIN), max(trial[5], _BLUR2_MIN)
+        trial[4], trial[5] = max(trial[4], BLUR2_MIN), max(trial[5], BLUR2_MIN)
         gain = dot(x, g)  # how much lower the cost should get, or a little more
         x[:] = trial - q
         done = damping <= 1.0 and (gain < stop * cost / pixels or _slight(x, q, slight))

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from armsight.data import Array, Ids, Record
 from armsight.geometry.matrix import dot, product, solved
 from armsight.kernels import kernel
+from armsight.vision.markers.crossing import BLUR2_MIN, BLUR2_PRIOR
 from armsight.vision.markers.quads import square_to_quad
 from armsight.vision.normal import edge, factor, invert, solve
 
@@ -32,7 +33,6 @@ PARAMETERS = FIELD + 6  # ..., squared blur, b, c, a, k (2)
 _STEPS, _STALL, _LAMBDA = 40, 0.05, 1e-2  # as in corner.py
 #: A step is the last when it lowers the cost by less than so many times one pixel's noise; in the first fit by so many.
 _STOP, _STOP_FIRST = 0.5, 20.0  # the step is taken: what is left is a hundredth of it
-_BLUR2_MIN = 0.03  # px^2, as in corner.py
 _BLOCK = 128  # pixels
 
 
@@ -181,7 +181,7 @@ def _assemble(n: int, px: Array, grid: Array, prior: Array, q: Array, J: Array, 
         A[i, i] += prior[i, 1]
         g[i] += prior[i, 1] * (prior[i, 0] - q[i])
         cost += (q[i] - prior[i, 0]) ** 2 * prior[i, 1]
-    if q[FIELD] < 1.001 * _BLUR2_MIN and g[FIELD] < 0.0:
+    if q[FIELD] < 1.001 * BLUR2_MIN and g[FIELD] < 0.0:
         A[FIELD, FIELD] *= 1e9
         g[FIELD] = 0.0
     return float(cost)
@@ -211,7 +211,7 @@ def _minimise(n: int, px: Array, grid: Array, prior: Array, stop: float, q: Arra
         solve(L, g, step)
         gain = dot(step, g)
         trial[:] = q + step
-        trial[FIELD] = max(trial[FIELD], _BLUR2_MIN)
+        trial[FIELD] = max(trial[FIELD], BLUR2_MIN)
         if current and damping <= 1.0 and gain < stop * cost / n:  # derivatives stay what they are
             step[:], q[:] = trial - q, trial
             for here in J:
@@ -295,8 +295,6 @@ SETTLED_CELLS, SETTLED_PX = 0.1, 0.3
 MISFIT_MAX = 0.5
 
 _ROUNDS = 5
-#: Weak priors, as in ``corner.py``, of a squared blur, px^2: mean and sigma.
-_BLUR2_PRIOR = (0.25, 0.25)
 #: Bow of a line by lens distortion: its deviation is about this times the squared length in px (a webcam near its
 #: corner).
 _BOW_PER_PX = 1e-4
@@ -470,7 +468,7 @@ def _fit_from(
         side += 0.25 * np.hypot(corners[k, 0] - corners[k - 1, 0], corners[k, 1] - corners[k - 1, 1])
     prior, J = np.zeros((FIELD + 3, 2)), np.empty(((n + _BLOCK - 1) // _BLOCK, PARAMETERS + 1, _BLOCK))
     prior[8:FIELD, 1] = (_PRIOR_NOISE * 0.5 / (_BOW_PER_PX * side)) ** 2
-    prior[FIELD, 0], prior[FIELD, 1] = _BLUR2_PRIOR[0], _BLUR2_PRIOR[1] ** -2.0
+    prior[FIELD, 0], prior[FIELD, 1] = BLUR2_PRIOR[0], BLUR2_PRIOR[1] ** -2.0
     prior[FIELD + 2, 1] = (_PRIOR_NOISE / (_BLEED_SHARE * max(q[FIELD + 1], 1.0))) ** 2
     if not _minimise(n, px, grid, prior, _STOP if most == PIXELS_LAST else _STOP_FIRST, q, J, inverse):
         return 2

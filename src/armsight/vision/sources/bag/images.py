@@ -23,7 +23,7 @@ from armsight.errors import InputError
 from armsight.vision.image import decoded
 from armsight.vision.source import Source
 from armsight.vision.sources.bag.pairing import Pairing, Stamps, pair, stamps_of
-from armsight.vision.sources.bag.reader import Bag, BagMessage, Decoded
+from armsight.vision.sources.bag.reader import S_NS, Bag, BagMessage, Decoded
 
 #: Types of messages that hold one image.
 IMAGES = ("sensor_msgs/Image", "sensor_msgs/CompressedImage", "foxglove.RawImage", "foxglove.CompressedImage")
@@ -69,7 +69,6 @@ _COMPRESSED = re.compile(r"/(compressed|image_compressed)$")
 _NAMED = (("left", "right"), ("cam0", "cam1"), ("camera0", "camera1"), ("infra1", "infra2"), ("fisheye1", "fisheye2"))
 #: Of several topics of one camera the first of these is taken: raw before rectified or processed images.
 _PREFERRED = ("image_raw", "image", "image_mono", "image_color")
-_S_NS = 1e9
 #: Messages that wait until they are due, MB; half: a recording far from the order of time is read more often; double: twice
 #: the memory.
 _HELD_MB = 128
@@ -147,9 +146,9 @@ class BagSource(Source):
 
 def _plan(pairing: Pairing, stamps: tuple[Stamps, Stamps]) -> list[_Planned]:
     """Return the shots in the order of time."""
-    rows = [(pairing.due_ns[0, k], _Planned((k, n), stamps[0].t_ns[k] / _S_NS, None)) for k, n in pairing.pairs]
+    rows = [(pairing.due_ns[0, k], _Planned((k, n), stamps[0].t_ns[k] / S_NS, None)) for k, n in pairing.pairs]
     for (side, n), problem in pairing.alone.items():
-        rows.append((pairing.due_ns[side, n], _Planned((), stamps[side].t_ns[n] / _S_NS, problem)))
+        rows.append((pairing.due_ns[side, n], _Planned((), stamps[side].t_ns[n] / S_NS, problem)))
     return [planned for _, planned in sorted(rows, key=lambda row: row[0])]
 
 

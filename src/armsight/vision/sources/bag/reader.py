@@ -36,6 +36,7 @@ _CHUNK_MB = 100
 #: Bytes before the stamp of a message that begins with a header: ROS 1 has a sequence number, CDR says its byte order.
 _BEFORE_STAMP = 4
 _SECOND_NS = 1_000_000_000
+S_NS = float(_SECOND_NS)
 #: Suffixes of recordings; in a folder files of the first that is there are one recording.
 SUFFIXES = (".mcap", ".db3", ".bag")
 _INSTALL = 'pip install "armsight[ros]"'

@@ -15,11 +15,10 @@ from scipy.spatial.transform import Rotation, Slerp
 from armsight.data import Array, Record
 from armsight.errors import InputError
 from armsight.geometry.pose import inverse
-from armsight.vision.sources.bag.reader import Bag, Decoded
+from armsight.vision.sources.bag.reader import S_NS, Bag, Decoded
 
 JOINTS = ("sensor_msgs/JointState", "foxglove.JointStates")
 TRANSFORMS = ("tf2_msgs/TFMessage", "tf/tfMessage", "foxglove.FrameTransforms", "foxglove.FrameTransform")
-_S_NS = 1e9
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +95,7 @@ def read_joints(bag: Bag, names: tuple[str, ...] | None = None) -> JointStream |
             )
         theirs = here
         stamp = message.stamp_ns()
-        rows.append(((stamp if stamp > 0 else message.arrival_ns) / _S_NS, [found[each] for each in theirs]))
+        rows.append(((stamp if stamp > 0 else message.arrival_ns) / S_NS, [found[each] for each in theirs]))
     if not rows or names is None:
         if partial and names is not None:
             raise InputError(
@@ -130,7 +129,7 @@ def read_transforms(bag: Bag) -> dict[str, tuple[str, PoseTrack]]:
     rows: dict[tuple[str, str], list[tuple[float, Array]]] = {}
     for message in bag.messages([topic.name for topic in bag.of_kind(*TRANSFORMS)]):
         for stamp_ns, parent, child, T in _transforms(message.decode()):
-            rows.setdefault((parent, child), []).append(((stamp_ns or message.arrival_ns) / _S_NS, T))
+            rows.setdefault((parent, child), []).append(((stamp_ns or message.arrival_ns) / S_NS, T))
     tree: dict[str, tuple[str, PoseTrack]] = {}
     for (parent, child), poses in rows.items():
         t_s, first = np.unique([t for t, _ in poses], return_index=True)
@@ -142,10 +141,10 @@ def _transforms(message: Decoded) -> Iterator[tuple[int, str, str, Array]]:
     """Yield stamp, ns, parent, child and pose (4, 4) of each transform of a message."""
     for each in getattr(message, "transforms", [message]):
         if hasattr(each, "parent_frame_id"):
-            stamp_ns = int(each.timestamp.seconds) * int(_S_NS) + int(each.timestamp.nanos)
+            stamp_ns = int(each.timestamp.seconds) * int(S_NS) + int(each.timestamp.nanos)
             parent, child, t, r = each.parent_frame_id, each.child_frame_id, each.translation, each.rotation
         else:
-            stamp_ns = int(each.header.stamp.sec) * int(_S_NS) + int(each.header.stamp.nanosec)
+            stamp_ns = int(each.header.stamp.sec) * int(S_NS) + int(each.header.stamp.nanosec)
             parent, child = each.header.frame_id, each.child_frame_id
             t, r = each.transform.translation, each.transform.rotation
         quaternion = np.array([r.x, r.y, r.z, r.w], float)

@@ -21,7 +21,7 @@ from armsight.vision.markers.tag import TagTarget
 from armsight.vision.markers.targets import Composite
 from armsight.vision.sources.bag.images import parsed, stamps_of_topics, two_topics
 from armsight.vision.sources.bag.pairing import pair
-from armsight.vision.sources.bag.reader import Bag, BagMessage, Decoded
+from armsight.vision.sources.bag.reader import S_NS, Bag, BagMessage, Decoded
 
 #: Types of messages that hold a camera's detected tags, with corners.
 TAGS = (
@@ -31,7 +31,6 @@ TAGS = (
 )
 #: Types that hold their poses alone.
 _WITHOUT_CORNERS = ("apriltag_ros/AprilTagDetectionArray", "apriltag_ros_msgs/AprilTagDetectionArray")
-_S_NS = 1e9
 
 
 def read_tags(spec: str, target: Target | Body) -> tuple[list[SeenShot], tuple[str, ...]]:
@@ -74,7 +73,7 @@ def read_tags(spec: str, target: Target | Body) -> tuple[list[SeenShot], tuple[s
         (left, uv_left), (right, uv_right) = seen
         if problem is None and not len(left) and not len(right):
             problem = "no tag of the body was detected"
-        shots.append(SeenShot(f"{number:06d}", (left, right), (uv_left, uv_right), t_ns / _S_NS, problem))
+        shots.append(SeenShot(f"{number:06d}", (left, right), (uv_left, uv_right), t_ns / S_NS, problem))
     if not any(len(ids) for shot in shots for ids in shot.ids):
         raise InputError(f"{path}: no tag of body {_name(target)} is in it; it has {_listed(unknown) or 'none'}")
     notes = [*bag.notes, *pairing.notes]
