@@ -67,7 +67,7 @@ def is_worse(value: float, stored: float, each: dict[str, Any]) -> bool:
 
 def items(run: dict[str, Any], stored: dict[str, float]) -> list[str]:
     """Return a run's figures as items of a list, metres as mm, those of one kind in one item."""
-    kinds: dict[str, list[str]] = {}
+    kinds: dict[str, dict[str, str]] = {}
     for name in run["figures"]:
         value = stored.get(f"{run['name']}: {name}")
         if value is None:
@@ -78,8 +78,14 @@ def items(run: dict[str, Any], stored: dict[str, float]) -> list[str]:
         ):  # of one alone, or a unit
             whose, kind = "", name
         kind, value = (f"{kind}m", 1e3 * value) if kind.endswith(", m") else (kind, value)
-        kinds.setdefault(kind, []).append(f"{whose} {value:.4g}".strip())
-    return [f"- {kind}: {'; '.join(known)}" for kind, known in kinds.items()]
+        kinds.setdefault(kind, {})[whose] = f"{value:.4g}"
+    texts = {
+        kind: f"{alike.pop()} each"
+        if len(alike := set(known.values())) == 1 < len(known)
+        else "; ".join(f"{whose} {value}".strip() for whose, value in known.items())
+        for kind, known in kinds.items()
+    }
+    return [f"- {kind}: {text}" for kind, text in texts.items()]
 
 
 def page(written: str, runs: list[dict[str, Any]], stored: dict[str, float]) -> str:
