@@ -159,7 +159,7 @@ def test_mistakes_are_one_line(armsight, run, tmp_path):
     assert_rejected(armsight("arm", "report", tmp_path / "no.json"), "no.json: no such folder")
     assert_rejected(armsight("arm", "report", tmp_path), "does not name its arm")
     assert_rejected(armsight("arm", "report", tmp_path, "--arm", "so101"), "is no run")
-    (tmp_path / "summary.json").touch()
+    (tmp_path / "summary.json").write_text("{}")
     assert_rejected(armsight("arm", "report", tmp_path, "--arm", "so101"), "the run ended before its motions")
     assert_rejected(armsight("arm", "report", run, "--arm", "six_r"), "is not of an arm of 6 joints")
     (tmp_path / "other.json").write_text("{}")
