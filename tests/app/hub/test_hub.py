@@ -225,3 +225,18 @@ def test_a_rotation_of_one_camera_shows_in_tilt_or_size(axis):
     changed, expected = np.abs(np.subtract(*found)), np.radians(0.01) * np.array([1.0, 0.85 / rig.baseline_m])
     assert changed[axis] == pytest.approx(expected[axis], rel=0.05)
     assert changed[1 - axis] < 0.05 * expected[1 - axis]
+
+
+def test_events_of_an_earlier_command_do_not_end_this_one(hub_at, cell_at, port, wait):
+    """The order in which they come, in batches of any size, is that in which they were made."""
+    hub = hub_at(port)
+    cell_at(f"a@127.0.0.1:{port}")
+    wait(lambda: shown(hub).get("a", {}).get("level") == 0)
+    old = {"level": "info", "text": "", "t": 1.0}
+    for n, kind in enumerate(("ended", "began", "nothing"), start=1):
+        hub._stored("site", "a", {"outbox": "x", "events": [{**old, "kind": kind, "n": n}, 7]})
+    wait(hub._heard.empty)
+    with hub._lock:
+        assert not hub._cells["site", "a"].ended
+    hub._stored("site", "a", {"outbox": "x", "events": [{**old, "kind": "ended", "n": 4}]})
+    wait(lambda: hub._cells["site", "a"].ended)

@@ -103,8 +103,10 @@ class Hub:
         if not (NAME.fullmatch(site) and NAME.fullmatch(cell)):
             return 0
         n = self._store.add_events(site, cell, message, time.time())
-        if n and any(each["kind"] == "ended" for each in message["events"][-1:]):
-            self._hear((site, cell, "ended", time.time(), None))
+        if n:  # a command that began after one that ended has not ended
+            kinds = [each.get("kind") for each in message["events"] if isinstance(each, dict)]
+            for kind in [kind for kind in kinds if kind in ("began", "ended")][-1:]:
+                self._hear((site, cell, kind, time.time(), None))
         return n
 
     def _run(self) -> None:
@@ -139,8 +141,8 @@ class Hub:
                 cell.token(session, came, at_s)
                 if came:
                     self._ask(cell, at_s)
-            elif what == "ended":
-                cell.ended = len(cell.sessions) < 2
+            elif what in ("began", "ended"):
+                cell.ended = what == "ended" and len(cell.sessions) < 2
             elif what == "state":
                 before_s = cell.state_s
                 row = cell.take(content, at_s)
