@@ -186,7 +186,7 @@ def buying_page() -> str:
     intro = (
         f"[`armsight budget`](howto/budget.md) predicts these figures for a volume of {BOUGHT['volume']} at "
         f"{BOUGHT['distance']}: 95 % of the errors are within them at the worst position. In motion the body moves at "
-        f"{BOUGHT['speed']}; the next column says what most of that is due to. Price classes reach from 1 (tens of "
+        f"{BOUGHT['speed']}; the next column says what that is mostly due to. Price classes reach from 1 (tens of "
         "euros a pair) to 5 (thousands). `python benchmarks/budget.py page` writes this page."
     )
     printed = (
@@ -194,7 +194,7 @@ def buying_page() -> str:
         "`armsight budget -o kit` draws the body. Measure both after printing: that gains more than better cameras."
     )
     head = (
-        "| kit | price class | at rest | in motion | most of it | at rest, print measured | one camera, at rest | "
+        "| kit | price class | at rest | in motion | mostly due to | at rest, print measured | one camera, at rest | "
         "three, at rest |"
     )
     lines = ["# What to buy", "", *textwrap.wrap(intro, 116), "", head, "|" + "---|" * 8, *rows]
