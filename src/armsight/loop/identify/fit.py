@@ -3,6 +3,7 @@
 Gauss-Newton (:mod:`armsight.estimate.solve`). Where the instrument's covariance is given, what the residuals show beyond it
 (the arm's repeatability, what the model does not know) is estimated by restricted likelihood and added: one sigma of
 position, one of rotation. A pose further from the model than chance allows is left out; the median sets the scale for that.
+What a pose's own covariance explains is never left out.
 
 Scatter of the joints from pose to pose (backlash that nothing holds on one side, jitter; :func:`joint_noise`): what the
 residuals show beyond the instrument's covariance is attributed to the joints, each of which moves the body along its own
@@ -155,7 +156,10 @@ def fit(
         before = noise
         taken = len(s.x) - float(linear.known @ (s.root**2).sum(axis=1))  # parameters, less what priors determine
         if linear.e.size - taken >= MIN_FREEDOM * linear.e.size:
-            sigmas = np.sqrt(restricted(linear, variances_of(linear, noise), MIN_NOISE, MAX_NOISE))
+            start = np.fmax(
+                noise, _robust_noise(linear.e)
+            )  # what is not there shrinks; far below it nothing would grow
+            sigmas = np.sqrt(restricted(linear, np.square(start[: len(linear.own)]), MIN_NOISE, MAX_NOISE))
             noise = (float(sigmas[0]), float(sigmas[1]) if len(sigmas) > 1 else 0.0)
         kept, keep = keep, (_sane(model, x, measured, phi, noise) if used is None else keep)
         if (kept == keep).all() and np.allclose(before, noise, rtol=1e-2, atol=MIN_NOISE):
@@ -212,10 +216,14 @@ def _robust_noise(e: Array) -> tuple[float, float]:
 
 
 def _sane(model: Model, x: Array, measured: Measured, phi: Array, noise: tuple[float, float]) -> Mask:
-    """Return which poses (N,) are no outliers, by the scale of the median."""
+    """Return which poses (N,) are no outliers: by the scale of the median, or because their own covariance explains them.
+
+    With few degrees of freedom the parameters take residuals for themselves, and the median is below what was given.
+    """
     linear = linear_of(model, x, measured, phi, np.zeros(len(x), bool), np.full(len(x), np.inf))
-    far = (whitened(linear, variances_of(linear, noise))[0] ** 2).sum(axis=1)
-    return by_chance(far, measured.size, CHANCE)
+    variances = variances_of(linear, noise)
+    far, given = ((whitened(linear, v)[0] ** 2).sum(axis=1) for v in (variances, 0.0 * variances))
+    return np.asarray(by_chance(far, measured.size, CHANCE) | (given <= chdtri(measured.size, CHANCE)))
 
 
 START_RAD, START_M = 1e-3, 1e-4  # where the search starts, rad and m: what is not there shrinks from it
@@ -270,12 +278,12 @@ def with_joint_noise(model: Model, x: Array, measured: Measured, sigma_rad: Arra
 
 
 def _of_sides(model: Model, x: Array, phi: Array) -> Array:
-    """Return the variance (N, n), rad^2, of joints in backlash that gravity closes: 1 - mean^2 of a side of +-1."""
+    """Return the variance (N, n), rad^2, of joints in their backlash: 1 - mean^2 of a side of +-1, whatever closes it."""
     out = np.zeros((len(phi), model.arm.joints))
     for k, f in enumerate(model.features):
-        if f.kind == "gravity_backlash":
+        if f.kind in ("backlash", "gravity_backlash"):
             half = 0.5 * x[model.sources_at + k]
-            out[:, f.joint] = half**2 * (1 - (2 * phi[:, k]) ** 2) * phi[:, k].any()
+            out[:, f.joint] += half**2 * (1 - (2 * phi[:, k]) ** 2) * phi[:, k].any()
     return out
 
 
