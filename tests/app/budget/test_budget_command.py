@@ -83,3 +83,4 @@ def test_what_was_given_is_not_said_to_be_chosen(armsight):
     assert "distance" not in chosen
     assert "camera" not in chosen
     assert "baseline 200mm" in chosen
+    assert "none" not in chosen

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+from armsight.app.budget.run import against_run, run_plan
 from armsight.app.run.tracks import ToolTrack, write_track
 from armsight.files import write_text
 from armsight.geometry.pose import exp_se3, pose
@@ -58,8 +59,34 @@ def test_the_cause_that_does_not_fit_is_named(armsight, run, monkeypatch):
     found = {row["errors"]: row for row in json.loads(said.out)["run"]}
     motion = found["in motion"]
     assert not motion["fits"]
-    assert (motion["cause"], motion["factor"]) == ("skew", 3.0)
+    assert motion["factors"] == {"skew": 3.0}
     assert found["constant at rest"]["measured_rms_m"] < found["constant at rest"]["predicted_rms_m"]
+
+
+def test_causes_that_are_not_there_are_named_and_unknown_cameras_are_said(armsight, run, monkeypatch):
+    monkeypatch.setattr(result, "CHANGES", {})
+    write_text(run / "plan.toml", "skew_ms = 100.0\nstart_ms = 80.0\n")
+    said = armsight("budget", run / "plan.toml", "--run", run, "--json")
+    motion = next(row for row in json.loads(said.out)["run"] if row["errors"] == "in motion")
+    # Neither alone: the other predicts more than ten times what was measured.
+    assert {"skew", "start of exposures"} <= motion["factors"].keys()
+    assert all(motion["factors"][cause] <= 0.5 for cause in ("skew", "start of exposures"))
+    assert "the run's cameras are not known: give --camera" in said.err
+    given = armsight("budget", run / "plan.toml", "--run", run, "--camera", "global-shutter-1mp")
+    assert "not known" not in given.err
+
+
+def test_blur_is_of_the_speed_of_each_shot(run, monkeypatch):
+    """At a plan's speed of 1 m/s, what is predicted of blur alone is that of a plan at the run's own speed."""
+    found = {}
+    monkeypatch.setattr("armsight.app.budget.run._rows_of", lambda budget, _: (budget, []))
+    for speed in ("0.1m/s", "0.2m/s"):
+        plan = run_plan(run, camera="webcam-720p", speed=speed, exposure_ms=20.0)
+        found[speed] = against_run(run, plan)[0].cov(of="exposure blur")
+        px = plan.conditions().noise_px["exposure blur"] / plan.speeds[0]
+        found[speed] = np.sqrt(np.trace(found[speed][:, :3, :3], axis1=1, axis2=2)) / px
+        assert found[speed].max() > 0
+    np.testing.assert_allclose(found["0.1m/s"], found["0.2m/s"], rtol=1e-9)
 
 
 def test_no_run_is_one_line(armsight, tmp_path):

@@ -1,6 +1,7 @@
 """A plan of a rig: what it says, the noise of its markers, its budget, and what cannot be built."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from armsight.sim.budget import result
 from armsight.sim.budget.chart import marker_noise
 from armsight.sim.budget.plan import RigPlan, catalogue, planned
 from armsight.sim.camera.stages import CameraPipeline
-from armsight.vision.rig import StereoRig
+from armsight.vision.rig import Shutters, StereoRig
 
 
 def test_a_file_says_the_same_as_options(tmp_path):
@@ -41,6 +42,8 @@ def test_noise_is_what_the_detector_shows():
         ({"volume": "400x400x300m"}, "is it in mm"),
         ({"volume": "0.4x0.4"}, "width x height x depth"),
         ({"volume": "0.2x0.2x0.8m", "distance": "0.3m"}, "behind the cameras; a distance above 0.4 m"),
+        ({"volume": "0x0x0m"}, "each side must be above zero"),
+        ({"volume": "0.1x0.1x0.1m", "baseline": "1mm"}, "two cameras cannot stand 1 mm apart"),
         ({"distance": "800"}, "with its unit"),
         ({"speed": "300m/s"}, "is it in mm/s"),
         ({"want": "0.1"}, "expected 0.1mm or 0.1mm,0.05deg"),
@@ -84,6 +87,16 @@ def test_python_takes_the_keys_of_a_plan_file():
         armsight.budget(sped="0.2m/s")
     with pytest.raises(InputError, match="pairs must be a whole number, got '20'"):
         armsight.budget(pairs="20")
+    with pytest.raises(InputError, match=r"pairs must be a whole number, got 20\.5"):
+        armsight.budget(pairs=20.5)
+
+
+def test_python_takes_paths_whole_floats_and_numbers_of_numpy():
+    given = {"rig": Path("a/rig.json"), "pairs": 20.0, "rate_hz": np.int64(30), "skew_ms": np.float32(2)}
+    found = RigPlan.read("", **given)
+    assert (found.rig, found.pairs, found.rate_hz, found.skew_ms) == (str(Path("a/rig.json")), 20, 30, 2.0)
+    assert isinstance(found.pairs, int)
+    assert RigPlan.read("", pairs=np.int32(12)).pairs == 12
 
 
 def test_the_best_is_at_a_minimum_and_alternatives_are_grouped(monkeypatch):
@@ -111,3 +124,29 @@ def test_a_rig_that_there_is_has_its_own_calibration(tmp_path):
     ratio = twice.found.rms(twice.found.cov(of="calibration"))[0] / once.rms(once.cov(of="calibration"))[0]
     assert ratio == pytest.approx(2.0, rel=1e-6)
     np.testing.assert_allclose(twice.found.cov(of="pixel noise"), once.cov(of="pixel noise"), rtol=1e-6)
+
+
+def test_what_a_rig_says_itself_cannot_be_given_beside_it(tmp_path):
+    plan = RigPlan(volume="0.1x0.1x0.1m")
+    plan.stereo_rig.save(path := tmp_path / "rig.json")
+    given = {"volume": "0.1x0.1x0.1m", "rig": path}
+    values = {"baseline": "500mm", "verging_deg": 5.0, "focal_widths": 1.0, "board": "chessboard:8x5:20mm"}
+    for key, value in (values | {"pairs": 9, "board_bent": "1mm"}).items():
+        with pytest.raises(InputError, match=rf"rig.json has its own {key}"):
+            RigPlan.read("", **given, **{key: value}).check()
+    late = RigPlan.read("", **given, skew_ms=4.0, start_ms=1.0)
+    late.check()
+    assert late.timing["skew"] == pytest.approx(0.004)
+    replace(plan.stereo_rig, shutters=Shutters(0.004, 0.0, np.zeros((2, 2)))).save(path)
+    for key in ("skew_ms", "start_ms"):
+        with pytest.raises(InputError, match=rf"rig.json has its own {key}"):
+            RigPlan.read("", **given, **{key: 1.0}).check()
+
+
+def test_other_cameras_keep_what_is_named(monkeypatch):
+    named = {"skew_ms": 100.0, "start_ms": 0.0, "exposure_ms": 1.0}
+    plan = RigPlan.read("", volume="0.1x0.1x0.1m", camera="webcam-720p", **named)
+    two = ("webcam-720p", "global-shutter-1mp")
+    monkeypatch.setattr(result, "catalogue", lambda: {name: catalogue()[name] for name in two})
+    monkeypatch.setattr(result, "CHANGES", {})
+    assert not result.RigBudget(plan, planned(plan)).changes  # the skew that is named costs most, and stays

@@ -62,6 +62,11 @@ def budget_report(found: RigBudget, alternatives: Sequence[Alternative] = (), ru
         "map": ("Over the volume", [Plot("volume", partial(_map, found.found), caption, title)]),
     }
     notes = [
+        *(
+            [Note("note", "the run's cameras are not known: give --camera")]
+            if run and "camera" not in plan.named
+            else []
+        ),
         Note("note", f"chosen: {_chosen(plan)}"),
         *(Note("note", f"not in the budget: {why}") for why in NOT_MODELLED),
     ]
@@ -130,15 +135,16 @@ def _answer(found: RigBudget) -> tuple[Grade, str]:
 
 def _chosen(plan: RigPlan) -> str:
     """Say what was left out."""
-    left = [each.name for each in plan.settings() if each.name not in plan.named]
+    left = [each.name for each in plan.settings() if each.name not in (*plan.named, *plan.of_rig)]
     shown = {
         "focal_widths": f"{plan.focal_px / plan.image_size_px[0]:.2f}",
         "verging_deg": f"{plan.stereo_rig.convergence_deg:.0f}",
         "rate_hz": f"{plan.timing['rate']:g}",
         **{f"{name}_ms": f"{1e3 * plan.timing[name]:.2g}" for name in ("skew", "start", "exposure")},
-        **{"body": "tool_body", "want": "none", "arm": "none", "rig": "none"},
+        "body": "tool_body",
     }
-    return ", ".join(f"{name} {shown.get(name, getattr(plan, name))}" for name in left)
+    said = {name: shown.get(name, getattr(plan, name)) for name in left}
+    return ", ".join(f"{name} {value}" for name, value in said.items() if value != "")
 
 
 def _map(found: Budget) -> Figure:

@@ -5,6 +5,8 @@ In: the folder of ``armsight run`` or ``demo``, and the plan of its rig. Out: a 
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -37,8 +39,8 @@ _FITS = {"precision": (1 / PREDICTED, PREDICTED), "trueness": (0.0, 2.0)}
 def against_run(folder: Path, plan: RigPlan) -> tuple[TextTable, list[dict[str, Any]]]:
     """Compare what a run measured with the budget at each shot: scatter at rest, what is constant, and in motion.
 
-    The truth is that of a simulated run, else the fused track; then what is constant cannot be seen. The cause that does
-    not fit is the one whose change makes the errors likeliest.
+    The truth is that of a simulated run, else the fused track; then what is constant cannot be seen. The causes that
+    do not fit are those whose changes make the errors likeliest.
     """
     T, before, T_true, after, known = _poses(folder)
     e = np.einsum("nij,nj->ni", T[:, :3, :3], log_se3(inverse(T_true) @ T)[:, :3])
@@ -50,8 +52,9 @@ def against_run(folder: Path, plan: RigPlan) -> tuple[TextTable, list[dict[str, 
         plan.conditions(), speed_m_s=1.0, rotation_rad_s=float(np.median(rotation / np.maximum(speed, _SLOW)))
     )
     found = pose_budget(rig, points, normals, views, given)
-    scaled = {name: F * (speed[:, None, None] if CAUSES[name].moving else 1.0) for name, F in found.factors.items()}
-    found, still = replace(found, factors=scaled), speed < _SLOW
+    of_plan = plan.speeds[0]  # which its blur in px is of; all else that moves is of 1 m/s
+    faster = {name: speed for name, kind in CAUSES.items() if kind.moving} | {"exposure blur": speed / (of_plan or 1.0)}
+    found, still = _scaled(found, {name: each[:, None, None] for name, each in faster.items()}), speed < _SLOW
     rest = np.cumsum(np.diff(still, prepend=still[:1]))  # the number of each rest, and of each motion
     constant = np.array([e[rest == k].mean(axis=0) for k in rest])
     kinds = {
@@ -113,25 +116,55 @@ def _poses(folder: Path) -> tuple[Array, Array, Array, Array, bool]:
     return T, before, T_true, after, simulated
 
 
+def _scaled(found: Budget, by: Mapping[str, float | Array]) -> Budget:
+    """Return a budget whose causes' standard deviations are multiplied by factors, each one or (G, 1, 1)."""
+    return replace(found, factors={name: F * by.get(name, 1.0) for name, F in found.factors.items()})
+
+
+def _fit(found: Budget, which: Array, e: Array, share: str) -> tuple[float, float]:
+    """Return the RMS that is predicted of errors (N, 3) of shots, m, and their mean log density but for a constant."""
+    C = found.cov(of=share)[which, :3, :3] + 1e-14 * np.eye(3)
+    d2 = np.einsum("ni,nij,nj->n", e, np.linalg.inv(C), e)
+    return float(np.sqrt(np.trace(C, axis1=1, axis2=2).mean())), -float((d2 + np.linalg.slogdet(C)[1]).mean())
+
+
+def _likeliest(found: Budget, which: Array, e: Array, share: str) -> dict[str, float]:
+    """Return causes and their factors: the one that raises the likelihood most, then the next, until chance explains it."""
+    changed, high = dict[str, float](), _FITS[share][1]
+    chance = 3 * (high**2 - 1 - 2 * math.log(high))  # what the last factor that fits gains, in all three axes
+    free, likely = (
+        [c for c in found.factors if CAUSES[c].common == (share == "trueness")],
+        _fit(found, which, e, share)[1],
+    )
+    while len(changed) < len(free):
+        tried = {
+            (cause, factor): _fit(_scaled(found, {cause: factor}), which, e, share)[1]
+            for cause in free
+            if cause not in changed
+            for factor in _FACTORS
+        }
+        cause, factor = max(tried, key=lambda key: tried[key])
+        if tried[cause, factor] - likely < chance * bool(changed):
+            break
+        likely, found, changed[cause] = tried[cause, factor], _scaled(found, {cause: factor}), factor
+    return changed
+
+
 def _rows_of(found: Budget, kinds: dict[str, tuple[Array, Array, str]]) -> tuple[TextTable, list[dict[str, Any]]]:
-    """Return the table of kinds of errors -> (which shots, errors (N, 3), precision or trueness), and the same as JSON."""
+    """Return the table of kinds of errors -> (which shots, errors (N, 3), precision or trueness), and the same as JSON.
+
+    Where the RMS does not fit, causes are named by how many times as large they make the errors likeliest.
+    """
     listed, rows = list[dict[str, Any]](), list[tuple[str, ...]]()
     for name, (which, errors, share) in kinds.items():
-        e, cov = errors[which], found.cov(of=share)[which, :3, :3]
-        measured = float(np.sqrt((e**2).sum(axis=1).mean()))
-        predicted = float(np.sqrt(np.trace(cov, axis1=1, axis2=2).mean()))
-        likely = {}
-        for cause in (c for c in found.factors if CAUSES[c].common == (share == "trueness")):
-            for factor in _FACTORS:
-                C = found.cov(of=share, scaled=cause, by=factor)[which, :3, :3] + 1e-14 * np.eye(3)
-                d2 = np.einsum("ni,nij,nj->n", e, np.linalg.inv(C), e)
-                likely[cause, factor] = -float((d2 + np.linalg.slogdet(C)[1]).mean())
-        cause, factor = max(likely, key=lambda key: likely[key])
-        low, high = _FITS[share]
+        e, (low, high) = errors[which], _FITS[share]
+        measured, predicted = float(np.sqrt((e**2).sum(axis=1).mean())), _fit(found, which, errors[which], share)[0]
         fits = low <= measured / predicted < high
+        changed = {} if fits else _likeliest(found, which, e, share)
         row = {"errors": name, "measured_rms_m": measured, "predicted_rms_m": predicted, "fits": fits}
-        listed.append(row if fits else row | {"cause": cause, "factor": factor})
+        listed.append(row | {"factors": changed})
+        words = ", ".join(f"{cause} {factor:g} times" for cause, factor in changed.items())
         shown = (f"{1e3 * measured:.2g} mm", f"{1e3 * predicted:.2g} mm", f"{measured / predicted:.2f}")
-        rows.append((name, *shown, "" if fits else f"{cause}: likeliest {factor:g} times as large"))
+        rows.append((name, *shown, f"likeliest: {words} as large" if words else ""))
     columns = ("errors of the run", "measured, RMS", "predicted", "ratio", "what does not fit")
     return TextTable("the run against its budget", columns, tuple(rows)), listed

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import os
 import re
 from dataclasses import Field, dataclass, field, fields, replace
 from functools import cache, cached_property, lru_cache
@@ -50,12 +51,16 @@ MOST_SQUARE_PX = (
 )
 #: Lengths that a table-top cell has, m: what lies outside is mm given as m.
 _LEAST_M, _MOST_M = 0.001, 20.0
+_LEAST_APART_M = 0.01  # m; half: endoscopes pass, double: the smallest camera modules are rejected
 _MOST_OFF_M = 0.01  # m; what a print may be off; half: sagging boards are rejected, double: mm meant as um pass
 #: Shortest focal length that is chosen where none is given, image widths: 80 degrees; half: lenses that bend the image more
 #: than the model of five coefficients, double: ordinary volumes are rejected.
 _WIDEST = 0.6
 _UNITS = {"um": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0}
 _NUMBER = r"((?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:e-?[0-9]+)?)"
+#: What a rig that there is says itself; and, where it says when its rows are exposed.
+_OF_RIG = ("baseline", "verging_deg", "focal_widths", "board", "pairs", "board_bent")
+_OF_SHUTTERS = ("skew_ms", "start_ms")
 #: Key -> least and most that a plan may say.
 _RANGES = {
     "verging_deg": (0.0, 120.0), "focal_widths": (0.2, 20.0), "body_scale": (0.05, 20.0), "pairs": (3, 1000),
@@ -99,6 +104,12 @@ def length_m(text: str, what: str) -> float:
     if found is None:
         raise InputError(f"{what} {text!r}: expected a length with its unit, such as 0.8m or 300mm")
     return float(found[1]) * _UNITS[found[2]]
+
+
+def _plain(value: object) -> object:
+    """Return a path as text, and a number of NumPy as one of Python."""
+    value = os.fspath(value) if isinstance(value, os.PathLike) else value
+    return value.item() if isinstance(value, np.generic) else value
 
 
 @dataclass(frozen=True)
@@ -176,12 +187,14 @@ class RigPlan:
         """
         known = {each.name: type(each.default) for each in RigPlan.settings()}
         values = read_toml(path) if path else {}
-        given = values | {key: value for key, value in given.items() if value is not None}
+        given = values | {key: _plain(value) for key, value in given.items() if value is not None}
         for key, value in given.items():
             of = f"{path}: " if key in values else ""
             if key not in known:
                 near = difflib.get_close_matches(key, known, 1)
                 raise InputError(f"{of}unknown key {key!r}{f': did you mean {near[0]}?' if near else ''}")
+            if known[key] is int and isinstance(value, float) and value.is_integer():
+                given[key] = value = int(value)
             if not isinstance(value, (int, float) if known[key] is float else known[key]) or isinstance(value, bool):
                 kind = {str: "a text", int: "a whole number", float: "a number"}[known[key]]
                 raise InputError(f"{of}{key} must be {kind}, got {value!r}")
@@ -203,7 +216,9 @@ class RigPlan:
         size = np.array([float(n) for n in found.groups()[:3]]) * _UNITS[found[4]]
         if size.max() > _MOST_M:
             raise InputError(f"volume {self.volume}: {size.max():g} m is no table-top cell: is it in mm?")
-        if size.min() < 0 or not self.distance_m - size[2] / 2 > 0:
+        if not size.min() > 0:
+            raise InputError(f"volume {self.volume}: each side must be above zero")
+        if not self.distance_m - size[2] / 2 > 0:
             raise InputError(
                 f"volume {self.volume} at {self.distance}: it reaches behind the cameras; a distance above "
                 f"{size[2] / 2:g} m is needed"
@@ -228,6 +243,13 @@ class RigPlan:
         return StereoRig.load(Path(self.folder) / self.rig) if self.rig else None
 
     @cached_property
+    def of_rig(self) -> tuple[str, ...]:
+        """Keys whose values the rig that there is has itself."""
+        if self.existing is None:
+            return ()
+        return _OF_RIG + (_OF_SHUTTERS if self.existing.shutters else ())
+
+    @cached_property
     def image_size_px(self) -> tuple[int, int]:
         """Width and height."""
         return self.existing.left.image_size_px if self.existing else self.cameras.image_size_px
@@ -235,7 +257,14 @@ class RigPlan:
     @cached_property
     def baseline_m(self) -> float:
         """Distance of the cameras."""
-        return self.existing.baseline_m if self.existing else self._reach_m("baseline")
+        if self.existing:
+            return self.existing.baseline_m
+        if (found := self._reach_m("baseline")) < _LEAST_APART_M:
+            raise InputError(
+                f"baseline {self.baseline}: two cameras cannot stand {1e3 * found:g} mm apart: at least "
+                f"{1e3 * _LEAST_APART_M:g} mm"
+            )
+        return found
 
     def _two(self, what: str, text: str, units: tuple[str, str], form: str) -> tuple[float, float]:
         """Read a length and an angle, rad; the second is 0 where it is left out."""
@@ -367,6 +396,8 @@ class RigPlan:
             value = getattr(self, key)
             if value != getattr(RigPlan, key) and not least <= value <= most:
                 raise InputError(f"{key} is {value:g}: expected {least:g} to {most:g}")
+        if own := [key for key in self.named if key in self.of_rig]:
+            raise InputError(f"{self.rig} has its own {', '.join(own)}: leave out what it says itself")
         if self.body and self.body_scale != 1.0:
             raise InputError(f"body_scale is {self.body_scale:g}: it is of the default body, not of {self.body}")
 

@@ -175,7 +175,7 @@ class RigBudget(Record):
         tried = [(text, price, lens | change(plan)) for text, (price, change) in CHANGES.items()]
         for name, each in catalogue().items():
             if each.price > plan.cameras.price and not plan.rig:
-                tried.append((f"{name}: {each.text}", each.price, {**OF_CAMERA, "camera": name}))
+                tried.append((f"{name}: {each.text}", each.price, _of_camera(plan, name)))
         for text, price, change in tried:
             try:
                 after = planned(replace(plan, **change))  # type: ignore[arg-type]
@@ -246,9 +246,8 @@ def best(plan: RigPlan, progress: Callable[[str], None] = lambda _: None) -> tup
     found = []
     for name in [plan.camera] if "camera" in plan.named else catalogue():
         progress(name)
-        other = {key: value for key, value in OF_CAMERA.items() if key not in plan.named}
         pairs = plan.pairs if "pairs" in plan.named else PAIRS
-        searched = replace(_searched(replace(plan, **other, camera=name)), pairs=pairs)
+        searched = replace(_searched(replace(plan, **_of_camera(plan, name))), pairs=pairs)
         if math.isfinite(_loss(searched)):
             found.append(RigBudget(searched, planned(searched)))
     if not found:
@@ -261,6 +260,11 @@ def best(plan: RigPlan, progress: Callable[[str], None] = lambda _: None) -> tup
             first, group = one, group + 1
         groups.append(Alternative(one, group))
     return tuple(sorted(groups, key=lambda one: (one.price, one.budget.mm)))
+
+
+def _of_camera(plan: RigPlan, name: str) -> dict[str, Any]:
+    """Return what another class of cameras changes; what the plan names stays."""
+    return {key: value for key, value in OF_CAMERA.items() if key not in plan.named} | {"camera": name}
 
 
 @lru_cache(maxsize=512)
