@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from enum import Enum
 from typing import Any, Literal
 
@@ -49,7 +49,7 @@ class HealthFinding:
         alternatives: other causes that explain it nearly as well.
         corrected_s: when it was put right, s; None where it was not.
         cost_mm: by how much it displaces the tool, or what is measured, at most so far, mm; None where that is not known.
-        pose_sigma_mm: sigma of the newest measured positions as it was before anything was found, mm; None without a pose.
+        pose_sigma_mm: sigma of measured positions, as without what was found, the least since, mm; None without a pose.
     """
 
     cause: Cause
@@ -68,6 +68,17 @@ class HealthFinding:
     def subject(self) -> tuple[str, str]:
         """What it is about: its cause, and its words before it says by how much."""
         return self.cause, self.what.partition(" by ")[0]
+
+    def since(self, before: HealthFinding | None) -> HealthFinding:
+        """Return it with the largest cost and the least sigma since it was found before: ``forbids`` does not flicker."""
+        if before is None:
+            return self
+        costs, sigmas = (
+            [each for each in both if each is not None]
+            for both in ((self.cost_mm, before.cost_mm), (self.pose_sigma_mm, before.pose_sigma_mm))
+        )
+        cost_mm = None if self.cost_mm is None else max(costs)
+        return replace(self, cost_mm=cost_mm, pose_sigma_mm=min(sigmas, default=None))
 
     @property
     def forbids(self) -> bool:

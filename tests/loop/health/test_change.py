@@ -56,6 +56,8 @@ def test_a_slip_of_the_body_is_the_same_at_every_pose_and_a_drift_goes_on():
     np.testing.assert_array_equal(change("body").displacement(T_LATER, 20.0)[0], MOTION)
     now, later = (change("drift").displacement(T, t_s)[0] for t_s in (14.0, 18.0))
     np.testing.assert_allclose(later, 2.0 * now, atol=1e-12)
+    # No further than as long again as it was seen: a stale finding does not widen poses without bound.
+    np.testing.assert_allclose(change("drift").displacement(T, 1e4)[0], 2.0 * now, atol=1e-12)
 
 
 def second_order(shift):

@@ -72,6 +72,18 @@ def test_a_side_of_the_backlash_that_is_wrong_for_two_blocks_is_no_slip(deg):
     assert watch.changes == ()
 
 
+def test_what_explained_something_once_and_does_no_more_is_taken_back():
+    once, watch = watched(11, "bend", np.radians([0.04, 0.0, 0.0, 0.0])), watched(11)
+    assert once.certain
+    watch.explained, watch.certain = once.explained, once.certain
+    watch._decide()  # finds nothing
+    assert watch.explained == watch.certain == ()
+    once._unsure = dict.fromkeys(once._unsure, 1e9)
+    once._decide()
+    assert once.explained
+    assert once.certain == ()  # it widens no pose
+
+
 SHIFT = np.array([6e-4, 0.0, 3e-4, 0.0, np.radians(0.03), 0.0])
 
 

@@ -1,5 +1,7 @@
 """What moves to and fro within a second, bodies that are strained as prints are, images that were seen before."""
 
+from types import SimpleNamespace
+
 import faults
 import numpy as np
 import pytest
@@ -7,8 +9,10 @@ from faults import ended, strained, watched_body
 
 from armsight.geometry.pose import inverse, log_se3
 from armsight.loop.finding import HealthFinding, health_lines
+from armsight.loop.health import HealthMonitor
 from armsight.loop.health.fixed import Unrest
 from armsight.loop.health.rig import RigWatch
+from armsight.loop.running.data import HealthNotes
 
 X, Y = np.eye(3)[:2]
 
@@ -89,6 +93,15 @@ def test_what_hardly_displaces_poses_forbids_nothing():
     assert first.startswith("note: ")
     assert second.startswith("do not trust this result: ")
     assert "by up to 0.50 mm" in second
+
+
+def test_a_finding_that_costs_about_a_sigma_is_noted_once():
+    monitor, notes, made = HealthMonitor(faults.TRUE, faults.BODY, 0.0), HealthNotes(), []
+    for k, sigma_m in enumerate((3.5e-4, 2.5e-4) * 5):
+        found = HealthFinding("rig", "moved by x", None, 0.02, 0.001, "deg", "y", cost_mm=0.3)
+        monitor._rig = SimpleNamespace(findings=lambda found=found: (found,), pose_sigma_m=sigma_m, wrong_at_rest=False)
+        made += list(notes.of(float(k), monitor.findings()))
+    assert [each.level for each in made] == ["info", "warning"]  # it forbids from the least sigma on
 
 
 def test_a_lens_that_breathes_within_a_second_is_a_lens():

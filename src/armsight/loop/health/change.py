@@ -219,8 +219,9 @@ class Change(Record):
             by = self.seen.zoomed(T_base_tool[:3, :3], T_base_tool[:3, 3])[:, None]
         elif self.suspect.kind != "body":  # the base moves the tool by the lever to it
             by = adjoint(inverse(T_base_tool) @ self.T_base_tool) @ by
-        if self.suspect.slow:
-            by = by * (t_s - self.begin_s) / (self.end_s - self.begin_s)
+        if self.suspect.slow:  # it is taken to go on for as long as it was seen, at most
+            seen_s = self.end_s - self.begin_s
+            by = by * min(t_s - self.begin_s, 2.0 * seen_s) / seen_s
         return by @ self.size, by @ self.cov @ by.T
 
     @property

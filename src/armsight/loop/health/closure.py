@@ -160,7 +160,8 @@ class ClosureWatch:
 
     Attributes:
         changes: the hypotheses that explain best what was found, the best first; empty while all is well.
-        explained: the same, also where it is smaller than is reported: it explains what another test reports.
+        explained: the same by the newest test, also where it is smaller than is reported: what another test reports.
+        certain: of these what is as certain as what is reported at first: poses are widened by it.
         strongest: of all tests the largest chi-square over its limit.
     """
 
@@ -185,6 +186,7 @@ class ClosureWatch:
         self._clear()
         self.changes: tuple[Change, ...] = ()
         self.explained: tuple[Change, ...] = ()
+        self.certain: tuple[Change, ...] = ()
         self.strongest = 0.0
 
     def _clear(self) -> None:
@@ -342,7 +344,16 @@ class ClosureWatch:
         return np.asarray(columns * self._wide[part] * after[:, None, None])
 
     def _decide(self) -> None:
-        """Test all hypotheses at some beginnings, and the best of them at those between."""
+        """Test what explains the blocks best, and report it where it is certain and matters."""
+        changes, certain = self._best()
+        self.explained, self.certain = changes, changes if certain else ()
+        # Once something was reported, what explains it best replaces it, also where it is smaller than is reported first.
+        if changes and (self.changes or (certain and _matters(changes[0]))):
+            # What was reported before is not undone by something else that began later.
+            self.changes = (*changes, *happened_besides(self._reported(), changes[0]))
+
+    def _best(self) -> tuple[tuple[Change, ...], bool]:
+        """Test all hypotheses at some beginnings, the best of them at those between; return whether they are certain."""
         begins = _begins(len(self._t))
         found = self._tested(begins, suspects(self._parts.joints))
         limits = _limits(self._parts.joints)
@@ -350,18 +361,15 @@ class ClosureWatch:
         self.strongest = max(self.strongest, *(each.chi_square / at_first[each.suspect.freedom] for each in found))
         finest = self._closest(begins, found)
         if not finest:
-            return
+            return (), False
         # The errors are what the best one leaves, not what is left while nothing is taken to have changed.
         best = max(finest, key=lambda each: each.above)
         # Where none is above its limit with all blocks, the block that is left out is six more numbers that explain.
         clear = max(each.above for each in found) > 0.0
         if best.above <= (0.0 if clear else limits[best.suspect.freedom + 6] - limits[best.suspect.freedom]):
-            return
-        changes = self.explained = ranked([self._change(each, best.left) for each in finest])
-        # Once something was reported, what explains it best replaces it, also where it is smaller than is reported first.
-        if self.changes or (best.above > self._unsure[best.suspect.freedom] and _matters(changes[0])):
-            # What was reported before is not undone by something else that began later.
-            self.changes = (*changes, *happened_besides(self._reported(), changes[0]))
+            return (), False
+        certain = best.above > self._unsure[best.suspect.freedom]
+        return ranked([self._change(each, best.left) for each in finest]), certain
 
     def _reported(self) -> tuple[Change, ...]:
         """Return what was reported to have happened first, as alternatives of each other."""

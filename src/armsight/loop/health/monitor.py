@@ -87,6 +87,7 @@ class HealthMonitor:
         self._measurements: Measurements | None = None
         # What was found before a correction: what it put right, and what else.
         self._kept: tuple[HealthFinding, ...] = ()
+        self._found: dict[tuple[str, str], HealthFinding] = {}  # what was found last, by its subject
         self._past: tuple[Change, ...] = ()
 
     def received(self, pose: PoseEstimate, t_s: float | None) -> PoseEstimate:
@@ -420,7 +421,7 @@ class HealthMonitor:
     @property
     def _widening(self) -> tuple[Change, ...]:
         """What widens poses now: what is certain, also where it is smaller than is reported."""
-        small = () if self._closure is None or self._clocks(self._closure.explained) else self._closure.explained
+        small = () if self._closure is None or self._clocks(self._closure.certain) else self._closure.certain
         changes = self.changes or small
         return changes if self._shakes.change is None else (*changes, self._shakes.change)
 
@@ -441,7 +442,9 @@ class HealthMonitor:
         )
         now = _with_scene(now, () if self._scene is None else self._scene.findings())
         sigma_m = None if self._rig is None else self._rig.pose_sigma_m
-        now = tuple(replace(each, pose_sigma_mm=None if sigma_m is None else 1e3 * sigma_m) for each in now)
+        sigma_mm = None if sigma_m is None else 1e3 * sigma_m
+        now = tuple(replace(each, pose_sigma_mm=sigma_mm).since(self._found.get(each.subject)) for each in now)
+        self._found = {each.subject: each for each in now}
         again = {each.subject for each in now}
         kept = (each for each in self._kept if each.corrected_s is not None or each.subject not in again)
         return (*kept, *now)
