@@ -150,6 +150,19 @@ def test_an_inertial_unit_is_fused_and_said_to_agree_or_not(armsight, run, tmp_p
         assert answer["reference"]["agrees"] is agrees
         assert answer["reference"]["windows"] > 10
         assert answer["differences"] is None
+        assert 0.2 < answer["reference"]["begin_s"] < 0.3  # the second estimator, which keeps the delay
+    slow = np.column_stack([stamps, z])[::50]
+    np.savetxt(
+        file.with_name("slow.csv"), slow, delimiter=",", header=",".join(["t_s", *INERTIAL_COLUMNS]), comments=""
+    )
+    other = tmp_path / "other.toml"
+    other.write_text(file.read_text().replace("imu.csv", "slow.csv"))
+    assert_rejected(armsight("replay", run, "--references", other), "imu", "50 ms apart", "at most 30 are integrated")
+    slow[:, 0] += 1e3
+    np.savetxt(
+        file.with_name("slow.csv"), slow, delimiter=",", header=",".join(["t_s", *INERTIAL_COLUMNS]), comments=""
+    )
+    assert_rejected(armsight("replay", run, "--references", other), "imu", "do both have one clock?")
     assert "disagrees with joints and vision" in armsight("replay", run, "--references", file).out
     file.write_text('[imu]\nkind = "inertial"\nsource = "imu.csv"\n')
     assert_rejected(armsight("replay", run, "--references", file), "imu", "has no parameters", "references calibrate")

@@ -22,6 +22,8 @@ DENSITY = np.repeat([CLASS.gyro_noise, CLASS.noise], 3)
 #: What a calibration leaves: rotation, lever, biases, M_a, M_g, G, tilt.
 LEFT = np.repeat([5e-4, 5e-4, 2e-4, 5e-3, 3e-4, 3e-4, 1e-5, 3e-4], [3, 3, 3, 3, 6, 9, 9, 2])
 CHANCE = 1e-4
+#: The camera's delay is right.
+KNOWN = Delay(0.0, 2e-4)
 
 
 def unit(left=LEFT, **more):
@@ -50,9 +52,14 @@ def world(seed, seconds, blind_s):
     return q, Ts, looks, said, t_s + np.sqrt(2.0) / (2 * np.pi * 400.0), z
 
 
-def go(q, looks, said=None, t_s=None, z=None, late=0):
-    """Give everything in order of time, 10 ms at a time, images so many ticks late; return the estimator."""
-    estimator, looks = KalmanEstimator(ARM, delay=Delay(0.0, 2e-4)), list(looks)
+def go(q, looks, said=None, t_s=None, z=None, late=0, *, heard=None, delay=KNOWN, learns_delay=False):
+    """Give everything in order of time, 10 ms at a time, images so many ticks late; return the estimator.
+
+    heard: lists to which what became of images and windows is added.
+    """
+    estimator, looks = KalmanEstimator(ARM, delay=delay, learns_delay=learns_delay), list(looks)
+    if heard is not None:
+        estimator.on_innovation, estimator.on_reading = heard[0].append, lambda name, window: heard[1].append(window)
     sensor = None if said is None else replace(said, delay_s=np.sqrt(2.0) / (2 * np.pi * 400.0))
     for begin in range(0, len(q), 10):
         end = min(begin + 10, len(q))
@@ -129,7 +136,90 @@ def test_hidden_for_half_a_second_the_unit_halves_the_error_and_the_covariance_k
         squares.append(e @ np.linalg.solve(now.cov, e))
         alone.append(off(go(q, looks).estimate().T_base_tool, Ts[-1])[:3])
     assert np.sqrt(np.mean(np.square(errors))) < 0.5 * np.sqrt(np.mean(np.square(alone)))
-    assert np.sum(squares) < chi2.ppf(1 - CHANCE, 6 * len(squares)), f"mean NEES {np.mean(squares):.2f}"
+    low, high = chi2.ppf([CHANCE, 1 - CHANCE], 6 * len(squares))
+    assert low < np.sum(squares) < high, f"mean NEES {np.mean(squares):.2f}"
+
+
+def test_all_late_images_are_reported_with_a_unit_as_without():
+    q, _, looks, *imu = world(231, 1.2, 1.0)
+    alone, beside = ([], []), ([], [])
+    go(q, looks, late=40, heard=alone)
+    go(q, looks, *imu, late=40, heard=beside)
+    assert [each.t_s for each in beside[0]] == pytest.approx([each.t_s for each in alone[0]])
+    assert len(beside[0]) == len(looks)
+
+
+def test_while_the_delay_is_learned_a_unit_changes_nothing_and_the_delay_is_as_close_as_its_sigma_says():
+    off_by, squares = [], []
+    for seed in range(4):
+        q, Ts, looks, *imu = world(260 + seed, 2.0, 2.0)
+        late = [replace(look, t_s=look.t_s + 0.003) for look in looks]
+        alone, beside = (go(q, late, *fused, delay=Delay(0.0, 0.01), learns_delay=True) for fused in ((), imu))
+        np.testing.assert_array_equal(beside.estimate().T_base_tool, alone.estimate().T_base_tool)
+        found = beside.learned().delay
+        off_by.append((found.delay_s - 0.003) / found.sigma_s)
+        e = off(beside.estimate().T_base_tool, Ts[-1])
+        squares.append(e @ np.linalg.solve(beside.estimate().cov, e))
+    for sums, freedom in ((np.square(off_by), 1), (squares, 6)):
+        low, high = chi2.ppf([CHANCE, 1 - CHANCE], freedom * len(sums))
+        assert low < np.sum(sums) < high, f"{sums} of {freedom}"
+
+
+def test_what_noise_makes_of_a_window_is_that_of_sampled_noise():
+    rng, rate, count = np.random.default_rng(270), 1000.0, 2000
+    T = pose(exp_so3(np.array([0.3, -1.2, 0.7])), np.zeros(3))
+    density = DENSITY * [1.0, 2.0, 3.0, 1.0, 2.0, 3.0]  # axes that are mixed up show
+    plain, t = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 9.8], (51, 1)), np.arange(51) / rate
+    found = []
+    for _ in range(count):
+        strapdown = Strapdown(unit())
+        strapdown.add(Samples(t, plain + rng.normal(size=plain.shape) * density * np.sqrt(rate), density))
+        window = strapdown.window(0.0, 0.05)
+        found.append(strapdown._constraint(window, np.stack([T, T]), np.zeros(42))[0])
+    expected, sampled_cov = strapdown._noise(window, T), np.cov(np.transpose(found))
+    sigma = np.sqrt(np.diag(expected))
+    # Correlations of so many scatter by 1/sqrt(count), variances by sqrt(2/count); of 51 samples, 1/50 is at the ends.
+    np.testing.assert_allclose(
+        sampled_cov / np.outer(sigma, sigma), expected / np.outer(sigma, sigma), atol=5 * np.sqrt(2 / count) + 0.02
+    )
+
+
+def test_biases_wander_as_sampled_random_walks_do_where_joints_say_nothing():
+    rng, z, T = np.random.default_rng(271), np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 9.8], (200, 1)), np.eye(4)
+    strapdown, rows = Strapdown(unit()), 7
+    strapdown.add(Samples(1e-3 * np.arange(200), z, DENSITY))
+    beside = first = strapdown.started(None, 0.0, T, np.zeros(6), rows)
+    H = np.stack([np.eye(6, 7)] * 2)  # the last row is the delay, which no reading changes
+    for k in range(10):
+        window = strapdown.window(0.01 * k, 0.01 * (k + 1))
+        state, step = (np.zeros(rows), np.eye(rows)), (np.ones(rows), np.ones(rows))
+        beside = strapdown.advanced(window, beside, state, step, (np.stack([T, T]), H), 6).beside
+        beside = beside._replace(C=np.zeros_like(beside.C))
+    # The bias differs over CORNER_S by as much as the average of the noise over that time is off.
+    steps = rng.normal(size=(20000, 100, 6)) * (DENSITY / 6.0) * np.sqrt(1e-3)
+    biases = slice(4 + 6, 4 + 12)
+    gained = np.diag(beside.Y)[biases] - np.diag(first.Y)[biases]
+    np.testing.assert_allclose(gained, steps.sum(axis=1).var(axis=0), rtol=0.05)
+
+
+def test_samples_that_are_far_off_for_a_moment_are_an_outlier_and_are_not_used():
+    q, _, looks, said, t_s, z = world(272, 1.5, 1.5)
+    knocked = z.copy()
+    knocked[(t_s > 1.302) & (t_s < 1.308)] += [0.0, 5.0, 0.0, 0.0, 0.0, 50.0]
+    good, bad = ([], []), ([], [])
+    as_it_is, now = (go(q, looks, said, t_s, each, heard=to).estimate() for each, to in ((z, good), (knocked, bad)))
+    outliers = [sum(each.outcome is Outcome.OUTLIER for each in to[1]) for to in (good, bad)]
+    assert outliers[0] == 0
+    assert 1 <= outliers[1] <= 2
+    moved = off(as_it_is.T_base_tool, now.T_base_tool)
+    assert moved @ np.linalg.solve(now.cov, moved) < 1.0
+
+
+def test_two_batches_of_half_of_what_is_kept_are_taken():
+    strapdown = Strapdown(unit())
+    for first in (0, 4096):
+        strapdown.add(Samples(1e-3 * np.arange(first, first + 4096), np.zeros((4096, 6)), DENSITY))
+    assert strapdown.window(8.19, 8.193) is not None
 
 
 def test_late_images_give_what_images_in_time_give():
@@ -137,8 +227,8 @@ def test_late_images_give_what_images_in_time_give():
     in_time, late = go(q, looks, *imu).estimate(), go(q, looks, *imu, late=40).estimate()
     # Meanwhile more readings of the joints have come about each window's ends: their noise differs, not what is known.
     sigma = np.sqrt(np.diag(in_time.cov)[:3].sum())
-    assert np.linalg.norm(off(in_time.T_base_tool, late.T_base_tool)[:3]) < 0.3 * sigma
-    np.testing.assert_allclose(np.diag(late.cov), np.diag(in_time.cov), rtol=0.25)
+    assert np.linalg.norm(off(in_time.T_base_tool, late.T_base_tool)[:3]) < sigma
+    np.testing.assert_allclose(np.diag(late.cov), np.diag(in_time.cov), rtol=0.6)
 
 
 def test_a_unit_rotated_on_its_mount_shows_in_the_residuals_and_a_good_one_does_not():
@@ -147,11 +237,9 @@ def test_a_unit_rotated_on_its_mount_shows_in_the_residuals_and_a_good_one_does_
         q, _, looks, said, t_s, z = world(240, 3.0, 3.0)
         R, found = exp_so3(np.radians([angle_deg, 0.0, 0.0])), []
         z = np.hstack([z[:, :3] @ R, z[:, 3:] @ R])
-        estimator = KalmanEstimator(ARM, delay=Delay(0.0, 2e-4))
+        estimator = KalmanEstimator(ARM, delay=Delay(0.0, 2e-4), learns_delay=False)
         estimator.on_reading = lambda name, i, found=found: found.append(i.z @ np.linalg.solve(i.cov, i.z) / 6)
-        estimator.joints(
-            states(np.arange(len(q)) * TICK_S, q)[:0] if False else states(np.arange(1500) * TICK_S, q[:1500])
-        )
+        estimator.joints(states(np.arange(1500) * TICK_S, q[:1500]))
         for look in looks[:80]:
             estimator.vision(look)
         for k in range(1500, len(q), 10):
@@ -163,17 +251,21 @@ def test_a_unit_rotated_on_its_mount_shows_in_the_residuals_and_a_good_one_does_
     assert ratios[1] > 1.5 * ratios[0]
 
 
-def test_a_unit_that_images_contradict_is_used_no_more():
+@pytest.mark.parametrize("waits", [False, True])
+def test_a_unit_that_images_contradict_is_used_no_more(waits):
     q, Ts, looks, said, t_s, z = world(241, 3.0, 3.0)
     R = exp_so3(np.radians([20.0, 0.0, 0.0]))
-    looks, estimator = list(looks), KalmanEstimator(ARM, delay=Delay(0.0, 2e-4))
+    looks, estimator = list(looks), KalmanEstimator(ARM, delay=Delay(0.0, 2e-4), learns_delay=False)
     for k in range(0, len(q), 10):
-        estimator.joints(states(np.arange(k, k + 10) * TICK_S, q[k : k + 10]))
+        if not waits:
+            estimator.joints(states(np.arange(k, k + 10) * TICK_S, q[k : k + 10]))
         rows = (t_s > (k - 10) * TICK_S) & (t_s <= k * TICK_S)
         if k > 1000:
             heard = estimator.take(said, Samples(t_s[rows], np.hstack([z[rows, :3] @ R, z[rows, 3:] @ R]), DENSITY))
         while looks and looks[0].t_s <= (k + 9) * TICK_S:
             estimator.vision(looks.pop(0))
+        if waits:
+            estimator.joints(states(np.arange(k, k + 10) * TICK_S, q[k : k + 10]))
     assert heard is Outcome.OUTLIER
     alone = go(q, world(241, 3.0, 3.0)[2]).estimate()
     now = estimator.estimate()

@@ -33,7 +33,7 @@ from armsight.loop.estimators import (
 )
 from armsight.loop.references.file import Entry, read_recording, read_references
 from armsight.loop.references.inertial import INERTIAL_CLASSES
-from armsight.loop.references.strapdown import Samples
+from armsight.loop.references.strapdown import GAP_S, Samples
 from armsight.loop.running.data import EventDatum, JointsDatum, Publisher, ShotDatum
 from armsight.robot.kinematics.arm import Arm
 from armsight.vision.detections import SeenShot
@@ -49,7 +49,7 @@ _Seen = TypeVar("_Seen", Shot, SeenShot)
 #: Every estimator; each takes the arm, and by name ``prior`` and ``delay``.
 ESTIMATORS: dict[str, Callable[..., Estimator]] = {"kalman": KalmanEstimator, "latest": LatestEstimator}
 
-#: Residuals over their sigma up to which a unit agrees (as links count as loose, 1/3 is usual), and the share of outliers;
+#: Residuals over their sigma below which a unit agrees (as links count as loose, 1/3 is usual), and the share of outliers;
 #: half: chance is a fault, double: a loose mount agrees.
 HONEST, OUTLIERS = 1.0, 0.01
 #: Samples that are given at once at most: older ones are of before the estimator began.
@@ -63,8 +63,12 @@ class FusedRow:
     name: str  #: of the reference
     windows: int  #: of its readings that were used or rejected
     outliers: int  #: of them rejected
-    residual_over_sigma: float  #: root mean square; 1 is right
+    begin_s: float  #: since when it was used, s: before, the camera's delay is learned
+    residual_over_sigma: (
+        float  #: root mean square; 1/3 is usual, as links count as loose; from ``HONEST`` on it disagrees
+    )
     agrees: bool  #: whether it agrees with joints and vision
+    rejected_s: float | None  #: when it was dropped as images contradict it, s; None where it was not
     moved_rms_m: float  #: distance of the estimates from those without it, m
     sigma_rms_m: float  #: of the position with it, root of the trace, m
     sigma_without_rms_m: float  #: and without, m
@@ -74,10 +78,14 @@ class FusedRow:
         """It as a line for people."""
         moved, sigma, without = (1e3 * x for x in (self.moved_rms_m, self.sigma_rms_m, self.sigma_without_rms_m))
         found = "agrees" if self.agrees else "disagrees"
+        dropped = (
+            "" if self.rejected_s is None else f"; it was dropped at {self.rejected_s:.1f} s: images contradict it"
+        )
         return (
-            f"with {self.name}: the estimates move by {moved:.3f} mm RMS, sigma {sigma:.3f} mm, without {without:.3f}; it "
-            f"{found} with joints and vision: residuals {self.residual_over_sigma:.2f} of their sigma, {self.outliers} of "
-            f"{self.windows} windows are outliers"
+            f"with {self.name} from {self.begin_s:.1f} s on: the estimates move by {moved:.3f} mm RMS, sigma "
+            f"{sigma:.3f} mm, without {without:.3f}; it {found} with joints and vision: residuals "
+            f"{self.residual_over_sigma:.2f} of their sigma, {self.outliers} of {self.windows} windows are outliers"
+            f"{dropped}"
         )
 
 
@@ -121,7 +129,7 @@ class Fused:
         windows: used so far, outliers included.
         outliers: of them.
         begin_s: time of the first window, s.
-        rejected: whether images contradicted it so that it was used no more.
+        rejected_s: when images contradicted it so that it was used no more, s; None where they did not.
 
     Raises:
         InputError: it is not calibrated, or its recording cannot be read.
@@ -136,8 +144,9 @@ class Fused:
         kind = INERTIAL_CLASSES[entry.sensor_class]
         self._density = np.repeat([kind.gyro_noise, kind.noise], 3)
         self._next, self._squares = 0, 0.0
-        self.windows, self.outliers, self.rejected = 0, 0, False
+        self.windows, self.outliers = 0, 0
         self.begin_s = np.inf
+        self.rejected_s: float | None = None
 
     @staticmethod
     def of(path: Path) -> Fused:
@@ -160,7 +169,8 @@ class Fused:
         if end > first:
             estimator.on_reading = self._heard
             outcome = estimator.take(self.sensor, Samples(self._t_s[first:end], self._z[first:end], self._density))
-            self.rejected = self.rejected or outcome is Outcome.OUTLIER
+            if outcome is Outcome.OUTLIER and self.rejected_s is None:
+                self.rejected_s = end_s
 
     def _heard(self, name: str, innovation: Innovation) -> None:
         """Take a window's residual."""
@@ -172,15 +182,27 @@ class Fused:
 
     @property
     def ratio(self) -> float:
-        """Root mean square of the residuals that were used, over their sigma; 1 is right."""
+        """Root mean square of the residuals that were used, over their sigma."""
         return float(np.sqrt(self._squares / max(self.windows - self.outliers, 1)))
 
     @property
     def agrees(self) -> bool:
         """Whether the residuals are as small as the filter expects."""
-        return (
-            self.windows > 0 and not self.rejected and self.ratio < HONEST and self.outliers < OUTLIERS * self.windows
-        )
+        few = self.windows > 0 and self.outliers < OUTLIERS * self.windows
+        return few and self.rejected_s is None and self.ratio < HONEST
+
+    def unused(self, begin_s: float, end_s: float) -> InputError:
+        """Return why no window was used of a run between two times, s."""
+        t_s = self._t_s[(self._t_s >= begin_s) & (self._t_s <= end_s)]
+        apart = float(np.median(np.diff(t_s))) if len(t_s) > 1 else 0.0
+        why = "the run ended before its mounting and the camera's delay were known; a unit is used from then on"
+        if not len(t_s):
+            why = "no reading is of the run's times; do both have one clock?"
+        elif apart > GAP_S:
+            why = (
+                f"samples are {1e3 * apart:.0f} ms apart, at most {1e3 * GAP_S:.0f} are integrated over; record faster"
+            )
+        return InputError(f"[{self.sensor.name}]: {why}")
 
 
 def replay_run(
@@ -230,13 +252,14 @@ def _row(beside: Fused, before: list[RecordedDatum], live: list[JointsDatum], bo
     """Return what a reference did to the estimates since the first of its windows."""
     rows = [(was, now) for was, now in zip(before, live, strict=True) if now.states.t_s[-1] >= beside.begin_s]
     if not rows:
-        raise InputError(f"[{beside.sensor.name}]: no reading is of the run's times; do both have one clock?")
+        times = [now.states.t_s for now in live] or [np.zeros(1)]
+        raise beside.unused(float(times[0][0]), float(times[-1][-1]))
     p_was, cov_was = (np.array([was.content[key] for was, _ in rows]) for key in ("tool_position_m", "tool_covariance"))
     fused = [now.to_json(body) for _, now in rows]
     p, cov = (np.array([each[key] for each in fused]) for key in ("tool_position_m", "tool_covariance"))
     sigma, sigma_was = (float(np.sqrt(np.einsum("nii->ni", one)[:, :3].sum(axis=1).mean())) for one in (cov, cov_was))
     moved = float(np.sqrt(((p - p_was) ** 2).sum(axis=1).mean()))
-    said = beside.windows, beside.outliers, beside.ratio, beside.agrees
+    said = beside.windows, beside.outliers, beside.begin_s, beside.ratio, beside.agrees, beside.rejected_s
     return FusedRow(beside.sensor.name, *said, moved, sigma, sigma_was)
 
 

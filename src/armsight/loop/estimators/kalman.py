@@ -232,13 +232,7 @@ class KalmanEstimator:
         """Take a pose measurement, in any order of time; return what became of it."""
         if self._unit is not None:
             pose_measurement = replace(pose_measurement, cov_noise=ALIKE * pose_measurement.cov_noise)
-        outcome = self._hear(pose_measurement)
-        if self._unit is not None and outcome is not Outcome.WAITING:
-            self._against = 0 if outcome is Outcome.USED else self._against + 1
-            if self._against >= STUBBORN and self._without is not None:
-                self._rejected, self._unit = self._unit.sensor, None
-                self.restore(self._without)
-        return outcome
+        return self._hear(pose_measurement)
 
     def take(self, reference: Reference, reading: Reading | Samples) -> Outcome:
         """Take a reading of a reference beside vision, in any order of time; return what became of it.
@@ -247,6 +241,7 @@ class KalmanEstimator:
         however often it comes back: which of reference and vision is wrong is not the filter's to say. Samples of an
         inertial unit come in order of time; its parameters and delay are estimated. A unit that so many images in a row
         contradict as reopen a filter is used no more, and what was learned with it is forgotten: they are outliers then.
+        While the camera's delay is learned, none are used: they would shift it by several of its sigma.
 
         Raises:
             InputError: the reference has no such channel, or samples are not of an inertial unit, or not in order.
@@ -256,6 +251,8 @@ class KalmanEstimator:
                 raise InputError(f"{reference.name}: samples are of inertial units; give its readings one by one")
             if reference is self._rejected:
                 return Outcome.OUTLIER
+            if self._learns_delay:
+                return Outcome.WAITING
             if self._unit is None or self._unit.sensor is not reference:
                 self._unit, self._without = Strapdown(reference), self.remembered()
             self._unit.add(reading)
@@ -292,8 +289,10 @@ class KalmanEstimator:
         if seen_s < oldest or (row == 1 and before.measurement is not None and self._after(before, measurement)):
             return Outcome.TOO_LATE
         later = self._states[row:]
-        after, outcome = self._used(before, measurement, report=not later)
-        if after is None:
+        newest_heard = all(isinstance(state.measurement, Until) for state in later)
+        after, outcome = self._used(before, measurement, report=newest_heard)
+        contradicted = isinstance(measurement, PoseMeasurement) and self._contradicted(outcome)
+        if after is None or contradicted:
             return outcome
         self._states[row:] = [after]
         for state in later:
@@ -304,6 +303,17 @@ class KalmanEstimator:
         while len(self._states) > 2 and self._states[1].t_s < self._states[-1].t_s - HISTORY_S:
             del self._states[0]
         return outcome
+
+    def _contradicted(self, outcome: Outcome) -> bool:
+        """Count an image's outcome; return whether so many contradict the inertial unit that it was dropped."""
+        if self._unit is None or self._without is None:
+            return False
+        self._against = 0 if outcome is Outcome.USED else self._against + 1
+        if self._against < STUBBORN:
+            return False
+        self._rejected, self._unit = self._unit.sensor, None
+        self.restore(self._without)
+        return True
 
     def _used(
         self, before: ErrorState, measurement: PoseMeasurement | Taken | Until, *, report: bool = False
@@ -500,8 +510,7 @@ class KalmanEstimator:
         if beside is None or beside.t_s != before.t_s:
             twist = Hs[0][:, self._at.zeros] * self._arm.direction @ before.joints.qd[0]
             beside = self._unit.started(beside, before.t_s, Ts[0], twist, len(before.x))
-        fixed = None if self._learns_delay else self._at.delay
-        got = self._unit.advanced(window, beside, (before.x, before.P), (kept, added), (Ts, Hs), fixed)
+        got = self._unit.advanced(window, beside, (before.x, before.P), (kept, added), (Ts, Hs), self._at.delay)
         outcome = Outcome.USED if chi_square(np.ascontiguousarray(got.S), got.z) < _GATE else Outcome.OUTLIER
         if report and self.on_reading is not None:
             said = got.z, got.S, got.by, kept, got.gain, outcome

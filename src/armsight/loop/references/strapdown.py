@@ -190,7 +190,7 @@ class Strapdown:
 
     def __init__(self, sensor: Inertial) -> None:
         self.sensor, self._density = sensor, np.zeros(6)
-        self._t, self._z = np.empty(_ROWS), np.empty((_ROWS, 6))
+        self._t, self._z = np.empty(_ROWS + 1), np.empty((_ROWS + 1, 6))  # and the one that is held
         self._first = self._count = 0
         self._R, self._lever = sensor.T_tool_sensor[:3, :3], sensor.T_tool_sensor[:3, 3]
         tilt = np.append(sensor.tilt, 0.0)
@@ -270,7 +270,7 @@ class Strapdown:
         state: tuple[Array, Array],
         step: tuple[Array, Array],
         poses: tuple[Array, Array],
-        fixed: int | None,
+        fixed: int,
     ) -> Advanced:
         """Use a window.
 
@@ -306,9 +306,8 @@ class Strapdown:
             P[:, rows] *= kept[rows]
         P.flat[:: len(P) + 1] += added
         P -= gain @ by_x
-        if fixed is not None:
-            P[fixed, fixed] += gain[fixed] @ by_x[:, fixed]
-            gain[fixed] = 0.0
+        P[fixed, fixed] += gain[fixed] @ by_x[:, fixed]
+        gain[fixed] = 0.0
         C -= by_x.T @ gain_y.T
         Y -= gain_y @ by_beside
         after = Navigated(beside.t_s + window.length_s, y + gain_y @ z, C, (Y + Y.T) / 2)
