@@ -7,7 +7,7 @@ import pinocchio
 import pytest
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from armsight import as_transform, ros_fields
+from armsight import as_transform, handeye, ros_fields
 from armsight.errors import InputError
 from armsight.geometry.convert import as_transforms
 from armsight.geometry.pose import exp_se3
@@ -79,6 +79,12 @@ def test_ros_has_the_quaternion_as_x_y_z_w():
         ("pose", "expected a 4x4 matrix"),
         (np.diag([1.0, 1.0, -1.0, 1.0]), "no rigid transform"),
         (T.T, "no rigid transform"),
+        ((Rotation.identity(), ["a", "b", "c"]), r"needs a translation of numbers: expected \(3,\), m"),
+        ((Rotation.identity(), Rotation.identity()), "expected a 4x4 matrix"),
+        (
+            message({"translation": dict.fromkeys("xyz", "a"), "rotation": dict.fromkeys("xyzw", 1.0)}),
+            "expected numbers",
+        ),
         (2 * T, "no rigid transform"),
         (np.full((4, 4), np.nan), "no rigid transform"),
         (message({"position": dict.fromkeys("xyz", 0.0), "orientation": dict.fromkeys("xyzw", 0.0)}), "never set"),
@@ -87,3 +93,29 @@ def test_ros_has_the_quaternion_as_x_y_z_w():
 def test_what_is_none_is_rejected(given, words):
     with pytest.raises(InputError, match=words):
         as_transform(given)
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ([T, np.tile(T, (2, 1, 1))], "holds 2 transforms; expected one"),
+        ([Rotation.identity(), Rotation.identity()], "expected a 4x4 matrix"),
+        ([T, np.full((4, 4), np.nan)], "no rigid transform"),
+        ([T, 2 * T], "no rigid transform"),
+        (np.array([T, 2 * T]), "no rigid transform"),
+        ([T, "pose"], "expected a 4x4 matrix"),
+    ],
+)
+def test_an_entry_that_is_none_is_rejected(given, words):
+    with pytest.raises(InputError, match=f"^entry [01]: .*{words}"):
+        as_transforms(given)
+
+
+def test_matrices_of_five_decimals_are_read():
+    Ts = exp_se3(np.random.default_rng(3).normal(size=(50, 6)))
+    np.testing.assert_allclose(as_transforms(list(np.round(Ts, 5))), Ts, atol=6e-6)
+
+
+def test_handeye_rejects_an_entry_that_holds_two():
+    with pytest.raises(InputError, match="holds 2 transforms; expected one"):
+        handeye([T, np.tile(T, (2, 1, 1))], [T, T])

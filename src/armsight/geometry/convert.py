@@ -13,8 +13,9 @@ from armsight.errors import InputError
 from armsight.geometry.pose import pose
 from armsight.geometry.rotation import Array, from_quaternion_wxyz, quaternion_wxyz
 
-#: Deviation of a rotation from orthonormal that rounding leaves; half: float32 is rejected, double: more drift passes.
-_ROUNDING = 1e-5
+#: Deviation of a rotation from orthonormal that rounding leaves, as `handeye` allows; half: five decimals pass barely,
+#: double: more drift passes.
+_ROUNDING = 1e-4
 
 
 def as_transform(given: object) -> Array:
@@ -46,12 +47,17 @@ def as_transforms(given: Any) -> Array:  # noqa: ANN401 - any library's object
     Such are SciPy's RigidTransform, a table of ``measure_all`` and ROS' PoseArray.
 
     Raises:
-        InputError: an entry is none of these.
+        InputError: an entry is none of these; the message has its number.
     """
     given = getattr(given, "poses", given)
-    if isinstance(given, list | tuple) and not _is_pair(given):
-        return np.array([_matrix(each) for each in given])
-    return _matrix(given)
+    many = given if isinstance(given, list | tuple) and not _is_pair(given) else _matrix(given).reshape(-1, 4, 4)
+    found = np.zeros((len(many), 4, 4))
+    for k, each in enumerate(many):
+        try:
+            found[k] = as_transform(each)
+        except InputError as error:
+            raise InputError(f"entry {k}: {error}") from None
+    return found
 
 
 def _is_pair(given: Any) -> bool:  # noqa: ANN401
@@ -60,16 +66,25 @@ def _is_pair(given: Any) -> bool:  # noqa: ANN401
         isinstance(given, list | tuple)
         and len(given) == 2
         and hasattr(given[0], "as_matrix")
+        and not hasattr(given[1], "as_matrix")
         and np.shape(given[0].as_matrix())[-2:] == (3, 3)
     )
+
+
+def _numbers(given: object) -> Array:
+    """Return an array of numbers, an empty one where there are none."""
+    try:
+        return np.array(given, dtype=float)
+    except (TypeError, ValueError):
+        return np.zeros(0)
 
 
 def _matrix(given: Any) -> Array:  # noqa: ANN401 - any library's object
     """Return the matrix of a transform of another library; (N, 4, 4) where it holds N."""
     if _is_pair(given):
-        R, p = np.asarray(given[0].as_matrix()), np.asarray(given[1], np.float64)
+        R, p = np.asarray(given[0].as_matrix()), _numbers(given[1])
         if p.shape != R.shape[:-1]:
-            raise InputError(f"a rotation {R.shape} with a translation {p.shape}: expected {R.shape[:-1]}, m")
+            raise InputError(f"a rotation {R.shape} needs a translation of numbers: expected {R.shape[:-1]}, m")
         return pose(R, p)
     for name in ("T_left_body", "transform", "pose"):  # a pose, and what ROS wraps
         if (inner := getattr(given, name, None)) is not None:
@@ -78,17 +93,16 @@ def _matrix(given: Any) -> Array:  # noqa: ANN401 - any library's object
         t: Any = getattr(given, moves, None)
         q: Any = getattr(given, rotates, None)
         if hasattr(t, "x") and hasattr(q, "w"):
-            wxyz = np.array([q.w, q.x, q.y, q.z], np.float64)
+            wxyz, p = _numbers([q.w, q.x, q.y, q.z]), _numbers([t.x, t.y, t.z])
+            if (wxyz.shape, p.shape) != ((4,), (3,)):
+                raise InputError(f"{type(given).__name__}: expected numbers as its {moves} and {rotates}")
             if not np.linalg.norm(wxyz) > 0:
                 raise InputError(f"{type(given).__name__}: its quaternion is zero: was it never set?")
-            return pose(from_quaternion_wxyz(wxyz), np.array([t.x, t.y, t.z], np.float64))
+            return pose(from_quaternion_wxyz(wxyz), p)
     given = (
         given.as_matrix() if hasattr(given, "as_matrix") else getattr(given, "homogeneous", getattr(given, "A", given))
     )
-    try:
-        T = np.array(given, dtype=float)
-    except (TypeError, ValueError):
-        T = np.zeros(0)
+    T = _numbers(given)
     if T.shape[-2:] != (4, 4) or T.ndim > 3:
         raise InputError(
             f"{type(given).__name__}: expected a 4x4 matrix, or a transform of pinocchio, SciPy, spatialmath or ROS"

@@ -200,3 +200,30 @@ def test_settings_are_kept_by_name_and_a_newer_folder_is_rejected(tmp_path):
     file.write_text("[]")
     with pytest.raises(InputError, match="not written by `armsight live`"):
         LiveSession(options)
+
+
+@pytest.mark.parametrize(
+    ("kept", "words"),
+    [
+        ("1", "settings 'a': expected an object, got 1"),
+        ("[[1]]", "expected an object"),
+        ('{"cameras": 1}', "cameras must be a text, got 1"),
+        ('{"distance_m": "0.8"}', "distance_m must be a number, got '0.8'"),
+        ('{"error_mm": true}', "error_mm must be a number, got True"),
+        ('{"arm": ["six_r"]}', "arm must be a text"),
+    ],
+)
+def test_kept_settings_of_other_kinds_are_one_line(tmp_path, kept, words):
+    (tmp_path / "session.json").write_text(f'{{"version": 1, "settings": {{"a": {kept}}}}}')
+    with pytest.raises(InputError, match=words):
+        LiveSession(SessionOptions(tmp_path, "usb:0,1"))
+
+
+def test_settings_kept_without_a_port_leave_the_board_that_is_named(tmp_path):
+    (tmp_path / "session.json").write_text('{"version": 1, "settings": {"a": {"arm_board": null, "error_mm": null}}}')
+    session = LiveSession(SessionOptions(tmp_path, "usb:0,1", board="serial:/dev/ttyUSB7"))
+    try:
+        session.use_settings("a")
+        assert session.shared.options.board == "serial:/dev/ttyUSB7"
+    finally:
+        session.close()

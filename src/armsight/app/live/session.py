@@ -45,6 +45,7 @@ _EVENTS = 200
 LOG = "session.log"
 #: What was chosen, by name, in the folder of the session; its version, and the longest name, characters.
 SETTINGS, VERSION, _NAME = "session.json", 1, 60
+_NUMBERS = ("error_mm", "distance_m")  # of what is kept; all else is text, or null where nothing is chosen
 _BEHIND = 1.5  # intervals between shots that a pose may take
 
 
@@ -149,7 +150,14 @@ class LiveSession:
         if not isinstance(settings, dict):
             raise InputError(f"{file}: not written by `armsight live`: move it away")
         require_version(file, "session", found.get("version"), VERSION)
-        return {name: dict(each) for name, each in settings.items()}
+        for name, each in settings.items():
+            if not isinstance(each, dict):
+                raise InputError(f"{file}: settings {name!r}: expected an object, got {each!r:.40}: move it away")
+            for key, value in each.items():
+                kind, words = ((int, float), "a number") if key in _NUMBERS else (str, "a text")
+                if value is not None and (isinstance(value, bool) or not isinstance(value, kind)):
+                    raise InputError(f"{file}: settings {name!r}: {key} must be {words}, got {value!r:.40}")
+        return settings
 
     @asked("")
     def keep_settings(self, name: str) -> None:
@@ -178,11 +186,11 @@ class LiveSession:
             raise InputError(f"no settings {name[:_NAME]!r}; there are {', '.join(self._settings) or 'none'}")
         kept, options = self._settings[name], self.shared.options
         if not self.arm.connected and self.shared.simulated is None:
-            self.shared.options = replace(options, board=kept.get("arm_board", options.board))
+            self.shared.options = replace(options, board=kept.get("arm_board") or options.board)
         choose: dict[str, tuple[object, Callable[[Any], None]]] = {
             "cameras": (self.shared.source, self.cameras.use_cameras),
             "board": (self.calibration.spec, self.board.use_board),
-            "distance_m": (None, lambda far: self.calibration.set_aim(kept.get("error_mm", 0.0), far)),
+            "distance_m": (None, lambda far: self.calibration.set_aim(kept.get("error_mm") or 0.0, far)),
             "body": (self.measuring.target_spec, self.body.use_body),
             "arm": (options.arm, self.arm.use_arm),
             "motion": (str(self.shared.motion), self.arm.use_motion),
