@@ -227,3 +227,12 @@ def test_settings_kept_without_a_port_leave_the_board_that_is_named(tmp_path):
         assert session.shared.options.board == "serial:/dev/ttyUSB7"
     finally:
         session.close()
+
+
+def test_a_name_that_is_no_unicode_is_kept_and_said(tmp_path):
+    session = LiveSession(SessionOptions(tmp_path, "usb:0,1"))
+    try:
+        session.keep_settings("a\ud800")
+        assert "settings kept: a\\ud800" in (tmp_path / "session.log").read_text()
+    finally:
+        session.close()

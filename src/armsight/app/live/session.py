@@ -266,7 +266,7 @@ class LiveSession:
             self._events.append(Event(self._number, time.strftime("%H:%M:%S"), level, text))
             with contextlib.suppress(OSError):  # a full disk ends no session
                 self.folder.mkdir(parents=True, exist_ok=True)
-                with (self.folder / LOG).open("a", encoding="utf-8") as log:
+                with (self.folder / LOG).open("a", encoding="utf-8", errors="backslashreplace") as log:
                     log.write(f"{time.strftime('%Y-%m-%dT%H:%M:%S')} {level}: {text}\n")
 
     def events(self, after: int = 0) -> tuple[Event, ...]:
