@@ -148,17 +148,16 @@ def fit(
         noise: to start from; None: from the residuals at the start.
     """
     phi = model.feature_values(measured.q, measured.approach)
-    keep = np.ones(len(measured), bool) if used is None else used
     noise = _robust_noise(model.residuals(x, measured, phi)) if noise is None else noise
+    keep = _sane(model, x, measured, phi, noise) if used is None else used
     history: list[float] = []
     for _ in range(ROUNDS):
         x, linear, s = _newton(model, x, measured.rows(keep), phi[keep], free, prior, noise, history)
         before = noise
         taken = len(s.x) - float(linear.known @ (s.root**2).sum(axis=1))  # parameters, less what priors determine
         if linear.e.size - taken >= MIN_FREEDOM * linear.e.size:
-            start = np.fmax(
-                noise, _robust_noise(linear.e)
-            )  # what is not there shrinks; far below it nothing would grow
+            # What is not there shrinks; from far below the residuals nothing would grow.
+            start = np.fmax(noise, _robust_noise(linear.e))
             sigmas = np.sqrt(restricted(linear, np.square(start[: len(linear.own)]), MIN_NOISE, MAX_NOISE))
             noise = (float(sigmas[0]), float(sigmas[1]) if len(sigmas) > 1 else 0.0)
         kept, keep = keep, (_sane(model, x, measured, phi, noise) if used is None else keep)
