@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from enum import Enum
@@ -24,6 +25,9 @@ FALSE_ALARMS_PER_MINUTE = 1e-4
 COSTS_M = 1e-4
 #: A rotation counts by what it does at this distance from the body's origin, m.
 LEVER_M = 0.1
+
+#: What changes in the words of a finding while it is the same: 1.24, and 3 of 9; the number of a joint does not.
+_MEASURED = re.compile(r"\d+\.\d+|\d+ of \d+")
 
 
 class Trust(Enum):
@@ -66,8 +70,8 @@ class HealthFinding:
 
     @property
     def subject(self) -> tuple[str, str]:
-        """What it is about: its cause, and its words before it says by how much."""
-        return self.cause, self.what.partition(" by ")[0]
+        """What it is about: its cause, and its words before it says by how much, without measured numbers and counts."""
+        return self.cause, _MEASURED.sub("", self.what.partition(" by ")[0])
 
     def since(self, before: HealthFinding | None) -> HealthFinding:
         """Return it with the largest cost and the least sigma since it was found before: ``forbids`` does not flicker."""

@@ -100,6 +100,9 @@ def test_keys_are_made_once_and_renewed_before_their_end(tmp_path, monkeypatch):
     assert [path.parent.name for path in make_keys(keys, "lab", ["a"], "hub.local", 7447)] == ["a"]
     assert make_keys(keys, "lab", ["a", "b"], "hub.local", 7447) == [keys / "cells/b/cell.toml"]
     assert site_of(keys) == ("lab", ["a", "b"])
+    assert make_keys(keys, "lab", ["a", "b"], "hub.local", 7448) == [keys / f"cells/{n}/cell.toml" for n in "ab"]
+    assert read_cell(str(keys / "cells/b/cell.toml")).router == "tls/hub.local:7448"
+    make_keys(keys, "lab", ["a", "b"], "hub.local", 7447)
     assert (keys / "ca.key").stat().st_mode & 0o077 == 0
     assert read_cell(str(keys / "cells/a/cell.toml")).router == "tls/hub.local:7447"
     with pytest.raises(InputError, match="keys of site lab, not of other"):

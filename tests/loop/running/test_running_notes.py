@@ -43,3 +43,15 @@ def test_one_that_is_put_right_holds_no_longer(notes):
 def test_two_of_one_cause_are_two(notes):
     other = replace(ROTATED, what="the left camera is rotated by 0.01 deg")
     assert len(texts(notes, ROTATED, other)) == 2
+
+
+def test_a_count_or_a_size_that_changes_is_no_other_finding(notes):
+    repeats = replace(ROTATED, cause="host", what="99 of 133 shots repeat the one before")
+    larger = replace(ROTATED, cause="body", what="the body looks 1.24 % larger")
+    assert len(texts(notes, repeats, larger)) == 2
+    again = (
+        replace(repeats, what="101 of 135 shots repeat the one before"),
+        replace(larger, what="the body looks 1.26 % larger"),
+    )
+    assert texts(notes, *again) == []
+    assert replace(ROTATED, what="joint 2 slipped").subject != replace(ROTATED, what="joint 3 slipped").subject

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from armsight.app.stream.cell_file import check_name, hold_bytes
 from armsight.errors import InputError
-from armsight.files import read_bytes, replacing, write_text
+from armsight.files import read_bytes, read_text, replacing, write_text
 
 if TYPE_CHECKING:
     from cryptography import x509
@@ -38,7 +38,7 @@ def make_keys(folder: Path, site: str, cells: Sequence[str], host: str, port: in
         port: of the hub.
 
     Returns:
-        The files of cells that are new, each to be carried to its cell.
+        The files of cells that are new or changed, each to be carried to its cell.
 
     Raises:
         InputError: a name that cannot be part of a key, a folder of another site, or cryptography is not installed.
@@ -55,15 +55,20 @@ def make_keys(folder: Path, site: str, cells: Sequence[str], host: str, port: in
     made = []
     for name in cells:
         at = folder / _CELLS / name
+        router = f"tls/[{host}]:{port}" if ":" in host else f"tls/{host}:{port}"
+        named = {"name": name, "site": site, "router": router}
+        named |= {"ca": "ca.pem", "certificate": "cell.pem", "key": "cell.key"}
+        lines = [f"{key} = {json.dumps(value)}" for key, value in named.items()]
         if _ensure(at / "cell", authority, f"{site}.{name}", []):
             write_text(at / "ca.pem", (folder / "ca.pem").read_text())
-            router = f"tls/[{host}]:{port}" if ":" in host else f"tls/{host}:{port}"
-            named = {"name": name, "site": site, "router": router}
-            named |= {"ca": "ca.pem", "certificate": "cell.pem", "key": "cell.key"}
-            lines = [f"{key} = {json.dumps(value)}" for key, value in named.items()]
-            if not (at / "cell.toml").exists():  # what its owner changed in it stays
-                last = "holds = false  # true: the hub may ask this cell to hold its arm"
-                write_text(at / "cell.toml", "\n".join([*lines, last]) + "\n")
+            made.append(at / "cell.toml")
+        if not (at / "cell.toml").exists():
+            last = "holds = false  # true: the hub may ask this cell to hold its arm"
+            write_text(at / "cell.toml", "\n".join([*lines, last]) + "\n")
+        before = read_text(at / "cell.toml")  # what its owner changed in it stays; the hub's address follows
+        now = re.sub(r"(?m)^router = .*$", lines[2], before)
+        if now != before:
+            write_text(at / "cell.toml", now)
             made.append(at / "cell.toml")
     return made
 

@@ -152,7 +152,10 @@ class MeasureRun:
                 if arrival_s is not None and arrival_s - looked_s > _HEALTH_S:
                     looked_s = arrival_s
                     for note in notes.of(arrival_s, self.monitor.findings()):
-                        _warn(note.text)
+                        if note.level == "warning":
+                            _warn(note.text)
+                        else:
+                            click.echo(f"note: {note.text}", err=True)
                         publisher.put(note)
                 if self.options.as_json:
                     click.echo(json.dumps(record.to_json()))

@@ -21,7 +21,7 @@ CHANGES: dict[str, tuple[int, Callable[[RigPlan], dict[str, object]]]] = {
     "start both cameras by one trigger": (2, lambda plan: {"skew_ms": 0.0, "start_ms": 0.05}),
     "measure at rest": (0, lambda plan: {"speed": "0m/s"}),
     "twice as many pairs of the board": (0, lambda plan: {"pairs": 2 * plan.pairs}),
-    "cameras half as far apart again": (0, lambda plan: {"baseline": f"{1.5e3 * plan.baseline_m:g}mm"}),
+    "cameras 1.5 times as far apart": (0, lambda plan: {"baseline": f"{1.5e3 * plan.baseline_m:g}mm"}),
     "a body half as large again": (1, lambda plan: {} if plan.body else {"body_scale": 1.5 * plan.body_scale}),
     "half the exposure, twice the light": (1, lambda plan: {"exposure_ms": 0.5e3 * plan.timing["exposure"]}),
     "a board printed on a stiff plate, its size measured": (1, lambda _: {"board_print": 1e-4, "board_bent": "0.03mm"}),
