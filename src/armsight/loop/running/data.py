@@ -200,10 +200,10 @@ class HealthNotes:
         now = {(each.subject, each.forbids, each.corrected_s): each for each in findings}
         before, self._before = self._before, now
         lines = tuple(each.line() for each in findings if each.forbids and each.corrected_s is None)
-        for key in now.keys() - before.keys():
+        for key in (each for each in now if each not in before):  # in the order of the findings
             wrong = now[key].forbids and now[key].corrected_s is None
             yield NoteDatum(time_s, now[key].line(), "warning" if wrong else "info", lines)
-        for gone in (before[key] for key in before.keys() - now.keys()):
+        for gone in (before[key] for key in before if key not in now):
             if gone.subject not in {each.subject for each in findings}:
                 yield NoteDatum(time_s, f"no longer found: {gone.line()}", "info", lines)
 
