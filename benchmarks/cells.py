@@ -27,6 +27,8 @@ import numpy as np
 NOISE_PX, BREATH_RAD, BREATH_S = 0.05, 3e-6, 40.0
 RATE_HZ = 10.0
 DRIFT_DEG_H = 0.05
+#: From a block's middle to the hub's look at it, s: the next block is being filled.
+LATE_S = 12.0
 
 
 def measured(rig, true, rng):
@@ -209,7 +211,7 @@ def alarms(days, seed):
             for n, mean in enumerate(rng.standard_normal(count) + size * state):
                 cells[str(n)].add(10.0 * block, mean)
             if block % 6 == 0:
-                now = {name for name, found in drifts(cells).items() if found.chance < CHANCE}
+                now = {name for name, found in drifts(cells, 10.0 * block + LATE_S).items() if found.chance < CHANCE}
                 named, alarmed = named + len(now - alarmed), now
         print(
             f"{kind}: {named} false alarms in {count * days} cell-days, {7 * named / (count * days):.2f} a cell and week"

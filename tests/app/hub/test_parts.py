@@ -335,3 +335,16 @@ def test_a_cell_is_frozen_although_the_hub_s_clock_was_set_back():
     assert cell.need(10_000.0 - 3600.0)[0] == LOST
     cell.take(state(6401.0), 6401.0)
     assert cell.need(6402.0)[0] == WELL
+
+
+def test_a_cell_by_itself_is_compared_with_its_own_past():
+    """The hub looks while the next block is being filled: the window is complete all the same."""
+    rng, cell = np.random.default_rng(8), Slopes()
+    for block in range(600 + 60):
+        slope = 100.0 * max(block - 600, 0) / 360.0
+        cell.add(10.0 * block, 0.05 * rng.standard_normal() + slope)
+        alone = drifts({"a": cell}, 10.0 * block + 14.0)
+        if block == 599:
+            assert alone["a"].sigma_per_h > 0.0
+            assert alone["a"].chance > CHANCE
+    assert alone["a"].chance < CHANCE

@@ -99,8 +99,8 @@ def keys_command(site: str, cells: tuple[str, ...], output: Path, host: str, por
 def hold_command(cell: str, reason: str, keys: Path, address: str, as_json: bool) -> None:
     """Ask CELL to bring its arm to rest and hold it. This is no emergency stop, which is at the cell.
 
-    A cell does so only where its cell.toml says holds = true, and the request is signed by the site's key. Both sides
-    keep an event. Exit code 2: it did not.
+    A cell does so only where its cell.toml says holds = true, and the request is signed by the site's key. The
+    cell keeps an event of it. Exit code 2: it did not.
     """
     from armsight.app.hub.router import hold
     from armsight.errors import ArmsightError

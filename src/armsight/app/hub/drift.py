@@ -65,7 +65,8 @@ class Slopes:
 
     def count(self, now_s: float) -> int:
         """Return how many blocks of the last window there are."""
-        return sum(now_s - t < BLOCKS * BLOCK_S for t, _ in self.blocks)
+        # The newest is half a block old when it is complete, and the next one is being filled.
+        return sum(now_s - t < (BLOCKS + 2) * BLOCK_S for t, _ in self.blocks)
 
     def per_h(self, now_s: float, count: int) -> float | None:
         """Return the slope of a line through the newest ``count`` blocks, an hour; None where they are too few."""

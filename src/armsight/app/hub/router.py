@@ -132,7 +132,7 @@ def hold(keys: Path, cell: str, reason: str, address: str) -> str:
     Args:
         keys: folder of the site's keys.
         cell: its name.
-        reason: kept in the events of both sides.
+        reason: kept in the events of the cell.
         address: ``HOST:PORT`` at which cells connect to the hub.
 
     Raises:
