@@ -26,7 +26,6 @@ import numpy as np
 
 from armsight.app.live import records
 from armsight.app.live.capture import CameraCapture
-from armsight.app.live.guide import CalibrationAim, Guide, Knowledge, working_points
 from armsight.app.live.server import LiveServer
 from armsight.app.live.session import LiveSession, SessionOptions
 from armsight.data import Detections, Shot
@@ -35,6 +34,7 @@ from armsight.sim.example_rig import board_poses, example_rig
 from armsight.sim.render.scene import chessboard
 from armsight.sim.workcell.workcell import Workcell
 from armsight.vision.calibrate.boards import Pair, calibrate_boards
+from armsight.vision.calibrate.guide import CalibrationAim, Guide, Knowledge, working_points
 from armsight.vision.calibrate.heldout import pair_errors
 from armsight.vision.markers.board import open_board
 from armsight.vision.match import join

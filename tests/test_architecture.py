@@ -19,7 +19,7 @@ MAY_IMPORT = {
     "sim": {"geometry", "kernels", "tables", "vision", "robot"},
     "estimate": {"geometry"},
     "loop": {"geometry", "kernels", "tables", "vision", "robot", "estimate"},
-    "app": {"geometry", "kernels", "firmware", "tables", "vision", "robot", "sim", "loop"},
+    "app": {"estimate", "geometry", "kernels", "firmware", "tables", "vision", "robot", "sim", "loop"},
 }
 #: The ground: what each of these modules may import of armsight.
 GROUND = {

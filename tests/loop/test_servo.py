@@ -9,6 +9,7 @@ from arm_rig import ARM, MIDDLE, TICK_S, Workcell, distance_mm, mounts, rms, wor
 from armsight.app.replay.run import ESTIMATORS
 from armsight.data import JointCommand
 from armsight.errors import InputError
+from armsight.geometry.pose import exp_se3
 from armsight.loop.estimators import ArmEstimate, Delay, Mounting
 from armsight.loop.health import Trust
 from armsight.loop.servo import (
@@ -19,6 +20,7 @@ from armsight.loop.servo import (
     LoopTiming,
     Mode,
     PoseServo,
+    likely_joint_errors,
     whole_steps,
 )
 from armsight.robot.arm_file import open_arm
@@ -342,3 +344,12 @@ def test_before_the_first_image_nothing_is_asked_of_the_loop():
     timing = LoopTiming(PERIOD_S, 1 / 60, 0.045)
     assert timing.gain_at(np.inf) == 0.0  # the age of no measurement: never NaN, which commands would take
     assert 0.0 < timing.gain_at(10.0) < timing.gain_at(0.0) == timing.gain
+
+
+def test_a_singular_arm_does_not_explain_a_millimetre_by_degrees():
+    arm, q = ARM, ARM.home
+    T = arm.forward(q) @ exp_se3(np.array([0.0, 0.0, 1e-3, 0.0, 0.0, 0.0]))
+    assert np.degrees(np.abs(likely_joint_errors(arm, q, T))).max() < 0.8
+    bent = q + np.radians([5, -20, 30, 10, 20, 5])
+    errors = np.radians([0.2, -0.1, 0.3, 0.1, -0.2, 0.1])
+    assert likely_joint_errors(arm, bent, arm.forward(bent + errors)) == pytest.approx(errors, abs=1e-3)

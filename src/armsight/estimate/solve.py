@@ -121,7 +121,34 @@ def by_chance(squares: Array, numbers: int, chance: float, least: float = 1e-300
     return np.asarray(squares <= scale * chdtri(numbers, chance))
 
 
+def squares_of(left: Array, cov: Array) -> Array:
+    """Return the squared Mahalanobis distance (N,) of residuals (N, m) with covariances (N, m, m)."""
+    return np.asarray(np.einsum("ni,ni->n", left, np.linalg.solve(cov, left[..., None])[..., 0]))
+
+
 def log_density(left: Array, cov: Array) -> Array:
     """Return the logarithm of the normal density (N,) of residuals (N, m) with covariances (N, m, m)."""
-    squares = np.einsum("ni,ni->n", left, np.linalg.solve(cov, left[..., None])[..., 0])
-    return np.asarray(-0.5 * (squares + np.linalg.slogdet(cov)[1] + left.shape[1] * np.log(2 * np.pi)))
+    return np.asarray(-0.5 * (squares_of(left, cov) + np.linalg.slogdet(cov)[1] + left.shape[1] * np.log(2 * np.pi)))
+
+
+def regression(A: Array, y: Array, groups: list[NDArray[np.int64]] | None) -> tuple[list[float], list[float]]:
+    """Return the coefficients of a fit and their sigmas, by the scatter of what is left.
+
+    Without groups the rows are independent. What the columns lack is the same at every visit of a pose: visits do not
+    average it out. The sigma is the larger one of that of independent rests and that of independent poses (clustered:
+    Liang and Zeger, Biometrika 73, 1986, for G poses times G / (G - P)).
+
+    Args:
+        A: (N, P) columns.
+        y: (N,) what is explained.
+        groups: rows of each pose; None: rows have nothing in common.
+    """
+    x, *_ = np.linalg.lstsq(A, y, rcond=None)
+    left = y - A @ x
+    inverse = np.linalg.pinv(A.T @ A)
+    rests = np.diag(inverse) * float(left @ left) / max(len(y) - A.shape[1], 1)
+    if groups is None:
+        return x.tolist(), np.sqrt(rests).tolist()
+    pulls = np.array([A[rows].T @ left[rows] for rows in groups]) @ inverse
+    poses = (pulls**2).sum(axis=0) * len(groups) / max(len(groups) - A.shape[1], 1)
+    return x.tolist(), np.sqrt(np.maximum(rests, poses)).tolist()

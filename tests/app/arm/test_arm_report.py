@@ -10,7 +10,7 @@ import pytest
 
 from armsight.app.arm import evaluate
 from armsight.app.arm import report as arm_report
-from armsight.app.arm.evaluate import evaluate_arm, least_squares, plan_report
+from armsight.app.arm.evaluate import evaluate_arm, plan_report
 from armsight.app.arm.report import write_report
 from armsight.app.check.evaluate import evaluate as evaluate_check
 from armsight.app.check.run_folder import attained_in
@@ -100,29 +100,6 @@ def test_what_a_length_that_was_not_selected_moves_a_zero_by_is_in_its_sigma():
     for i in (1, 2, 3):
         zero, sigma_deg = evaluate._zero(ARM, i, SimpleNamespace(q=q, approach=None), found)
         assert abs(zero - zeros_deg[i]) < 2 * sigma_deg < 0.6
-
-
-def test_the_sigma_of_a_droop_allows_for_what_all_visits_of_a_pose_have_in_common():
-    rng, z = np.random.default_rng(5), []
-    visits = list(np.arange(80).reshape(20, 4))
-    for _ in range(300):
-        lever, own = (np.repeat(drawn, 4) for drawn in (rng.uniform(-0.2, 0.3, 20), rng.normal(0.0, 1.0, 20)))
-        A = np.column_stack([np.ones(80), rng.choice([-1.0, 1.0], 80), lever])
-        x, sigma = least_squares(A, A @ [0.1, 0.2, 3.0] + own + rng.normal(0.0, 0.3, 80), visits)
-        z.append((x[2] - 3.0) / sigma[2])
-    # Squares of 20 poses weighted by those of a uniform lever (kurtosis 1.8) are worth 20 / 1.8 = 11 degrees of freedom:
-    # Student's t of so many scatters by 1.11, and 300 draws know it to 5 % (its kurtosis is 3.9): three of these either
-    # way. Rests taken as independent give 2.1.
-    assert 0.94 < np.std(z) < 1.28
-
-
-def test_the_sigma_of_a_slope_without_groups_is_the_classical_one():
-    A, y = np.column_stack([np.ones(6), np.arange(6.0)]), np.array([0.0, 1.2, 1.9, 3.1, 3.8, 9.0])
-    x, sigma = least_squares(A, y, None)
-    left = y - A @ x
-    assert sigma[1] == pytest.approx(np.sqrt(left @ left / 4 / 17.5))  # 17.5: squares of the times from their mean
-    alone = least_squares(A, y, list(np.arange(6)[:, None]))[1]
-    assert alone[1] > 1.1 * sigma[1]  # what a group for each row gave
 
 
 def test_the_whole_error_is_split_and_a_remedy_takes_its_part_away(run, report):

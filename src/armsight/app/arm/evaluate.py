@@ -29,6 +29,7 @@ from armsight.app.run.tracks import read_track
 from armsight.app.show.encode import json_of
 from armsight.data import Array, Record
 from armsight.errors import InputError
+from armsight.estimate.solve import regression
 from armsight.files import read_json, read_toml
 from armsight.geometry.pose import mean_pose
 from armsight.geometry.rotation import log_so3
@@ -360,7 +361,7 @@ def _joint(
     lag, side = rests.q[:, i] - rests.q_ref[:, i], rests.approach[:, i]
     loaded = float(np.abs(lever).max()) > _LEVER_M
     columns = [np.ones(len(lag)), *([side] if side.any() else []), *([lever] if loaded else [])]
-    fitted, sigmas = least_squares(np.column_stack(columns), lag, rests.groups(rests.visits()[0], by_side=False))
+    fitted, sigmas = regression(np.column_stack(columns), lag, rests.groups(rests.visits()[0], by_side=False))
     hysteresis = (-2 * deg * fitted[1], 2 * deg * sigmas[1]) if side.any() else None
     droop = (deg * fitted[-1], deg * sigmas[-1]) if loaded else None
     most = None if droop is None else droop[0] * float(lever[np.argmax(np.abs(lever))])
@@ -388,29 +389,6 @@ def _zero(arm: Arm, i: int, rests: RestPoses, found: Identified) -> tuple[float,
 
 
 _LEVER_M = 0.02  # a joint whose gravity load has a lever below this at all poses carries none, m
-
-
-def least_squares(A: Array, y: Array, groups: list[NDArray[np.int64]] | None) -> tuple[list[float], list[float]]:
-    """Return the coefficients of a fit and their sigmas, by the scatter of what is left.
-
-    Without groups the rows are independent. What the columns lack is the same at every visit of a pose: visits do not
-    average it out. The sigma is the larger one of that of independent rests and that of independent poses (clustered:
-    Liang and Zeger, Biometrika 73, 1986, for G poses times G / (G - P)).
-
-    Args:
-        A: (N, P) columns.
-        y: (N,) what is explained.
-        groups: rows of each pose; None: rows have nothing in common.
-    """
-    x, *_ = np.linalg.lstsq(A, y, rcond=None)
-    left = y - A @ x
-    inverse = np.linalg.pinv(A.T @ A)
-    rests = np.diag(inverse) * float(left @ left) / max(len(y) - A.shape[1], 1)
-    if groups is None:
-        return x.tolist(), np.sqrt(rests).tolist()
-    pulls = np.array([A[rows].T @ left[rows] for rows in groups]) @ inverse
-    poses = (pulls**2).sum(axis=0) * len(groups) / max(len(groups) - A.shape[1], 1)
-    return x.tolist(), np.sqrt(np.maximum(rests, poses)).tolist()
 
 
 def _mean_mm(metrics: list[Metric]) -> float | None:
@@ -441,7 +419,7 @@ def _drift(rests: RestPoses) -> tuple[Array, tuple[float, float] | None]:
     if len(rows) < 2 * MIN_POSES or hours[-1] <= 0:
         return track, None
     columns = np.column_stack([np.ones(len(hours)), hours])
-    slopes, sigmas = np.array([least_squares(columns, 1e3 * y, None) for y in p.T])[:, :, 1].T
+    slopes, sigmas = np.array([regression(columns, 1e3 * y, None) for y in p.T])[:, :, 1].T
     rate = float(np.linalg.norm(slopes))
     return track, (rate, float(np.linalg.norm(slopes * sigmas)) / max(rate, 1e-12))
 

@@ -16,8 +16,7 @@ from armsight.app.show.report import Grade
 from armsight.data import Array, Record
 from armsight.errors import InputError
 from armsight.geometry.pose import transform
-from armsight.vision.calibrate.heldout import LEAST_SIGMA_PX
-from armsight.vision.calibrate.result import Calibration
+from armsight.vision.calibrate.result import Calibration, corner_variance_px2
 from armsight.vision.markers.board import open_board
 from armsight.vision.rig import StereoRig
 from armsight.vision.triangulate import optimal_points
@@ -43,14 +42,6 @@ class Slice(Record):
     seen: Array  #: (D, W) whether both cameras see the point
     sigma_depth_m: Array  #: (3, D, W) one sigma along the line of sight, m, by SHARES; NaN where not seen
     sigma_lateral_m: Array  #: (3, D, W) one sigma across the line of sight, in the worse direction, m
-
-
-def corner_variance_px2(calibration: Calibration) -> Array:
-    """Return (2,) the variance of a typical corner in the left and the right image, px^2: its own and the rig's share."""
-    observations, base = calibration.observations, max(calibration.rig.sigma_px, LEAST_SIGMA_PX) ** 2
-    image = np.trace(observations.cov_uv, axis1=1, axis2=2) / 2
-    sides = [image[observations.camera == side] for side in (0, 1)]
-    return np.array([base + (float(np.median(values)) if len(values) else 0.0) for values in sides])
 
 
 def predicted_sigmas(rig: StereoRig, p_left: Array, variance_px2: Array) -> tuple[Array, Array]:

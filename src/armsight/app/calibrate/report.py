@@ -19,7 +19,6 @@ from armsight.app.calibrate.assessment import (
     SHARES,
     advice,
     assess,
-    corner_variance_px2,
     graded_metrics,
     predicted_sigmas,
     target,
@@ -41,7 +40,7 @@ from armsight.app.show.report import Block, Html, Plot, Report, Section, Text, f
 from armsight.app.show.table import TextTable, plain_text
 from armsight.geometry.pose import exp_se3
 from armsight.geometry.rotation import log_so3
-from armsight.vision.calibrate.result import Calibration
+from armsight.vision.calibrate.result import Calibration, corner_variance_px2
 from armsight.vision.calibrate.screen import merged_notes
 from armsight.vision.calibrate.weak import COVERAGE_GRID, contradicted
 from armsight.vision.rig import StereoRig

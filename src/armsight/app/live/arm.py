@@ -25,7 +25,6 @@ from armsight.app.live.handeye import (
     IdentifyState,
     IdentifyStep,
     go,
-    likely_joint_errors,
     visit_poses,
 )
 from armsight.app.live.measuring import MeasureStep
@@ -56,6 +55,7 @@ from armsight.loop.running.calibrate import VisitedPose, handeye_poses
 from armsight.loop.running.log import NEWEST_SHOTS
 from armsight.loop.running.loop import Loop
 from armsight.loop.running.setup import HostClock, Setup
+from armsight.loop.servo import likely_joint_errors
 from armsight.robot.arm_file import open_arm
 from armsight.robot.board_registry import emulator_name, is_real, open_motion_board, slowed
 from armsight.robot.boards.codes import STATE_TEXTS, BoardState, Fault

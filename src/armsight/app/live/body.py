@@ -18,11 +18,11 @@ from armsight.app.body.draw import draw_body, is_board_spec
 from armsight.app.body.text import body_report
 from armsight.app.live.calibration import CalibrationStep
 from armsight.app.live.capture import LiveShot
-from armsight.app.live.guide import CalibrationAim
 from armsight.app.live.measuring import MeasureStep
 from armsight.app.live.records import asked
 from armsight.app.live.step import PageStep, S, Shared
 from armsight.errors import ArmsightError, InputError
+from armsight.vision.calibrate.guide import CalibrationAim
 from armsight.vision.image import grey
 from armsight.vision.markers.board import BOARDS, board_in_view, open_board
 from armsight.vision.markers.body_layout import read_layout

@@ -21,7 +21,6 @@ from armsight.app.calibrate.assessment import advice, assess, graded_metrics
 from armsight.app.calibrate.run import provenance
 from armsight.app.live.cameras import SHARP_PX, edge_spread_px
 from armsight.app.live.capture import LiveShot
-from armsight.app.live.guide import CalibrationAim, Guide, Knowledge, NextPose, guessed_camera, guessed_rig
 from armsight.app.live.records import Drawn, asked, dots, polyline
 from armsight.app.live.step import Guided, GuidedState, Shared
 from armsight.app.record.recording import ShotFolder
@@ -31,6 +30,7 @@ from armsight.files import unused
 from armsight.geometry.pose import inverse, transform
 from armsight.vision.calibrate import MODELS
 from armsight.vision.calibrate.boards import Pair, calibrate_boards
+from armsight.vision.calibrate.guide import CalibrationAim, Guide, Knowledge, NextPose, guessed_camera, guessed_rig
 from armsight.vision.calibrate.result import Calibration
 from armsight.vision.calibrate.weak import require_order
 from armsight.vision.image import grey

@@ -3,7 +3,7 @@
 In: poses of the arm at rest, taken by a person or by the arm itself. Out: a :class:`HandEyeState` at any time, and a
 :class:`~armsight.loop.running.calibrate.HandEyeRun`, which the loop uses and ``handeye/`` of the session holds. The next
 pose is the one of the candidates after which the predicted error is least: the RMS distance by which the covariance of the
-calibration moves a measured position in the arm's base (as :mod:`~armsight.app.live.guide` does for the cameras).
+calibration moves a measured position in the arm's base (as :mod:`~armsight.vision.calibrate.guide` does for the cameras).
 From the same poses :class:`IdentifyStep` makes a corrected arm, and the files of ``armsight identify``.
 """
 
@@ -24,7 +24,7 @@ from armsight.app.show.report import Report
 from armsight.data import Array, Missed
 from armsight.errors import ArmsightError, CalibrationError, InputError
 from armsight.files import unused, write_text
-from armsight.geometry.pose import inverse, log_se3, pose
+from armsight.geometry.pose import inverse, pose
 from armsight.geometry.rotation import skew
 from armsight.loop.handeye.poses import Poses
 from armsight.loop.identify.read import read_poses
@@ -43,8 +43,6 @@ LITTLE = 0.02
 #: A pose is another one if a joint is so far from all that were taken, rad.
 _OTHER_RAD = float(np.radians(3.0))
 _CANDIDATES, _MARGIN_PX = 60, 60.0
-#: Sigma of what joints cannot explain of a measured pose, m and rad; sigma of the error of a joint, rad.
-_EXPLAINED, _JOINT_RAD = (3e-4, 5e-4), float(np.radians(1.0))
 
 
 @dataclass(frozen=True)
@@ -292,18 +290,6 @@ def go(loop: Loop, way: Trajectory, progress: Callable[[str], None]) -> None:
     """Move an arm to the start of its motions."""
     progress("to the start")
     loop.go(way, 0.3, RunSegment("calibration", "to the start", "joints"), watch=False)
-
-
-def likely_joint_errors(arm: Arm, q: Array, T_base_tool: Array) -> Array:
-    """Return the errors of joint readings q (n,), rad, that most likely explain a measured pose (4, 4) of the tool.
-
-    The maximum a posteriori with a prior about zero: near a singular pose an exact inverse explains a fraction of a
-    millimetre by tens of degrees.
-    """
-    weights = np.repeat(1.0 / np.square(_EXPLAINED), 3)
-    J, xi = arm.jacobian(q, "tool"), log_se3(inverse(arm.forward(q)) @ T_base_tool)
-    JW = J.T * weights
-    return np.asarray(np.linalg.solve(JW @ J + np.eye(len(q)) / _JOINT_RAD**2, JW @ xi))
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ import numpy as np
 from armsight.app.replay.recorded import RecordedDatum, RecordedRun
 from armsight.data import Body, JointStates, Missed, PoseEstimate, Shot
 from armsight.errors import InputError
+from armsight.estimate.solve import squares_of
 from armsight.loop.estimators import (
     ArmEstimate,
     Delay,
@@ -178,7 +179,7 @@ class Fused:
         self.windows += 1
         self.outliers += innovation.outcome is Outcome.OUTLIER
         if innovation.outcome is not Outcome.OUTLIER:
-            self._squares += float(z @ np.linalg.solve(innovation.cov, z)) / len(z)
+            self._squares += float(squares_of(z[None], innovation.cov[None])[0]) / len(z)
 
     @property
     def ratio(self) -> float:

@@ -17,6 +17,7 @@ from scipy.special import chdtri
 
 from armsight.app.run.tracks import Part, ToolTrack, Tracks, errors
 from armsight.data import Array, Record
+from armsight.estimate.solve import squares_of
 from armsight.loop.servo import CORRECTED_ABOVE
 from armsight.robot.kinematics.arm import Arm
 
@@ -73,7 +74,7 @@ def track_metrics(track: ToolTrack, truth: ToolTrack) -> TrackMetrics:
     position, angle = np.linalg.norm(error[:, :3], axis=1), np.linalg.norm(error[:, 3:], axis=1)
     claimed: tuple[float, ...] = ()
     if track.covs is not None:
-        nees = np.einsum("ni,ni->n", error, np.linalg.solve(track.covs, error[..., None])[..., 0])
+        nees = squares_of(error, track.covs)
         variance = np.einsum("nii->ni", track.covs)
         sigmas = (rms(np.sqrt(variance[:, part].sum(axis=1))) for part in (slice(0, 3), slice(3, 6)))
         claimed = *sigmas, float(nees.mean()), float((nees <= chdtri(6, 0.05)).mean())

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from armsight.data import Array, Record
 from armsight.errors import InputError
 from armsight.estimate.linear import Linear
-from armsight.estimate.solve import Solved, by_chance, left_out, solve
+from armsight.estimate.solve import Solved, by_chance, left_out, solve, squares_of
 from armsight.estimate.variance import restricted
 from armsight.geometry.pose import exp_se3, inverse, log_se3
 from armsight.loop.references.reference import Reading, Reference, ToolMotion
@@ -239,7 +239,7 @@ def _factors(linear: Linear, variances: Array) -> Array:
     from scipy.special import chdtri
 
     errors, covs = left_out(solve(linear, variances))
-    squares = np.einsum("ni,ni->n", errors, np.linalg.solve(covs, errors[..., None])[..., 0])
+    squares = squares_of(errors, covs)
     median = chdtri(errors.shape[1], 0.5)
     mine = [np.abs(M).sum(axis=(1, 2)) > 0.0 for M in linear.own.values()]
     each = [v * np.median(squares[rows]) / median for v, rows in zip(variances, mine, strict=True)]
@@ -249,7 +249,7 @@ def _factors(linear: Linear, variances: Array) -> Array:
 def _plausible(linear: Linear, variances: Array, channel: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Return which readings (N,) chance explains, among those of their channel."""
     errors, covs = left_out(solve(linear, variances))
-    squares = np.einsum("ni,ni->n", errors, np.linalg.solve(covs, errors[..., None])[..., 0])
+    squares = squares_of(errors, covs)
     out = np.ones(len(squares), np.bool_)
     for k in np.unique(channel):
         out[channel == k] = by_chance(squares[channel == k], errors.shape[1], CHANCE)
@@ -268,7 +268,7 @@ def _held_out(linear: Linear, variances: Array, used: NDArray[np.bool_]) -> tupl
         JR = out.J @ s.root[: out.J.shape[2]]
         cov = own + JR @ np.swapaxes(JR, 1, 2)
         errors[block] = error
-        squares[block] = np.einsum("ni,ni->n", error, np.linalg.solve(cov, error[..., None])[..., 0]) / m
+        squares[block] = squares_of(error, cov) / m
     return errors, squares
 
 

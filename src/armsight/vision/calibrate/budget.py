@@ -207,7 +207,7 @@ def pose_budget(rig: StereoRig, points: Array, normals: Array, views: list[Predi
     found: list[dict[str, Array]] = []
     at, forward = [], np.zeros(3)
     by_rig = {
-        "calibration": _root(given.cov_calibration),
+        "calibration": covariance_root(given.cov_calibration),
         "print of the board": given.board_scale * _scaled_rig(rig),
         "warming of the mount": _mount(rig, given),
         "warming of the lenses": _lenses(rig, given.lens_share),
@@ -276,7 +276,7 @@ def _stacked(factors: list[Array | None]) -> Array:
     return out
 
 
-def _root(cov: Array) -> Array:
+def covariance_root(cov: Array) -> Array:
     """Return L (P, P) of a covariance L L^T, also where it is singular."""
     size = np.sqrt(np.maximum(np.diag(cov), 1e-300))
     values, vectors = np.linalg.eigh(cov / np.outer(size, size)) if len(cov) else (np.zeros(0), cov)

@@ -18,7 +18,7 @@ from armsight.geometry.rigid import fit_rigid, fit_scale
 from armsight.geometry.rotation import skew
 from armsight.vision.calibrate import MODELS
 from armsight.vision.calibrate.motion import ExposureMotion
-from armsight.vision.calibrate.result import HeldOutErrors, PairErrors
+from armsight.vision.calibrate.result import LEAST_SIGMA_PX, HeldOutErrors, PairErrors
 from armsight.vision.camera import DISTORTION_MODELS
 from armsight.vision.discs.bias import disc_bias
 from armsight.vision.match import epipolar_distances
@@ -26,7 +26,6 @@ from armsight.vision.pose.bundle import BundleSolution, Observations
 from armsight.vision.rig import StereoRig
 from armsight.vision.triangulate import optimal_points
 
-LEAST_SIGMA_PX = 1e-6
 #: The perspective bias depends on the pose and the pose on the bias: it shrinks a hundredfold each round.
 _BIAS_ROUNDS = 4
 #: A point this many times as far from the rigid fit as the usual one is an outlier, which a measurement drops by name.

@@ -5,11 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from armsight.data import Array, Body, Record
 from armsight.plots import new_figure
 from armsight.vision.calibrate.motion import ExposureMotion
 from armsight.vision.pose.bundle import BundleSolution, Observations
 from armsight.vision.rig import StereoRig
+
+LEAST_SIGMA_PX = 1e-6
 
 
 @dataclass(frozen=True)
@@ -139,3 +143,11 @@ class Calibration(Record):
     def reprojection_rms_px(self) -> float:
         """RMS distance of the fitted detections from their projections, px."""
         return float((self.solution.residuals_px**2).sum(axis=1).mean() ** 0.5)
+
+
+def corner_variance_px2(calibration: Calibration) -> Array:
+    """Return (2,) the variance of a typical corner in the left and the right image, px^2: its own and the rig's share."""
+    observations, base = calibration.observations, max(calibration.rig.sigma_px, LEAST_SIGMA_PX) ** 2
+    image = np.trace(observations.cov_uv, axis1=1, axis2=2) / 2
+    sides = [image[observations.camera == side] for side in (0, 1)]
+    return np.array([base + (float(np.median(values)) if len(values) else 0.0) for values in sides])

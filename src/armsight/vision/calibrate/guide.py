@@ -14,12 +14,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from armsight.app.calibrate.assessment import corner_variance_px2
 from armsight.data import Array, Record
 from armsight.geometry.pose import inverse, pose, transform
 from armsight.geometry.rotation import exp_so3
 from armsight.vision.calibrate.boards import printed_board, rigid_board
-from armsight.vision.calibrate.result import Calibration
+from armsight.vision.calibrate.budget import covariance_root
+from armsight.vision.calibrate.result import Calibration, corner_variance_px2
 from armsight.vision.camera import Camera
 from armsight.vision.markers.marker import CalibrationBoard
 from armsight.vision.pose.bundle import BundleModel, BundleState, Observations, predict
@@ -107,9 +107,7 @@ class Knowledge(Record):
         model = printed_board(points) if len(state.shape) else rigid_board(points)
         model = replace(model, disc_radius_m=calibration.disc_radius_m or 0.0)
         cov = calibration.solution.cov_shared * calibration.heldout.normalised_rms**2
-        size = np.sqrt(np.maximum(np.diag(cov), 1e-300))
-        values, vectors = np.linalg.eigh(cov / size / size[:, None])
-        root = size[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+        root = covariance_root(cov)
         variance, points = corner_variance_px2(calibration), working_points(calibration.rig, aim.distance_m)
         goal_m = aim.error_m or noise_m(calibration.rig, points, variance)
         bare = replace(state, Ts_left_body=np.zeros((0, 4, 4)), motions=np.zeros((0, 6)))

@@ -5,15 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from armsight.app.calibrate.assessment import corner_variance_px2
 from armsight.app.live import calibration
 from armsight.app.live.calibration import quick_look
-from armsight.app.live.guide import CalibrationAim, Guide, Knowledge, error_weights, guessed_rig, working_points
 from armsight.data import Detections
 from armsight.geometry.pose import transform
 from armsight.sim.example_rig import board_poses, example_rig
 from armsight.sim.render.scene import chessboard
 from armsight.vision.calibrate.boards import Pair, calibrate_boards
+from armsight.vision.calibrate.guide import CalibrationAim, Guide, Knowledge, error_weights, guessed_rig, working_points
+from armsight.vision.calibrate.result import corner_variance_px2
 from armsight.vision.markers.board import open_board
 from armsight.vision.triangulate import optimal_points
 
