@@ -9,7 +9,6 @@ from armsight.vision.dense.method import Search
 from armsight.vision.dense.semiglobal import _EDGE, _P1, _P2, Semiglobal
 
 WAYS = {
-    4: [(0, 1), (0, -1), (1, 0), (-1, 0)],
     5: [(0, 1), (0, -1), (1, 0), (1, 1), (1, -1)],
     8: [(0, 1), (0, -1), (1, 0), (1, 1), (1, -1), (-1, 0), (-1, 1), (-1, -1)],
 }

@@ -21,7 +21,6 @@ import cv2
 import numpy as np
 
 from armsight.data import Image
-from armsight.errors import InputError
 from armsight.kernels import kernel, kernel_types
 from armsight.vision.dense.cost import Bytes
 from armsight.vision.dense.method import Disparity, Search
@@ -36,10 +35,9 @@ _CENSUS_REACH = 2
 #: Beyond this many grey levels the difference is cut off; cost of a match beyond the right image's edge: about that of
 #: an ambiguous pixel; the largest cost of a match.
 _CUT, _OUTSIDE, RAW_MAX = np.uint8(20), np.uint8(10), 2 * 8 + 20 // 2
-#: The reach whose sum is written out.
-_USUAL = 4
-#: Up to this reach the sum along a row fits a byte.
-BYTE_REACH = (255 // RAW_MAX - 1) // 2
+#: Pixels of a window to either side of its middle; half: noisy; double: breaks are blurred, and sums along a row no longer
+#: fit a byte.
+REACH = 4
 
 
 @kernel_types("u1[::1], u1[::1], u1[::1], u1[::1], u8, u8")
@@ -78,19 +76,18 @@ def _census(padded: Bytes, out: Bytes) -> None:
                     row[x] = (row[x] << np.uint8(1)) | np.uint8(other[x + i] < middle[x + _CENSUS_REACH])
 
 
-def prepare_planes(left: Image, right: Image, reach: int, further: int) -> PairPlanes:
+def prepare_planes(left: Image, right: Image, further: int) -> PairPlanes:
     """Compute the planes of both images of a pair.
 
     Args:
         left: (H, W) uint8.
         right: (H, W) uint8.
-        reach: of the windows, px.
         further: how far to the left of the right image a match may lie: the search's last disparity and one.
     """
 
     def widened(image: Image, before: int) -> Bytes:
         return np.asarray(
-            cv2.copyMakeBorder(image, reach, reach, before + reach, reach + 2 * _VECTOR, cv2.BORDER_REPLICATE)
+            cv2.copyMakeBorder(image, REACH, REACH, before + REACH, REACH + 2 * _VECTOR, cv2.BORDER_REPLICATE)
         )
 
     def census(image: Image) -> Bytes:
@@ -136,15 +133,14 @@ class StripBuffers(NamedTuple):
     right: Counts
 
 
-def make_buffers(width: int, reach: int, further: int, count: int) -> StripBuffers:
+def make_buffers(width: int, further: int, count: int) -> StripBuffers:
     """Return buffers for strips of images of a width."""
     wide = -(-width // _VECTOR) * _VECTOR
-    kind = np.uint8 if reach <= BYTE_REACH else np.uint16
     return StripBuffers(
-        np.zeros(wide + 2 * reach + 2 * _VECTOR, np.uint8),
-        np.zeros(wide + 2 * reach + 2 * _VECTOR, np.uint8),
-        np.zeros(wide, kind),
-        np.zeros((2 * reach + 1) * count * wide, kind),
+        np.zeros(wide + 2 * REACH + 2 * _VECTOR, np.uint8),
+        np.zeros(wide + 2 * REACH + 2 * _VECTOR, np.uint8),
+        np.zeros(wide, np.uint8),
+        np.zeros((2 * REACH + 1) * count * wide, np.uint8),
         np.zeros(count * wide, np.uint16),
         np.zeros(wide, np.uint16),
         np.zeros(wide, np.uint16),
@@ -153,9 +149,9 @@ def make_buffers(width: int, reach: int, further: int, count: int) -> StripBuffe
 
 
 @kernel(nogil=True)
-def _cost_row(planes: PairPlanes, row: int, d: int, pad: int, width: int, reach: int, raw: Bytes) -> None:
-    """Write the costs of a row at disparity d, from ``reach`` pixels before it to ``reach`` after it."""
-    size = (width + 2 * reach + _VECTOR - 1) // _VECTOR * _VECTOR
+def _cost_row(planes: PairPlanes, row: int, d: int, pad: int, width: int, raw: Bytes) -> None:
+    """Write the costs of a row at disparity d, from REACH pixels before it to as many after it."""
+    size = (width + 2 * REACH + _VECTOR - 1) // _VECTOR * _VECTOR
     left, right = row * np.int64(planes.left_stride), row * np.int64(planes.right_stride) + pad - d
     grey, word = planes.left[left : left + size], planes.left_census[left : left + size]
     r_grey, r_word = planes.right[right : right + size], planes.right_census[right : right + size]
@@ -163,42 +159,23 @@ def _cost_row(planes: PairPlanes, row: int, d: int, pad: int, width: int, reach:
         apart = np.uint8(max(grey[j], r_grey[j]) - min(grey[j], r_grey[j]))
         bits = _bits_set(np.uint8(word[j] ^ r_word[j]))
         raw[j] = np.uint8(np.uint8(bits + bits) + (min(apart, _CUT) >> np.uint8(1)))
-    raw[: min(d, width) + reach] = _OUTSIDE if d > 0 else raw[reach]
-    raw[width + reach : width + 2 * reach] = raw[width + reach - 1]
+    raw[: min(d, width) + REACH] = _OUTSIDE if d > 0 else raw[REACH]
+    raw[width + REACH : width + 2 * REACH] = raw[width + REACH - 1]
 
 
 @kernel(nogil=True)
-def _sum_along(raw: Bytes, threes: Bytes, reach: int, along: Bytes) -> None:
-    """Write sums over 2 ``reach`` + 1 pixels of a row; they fit the type of ``along``."""
+def _sum_along(raw: Bytes, threes: Bytes, along: Bytes) -> None:
+    """Write sums over the nine pixels of a window along a row; they fit a byte."""
     size = np.uintp(len(along))
-    for x in range(size + np.uintp(2 * reach)):
+    for x in range(size + np.uintp(2 * REACH)):
         threes[x] = np.uint8(np.uint8(raw[x] + raw[x + ONE]) + raw[x + TWO])
-    if reach == _USUAL:
-        for x in range(size):
-            along[x] = threes[x] + threes[x + THREE] + threes[x + SIX]
-        return
     for x in range(size):
-        along[x] = threes[x]
-    wide = np.uintp(2 * reach + 1)
-    for k in range(THREE, wide - wide % THREE, THREE):
-        for x in range(size):
-            along[x] += threes[x + k]
-    for k in range(wide - wide % THREE, wide):
-        for x in range(size):
-            along[x] += raw[x + k]
+        along[x] = threes[x] + threes[x + THREE] + threes[x + SIX]
 
 
 @kernel(nogil=True)
 def _add_row(
-    planes: PairPlanes,
-    row: int,
-    choose: bool,
-    reach: int,
-    first: int,
-    count: int,
-    width: int,
-    pad: int,
-    buffers: StripBuffers,
+    planes: PairPlanes, row: int, choose: bool, first: int, count: int, width: int, pad: int, buffers: StripBuffers
 ) -> None:
     """Move the windows down by a row of the widened images; with ``choose`` find the least totals.
 
@@ -206,11 +183,11 @@ def _add_row(
     end.
     """
     stride, along = len(buffers.least), buffers.along
-    slot = row % (2 * reach + 1) * count * stride
+    slot = row % (2 * REACH + 1) * count * stride
     for k in range(count):
         d = first + k
-        _cost_row(planes, row, d, pad, width, reach, buffers.raw)
-        _sum_along(buffers.raw, buffers.threes, reach, along)
+        _cost_row(planes, row, d, pad, width, buffers.raw)
+        _sum_along(buffers.raw, buffers.threes, along)
         total, kept = buffers.total[k * stride :], buffers.kept[slot + k * stride :]
         for x in range(np.uintp(stride)):
             total[x] = np.uint16(total[x] + np.uint16(np.uint16(along[x]) - np.uint16(kept[x])))
@@ -254,57 +231,34 @@ def _write_row(y: int, first: int, count: int, pad: int, buffers: StripBuffers, 
 
 
 @kernel(
-    "PairPlanes, i8, i8, i8, i8, i8, i8, "
+    "PairPlanes, i8, i8, i8, i8, i8, "
     "StripBuffers(u1[::1], u1[::1], u1[::1], u1[::1], u2[::1], u2[::1], u2[::1], u2[::1]), Winners",
-    "PairPlanes, i8, i8, i8, i8, i8, i8, "
-    "StripBuffers(u1[::1], u1[::1], u2[::1], u2[::1], u2[::1], u2[::1], u2[::1], u2[::1]), Winners",
     nogil=True,
 )
 def match_windows(
-    planes: PairPlanes,
-    begin: int,
-    end: int,
-    reach: int,
-    first: int,
-    count: int,
-    pad: int,
-    buffers: StripBuffers,
-    found: Winners,
+    planes: PairPlanes, begin: int, end: int, first: int, count: int, pad: int, buffers: StripBuffers, found: Winners
 ) -> None:
     """Choose the disparities of the rows from ``begin`` to ``end`` by the least sum over a window."""
     width = found.disparity.shape[1]
     buffers.kept[:] = 0
     buffers.total[:] = 0
-    for row in range(begin, end + 2 * reach):
-        y = row - 2 * reach  # the row whose window this one completes
+    for row in range(begin, end + 2 * REACH):
+        y = row - 2 * REACH  # the row whose window this one completes
         buffers.least[:] = NOWHERE
         buffers.right[:] = NOWHERE
-        _add_row(planes, row, y >= begin, reach, first, count, width, pad, buffers)
+        _add_row(planes, row, y >= begin, first, count, width, pad, buffers)
         if y >= begin:
             _write_row(y, first, count, pad, buffers, found)
 
 
 _STRIP_ROWS = 384
-#: The largest window whose sum of raw costs still fits two bytes.
-_REACH_MAX = 24
 #: See postprocess.py.
 _SIGMA_MODEL = SigmaModel(0.17, 0.09)
 
 
 @dataclass(frozen=True)
 class Block:
-    """Local matching.
-
-    Attributes:
-        reach: pixels to either side of the middle: the window is 2 reach + 1 wide.
-    """
-
-    reach: int = 4
-
-    def __post_init__(self) -> None:
-        """Check the size."""
-        if not 1 <= self.reach <= _REACH_MAX:
-            raise InputError(f"a window reaches 1 to {_REACH_MAX} px to either side, not {self.reach}")
+    """Local matching over windows of 9 x 9 pixels."""
 
     def match(self, left: Image, right: Image, search: Search) -> Disparity:
         """Match a pair; see :class:`~armsight.vision.dense.method.Method`."""
@@ -313,11 +267,11 @@ class Block:
     def search(self, left: Image, right: Image, search: Search) -> Winners:
         """Find disparities, without rejecting, smoothing or filling any."""
         pad = search.last + 1
-        planes, found = prepare_planes(left, right, self.reach, pad), make_winners(*left.shape)
+        planes, found = prepare_planes(left, right, pad), make_winners(*left.shape)
 
         def work(begin: int, end: int) -> None:
-            buffers = make_buffers(left.shape[1], self.reach, pad, search.count)
-            match_windows(planes, begin, end, self.reach, search.first, search.count, pad, buffers, found)
+            buffers = make_buffers(left.shape[1], pad, search.count)
+            match_windows(planes, begin, end, search.first, search.count, pad, buffers, found)
 
         for_each_strip(left.shape[0], _STRIP_ROWS, work)
         return found

@@ -1,4 +1,4 @@
-"""OpenCV's block matching and semi-global matching behind the same contract, as a reference and a fallback."""
+"""OpenCV's semi-global matching behind the same contract, as a reference and a fallback."""
 
 from __future__ import annotations
 
@@ -8,39 +8,20 @@ import cv2
 import numpy as np
 
 from armsight.data import Image
-from armsight.errors import InputError
 from armsight.vision.dense.method import Disparity, Search
 from armsight.vision.dense.postprocess import SigmaModel, finished
 from armsight.vision.dense.winner import Singles, Winners
 
-_WINDOW_BM, _WINDOW_SGBM = 15, 3
+_WINDOW = 3
 #: What OpenCV's samples recommend: penalties of a slant and of a jump a pixel of the window, and a uniqueness of 10%.
 _P1, _P2, _UNIQUENESS = 8, 32, 10
-#: Name -> OpenCV's mode; None is StereoBM.
-MODES = {
-    "bm": None,
-    "sgbm": cv2.STEREO_SGBM_MODE_SGBM,
-    "hh": cv2.STEREO_SGBM_MODE_HH,
-    "3way": cv2.STEREO_SGBM_MODE_SGBM_3WAY,
-}
 #: See postprocess.py.
 _SIGMA_MODEL = SigmaModel(0.36)
 
 
 @dataclass(frozen=True)
 class OpenCV:
-    """OpenCV's matchers.
-
-    Attributes:
-        mode: a key of MODES.
-    """
-
-    mode: str = "sgbm"
-
-    def __post_init__(self) -> None:
-        """Check the mode."""
-        if self.mode not in MODES:
-            raise InputError(f"unknown mode {self.mode!r} of OpenCV's matchers; known are {', '.join(MODES)}")
+    """OpenCV's StereoSGBM."""
 
     def match(self, left: Image, right: Image, search: Search) -> Disparity:
         """Match a pair; see :class:`~armsight.vision.dense.method.Method`."""
@@ -54,17 +35,9 @@ class OpenCV:
 
         The images are widened to the left, or columns that have less than the whole search to their left stay empty.
         """
-        count, mode = -(-search.count // 16) * 16, MODES[self.mode]
+        count = -(-search.count // 16) * 16
         wide = [cv2.copyMakeBorder(i, 0, 0, search.first + count, 0, cv2.BORDER_REPLICATE) for i in (left, right)]
-        matcher: cv2.StereoMatcher
-        if mode is None:
-            bm = cv2.StereoBM.create(count, _WINDOW_BM)
-            bm.setMinDisparity(search.first)
-            matcher = bm
-        else:
-            area = _WINDOW_SGBM**2
-            matcher = cv2.StereoSGBM.create(
-                search.first, count, _WINDOW_SGBM, _P1 * area, _P2 * area, 1, 0, _UNIQUENESS, 0, 0, mode
-            )
+        area = _WINDOW**2
+        matcher = cv2.StereoSGBM.create(search.first, count, _WINDOW, _P1 * area, _P2 * area, 1, 0, _UNIQUENESS)
         found = matcher.compute(*wide)[:, search.first + count :]
         return np.ascontiguousarray(found.astype(np.float32) / 16)

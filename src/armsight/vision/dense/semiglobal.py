@@ -1,8 +1,8 @@
-"""Semi-global matching: the sum of the best paths from four, five or eight directions.
+"""Semi-global matching: the sum of the best paths from five or eight directions.
 
 Hirschmueller, "Stereo processing by semiglobal matching and mutual information", PAMI 30(2), 2008, with census and
 Birchfield and Tomasi's dissimilarity as the cost. The image is processed in strips of rows, each by itself from some
-rows before it (with four or eight paths, behind it too): the memory is that of a strip, strips go to threads, and the
+rows before it (with eight paths, behind it too): the memory is that of a strip, strips go to threads, and the
 result is the same for any number of them.
 
 The costs of the best paths that end in a pixel follow the recurrence (equation 13 of the same paper), in bytes: L(p, d)
@@ -128,7 +128,6 @@ def forward(
     image: Bytes,
     y: int,
     from_y: int,
-    sides: int,
     keep: int,
     size: np.uintp,
     at: np.uintp,
@@ -145,7 +144,6 @@ def forward(
         image: (H, W) left image, for the steps between pixels.
         y: this row.
         from_y: the row before, above or below; < 0 where there is none.
-        sides: 1 for the diagonals too, 0 for the straight path alone.
         keep: RUN_UP for no totals, WRITE to go along the row too and write them, ADD to add to them.
         size: disparities, padded.
         at: where the row's totals begin.
@@ -165,7 +163,7 @@ def forward(
             here = np.uintp(6 * width + (x & 1)) * slot
             least_row = _step(work.arena, s[3], here, costs + o, size, least_row, p1, jump_row)
             s[3] = here
-        for side in range(-sides, sides + 1):
+        for side in range(-1, 2):
             from_x, to = x + side, (now * 3 + side + 1) * width + x
             before, least, jump = start, np.uint8(0), np.uint8(0)
             if from_y >= 0 and 0 <= from_x < width:
@@ -236,7 +234,7 @@ def _strip(
 ) -> None:
     """Match the rows from ``begin`` to ``end``."""
     height, width = pair.left.shape
-    both_ways, sides = paths != 5, 0 if paths == 4 else 1
+    both_ways = paths == 8
     work = make_work(width, int(size), first + int(size), end - begin if both_ways else 1)
     n = np.uintp(width) * size
     top, bottom = max(0, begin - _RUN_UP), min(height, end + _RUN_UP)
@@ -244,7 +242,7 @@ def _strip(
         at = np.uintp(y - begin if both_ways and y >= begin else 0) * n
         _costs(pair, y, 1, y > top, first, count, size, work)
         keep = WRITE if y >= begin else RUN_UP
-        forward(work, pair.left, y, y - 1 if y > top else -1, sides, keep, size, at, p1, p2)
+        forward(work, pair.left, y, y - 1 if y > top else -1, keep, size, at, p1, p2)
         if y >= begin:
             leftward(work, pair.left, y, size, at, p1, p2)
             if not both_ways:
@@ -254,7 +252,7 @@ def _strip(
             at = np.uintp(y - begin if y < end else 0) * n
             _costs(pair, y, -1, y < bottom - 1, first, count, size, work)
             keep = ADD if y < end else RUN_UP
-            forward(work, pair.left, y, y + 1 if y < bottom - 1 else -1, sides, keep, size, at, p1, p2)
+            forward(work, pair.left, y, y + 1 if y < bottom - 1 else -1, keep, size, at, p1, p2)
             if y < end:
                 choose_row(work.total, at, work.best_right, y, first, count, size, found)
 
@@ -264,21 +262,19 @@ class Semiglobal:
     """Semi-global matching.
 
     Attributes:
-        paths: 4, 5 or 8. Five are fastest and need the least memory, for all come from above or along the row.
-        edges: whether depth breaks are aligned to the edges of the image (``postprocess.py``).
+        paths: 5 or 8. Five are faster and need less memory, for all come from above or along the row.
     """
 
     paths: int = 8
-    edges: bool = True
 
     def __post_init__(self) -> None:
         """Check the number of paths."""
-        if self.paths not in (4, 5, 8):
-            raise InputError(f"semi-global matching has 4, 5 or 8 paths, not {self.paths}")
+        if self.paths not in (5, 8):
+            raise InputError(f"semi-global matching has 5 or 8 paths, not {self.paths}")
 
     def match(self, left: Image, right: Image, search: Search) -> Disparity:
         """Match a pair; see :class:`~armsight.vision.dense.method.Method`."""
-        return finished(self.search(left, right, search), left, search, _SIGMA_MODEL, edges=self.edges)
+        return finished(self.search(left, right, search), left, search, _SIGMA_MODEL, edges=True)
 
     def search(self, left: Image, right: Image, search: Search) -> Winners:
         """Find disparities, without rejecting, smoothing or filling any."""
