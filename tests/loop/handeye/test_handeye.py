@@ -51,7 +51,7 @@ def test_the_closed_form_start_is_exact_without_noise():
 @pytest.mark.skipif(not hasattr(cv2, "calibrateRobotWorldHandEye"), reason="this OpenCV has no hand-eye calibration")
 def test_the_own_start_is_as_good_as_opencvs():
     A, B, _, _, _ = recording(2)
-    parts = [[T[:3, :3] for T in A], [T[:3, 3] for T in A], [T[:3, :3] for T in B], [T[:3, 3] for T in B]]
+    parts = [[T[:3, part] for T in Ts] for Ts in (A, B) for part in (slice(3), [3])]  # OpenCV 5.1 wants columns
     RX, tX, RZ, tZ = cv2.calibrateRobotWorldHandEye(*parts, method=cv2.CALIB_ROBOT_WORLD_HAND_EYE_SHAH)
     for own, R, t in zip(handeye_start.kronecker(A, B), (RX, RZ), (tX, tZ), strict=True):
         assert np.abs(own - pose(R, t.ravel())).max() < 0.02
