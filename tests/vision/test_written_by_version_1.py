@@ -7,8 +7,7 @@ import pytest
 
 from armsight.errors import InputError
 from armsight.vision.markers.body_file import RENAMED, VERSION
-from armsight.vision.markers.body_layout import read_layout
-from armsight.vision.markers.targets import open_target
+from armsight.vision.markers.targets import open_target, read_layout
 from armsight.vision.rig import StereoRig
 
 FILES = Path(__file__).parent / "written_by_version_1"

@@ -18,8 +18,7 @@ from armsight.geometry.pose import inverse, transform
 from armsight.vision.discs.bias import project_discs
 from armsight.vision.discs.identify import identify
 from armsight.vision.markers.board import open_board
-from armsight.vision.markers.body_layout import read_layout
-from armsight.vision.markers.targets import open_target
+from armsight.vision.markers.targets import open_target, read_layout
 from armsight.vision.pose.predict import plain_rig, view
 from cli_runs import assert_rejected
 

@@ -7,7 +7,7 @@ import pytest
 
 from armsight.sim.budget import result
 from armsight.sim.workcell.body import body_target
-from armsight.vision.markers.body_layout import read_layout
+from armsight.vision.markers.targets import read_layout
 from armsight.vision.rig import StereoRig
 from cli_runs import assert_rejected
 

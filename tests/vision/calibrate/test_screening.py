@@ -9,8 +9,8 @@ from armsight.geometry.pose import inverse, log_se3
 from armsight.geometry.rotation import exp_so3
 from armsight.vision.calibrate.boards import calibrate_boards
 from armsight.vision.calibrate.heldout import cross_validate, folds_of, pair_errors, residual_epipolar_rms, summary
-from armsight.vision.calibrate.screen import correct_symmetries, merged_notes, noise_px, robust_sigma, screen
-from armsight.vision.calibrate.start import pinhole, relative_poses, start_board
+from armsight.vision.calibrate.screen import merged_notes, noise_px, robust_sigma, screen
+from armsight.vision.calibrate.start import agreed_symmetries, pinhole, relative_poses, start_board
 from armsight.vision.calibrate.weak import coverage, require_order, weaknesses
 from armsight.vision.match import join, renamed
 from armsight.vision.pose.bundle import BundleModel, BundleState, Observations, minimise
@@ -108,7 +108,7 @@ def test_a_reversed_board_is_found_by_shot():
     true, board, Ts = rig_and_board(spec="chessboard:9x7:25mm")
     pairs = board_pairs(true, board.body.points, Ts[:4])
     pairs[2] = replace(pairs[2], right=renamed(pairs[2].right, board.symmetries[0]))
-    found = correct_symmetries(board.body.points, truth(true, Ts[:4]), observed(pairs), board.symmetries)
+    found = agreed_symmetries(board.body.points, SIZES, observed(pairs), board.symmetries, "brown4")
     assert list(found) == [2]
     assert (found[2] == board.symmetries[0]).all()
 

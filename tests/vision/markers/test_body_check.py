@@ -13,9 +13,8 @@ from armsight.geometry.pose import transform
 from armsight.vision.discs.symmetry import flat, other_side, symmetries
 from armsight.vision.markers.board import open_board
 from armsight.vision.markers.body_file import read_body_file
-from armsight.vision.markers.body_layout import read_layout
 from armsight.vision.markers.discs import DiscTarget
-from armsight.vision.markers.targets import open_target
+from armsight.vision.markers.targets import open_target, read_layout
 
 TRIANGLE = ((-55, 0, 0), (55, 0, 0), (0, 85, 0))
 

@@ -22,8 +22,8 @@ from armsight.geometry.rotation import skew
 from armsight.vision.discs.pairing import SIZE_TOLERANCE, UNMODELLED_PX, UNMODELLED_SHARE
 from armsight.vision.discs.symmetry import Symmetry, flat, other_side, symmetries
 from armsight.vision.markers.body_file import collinear
-from armsight.vision.markers.body_layout import Layout
 from armsight.vision.markers.discs import DiscTarget
+from armsight.vision.markers.targets import Composite
 from armsight.vision.pose.predict import FACING, look_direction, pose_covariance, separation, view
 from armsight.vision.rig import StereoRig
 
@@ -152,7 +152,7 @@ def pair_text(symmetry: Symmetry, body: Body) -> str:
     )
 
 
-def axis_text(axis: Array, forward: Array, layout: Layout) -> str:
+def axis_text(axis: Array, forward: Array, layout: Composite) -> str:
     """Name a direction (3,) of the body: one of its axes, the line of two markers, or numbers."""
     found = [f"the body's {name} axis" for name, along in zip("xyz", axis, strict=True) if abs(along) > _ALONG]
     if not found and layout.discs is not None:
@@ -169,7 +169,7 @@ def axis_text(axis: Array, forward: Array, layout: Layout) -> str:
     return found[0] + (f" ({found[1]})" if len(found) > 1 else "")
 
 
-def assess(layout: Layout, rig: StereoRig, distances_m: tuple[float, ...]) -> Assessment:
+def assess(layout: Composite, rig: StereoRig, distances_m: tuple[float, ...]) -> Assessment:
     """Assess a body by its layout.
 
     Args:
@@ -183,13 +183,13 @@ def assess(layout: Layout, rig: StereoRig, distances_m: tuple[float, ...]) -> As
     discs = layout.discs
     if discs is not None and layout.disc_count > SEARCHED:
         text = f"{layout.disc_count} discs: ambiguities are not searched above {SEARCHED}"
-        grade: Grade = "note" if layout.coded else "bad"
-        findings.append(Finding(grade, "ambiguous", text, "" if layout.coded else "take fewer discs, or add a tag"))
+        grade: Grade = "note" if layout.parts else "bad"
+        findings.append(Finding(grade, "ambiguous", text, "" if layout.parts else "take fewer discs, or add a tag"))
     elif discs is not None and layout.disc_count >= 3 and not any(f.kind in ("view", "overlap") for f in findings):
-        search = _Search(rig, discs, distances_m, layout.coded)
+        search = _Search(rig, discs, distances_m, bool(layout.parts))
         found = tuple(one for seen in search.seen_together for one in search.ambiguities(seen))
         findings += search.findings(found)
-        findings += [] if layout.coded else _single_camera(search)
+        findings += [] if layout.parts else _single_camera(search)
     return Assessment(predictions, found, (*findings, *_pose_findings(layout, predictions)))
 
 
@@ -198,7 +198,7 @@ def sigma_px(rig: StereoRig) -> float:
     return float(np.hypot(IMAGE_SIGMA_PX, rig.sigma_px))
 
 
-def _predicted(layout: Layout, rig: StereoRig, distance_m: float) -> Prediction:
+def _predicted(layout: Composite, rig: StereoRig, distance_m: float) -> Prediction:
     """Predict the pose of a body that faces the cameras at a distance."""
     seen = view(rig, layout.body.points, layout.normals, distance_m)
     cov = pose_covariance(rig, layout.body.points, seen, sigma_px(rig))
@@ -210,7 +210,7 @@ def _predicted(layout: Layout, rig: StereoRig, distance_m: float) -> Prediction:
     return Prediction(distance_m, np.full((6, 6), np.nan) if cov is None else cov, forward, diameters)
 
 
-def _neighbours(layout: Layout) -> list[Finding]:
+def _neighbours(layout: Composite) -> list[Finding]:
     """Say which discs overlap, or leave each other, a tag or a board no plain surround."""
     if layout.discs is None:
         return []
@@ -248,7 +248,7 @@ def _neighbours(layout: Layout) -> list[Finding]:
     return findings
 
 
-def _in_view(layout: Layout, rig: StereoRig, predictions: tuple[Prediction, ...]) -> list[Finding]:
+def _in_view(layout: Composite, rig: StereoRig, predictions: tuple[Prediction, ...]) -> list[Finding]:
     """Say where too few points are seen together."""
     points, normals = layout.body.points, layout.normals
     cosine = normals @ look_direction(points, normals)
@@ -267,7 +267,7 @@ def _in_view(layout: Layout, rig: StereoRig, predictions: tuple[Prediction, ...]
     return findings
 
 
-def _sizes(layout: Layout, rig: StereoRig, predictions: tuple[Prediction, ...]) -> list[Finding]:
+def _sizes(layout: Composite, rig: StereoRig, predictions: tuple[Prediction, ...]) -> list[Finding]:
     """Say which discs are too small or too large in the images."""
     findings = []
     low, high = DISC_PX
@@ -283,7 +283,7 @@ def _sizes(layout: Layout, rig: StereoRig, predictions: tuple[Prediction, ...]) 
     return findings
 
 
-def _pose_findings(layout: Layout, predictions: tuple[Prediction, ...]) -> list[Finding]:
+def _pose_findings(layout: Composite, predictions: tuple[Prediction, ...]) -> list[Finding]:
     """Say which rotation is known least, what would help, and what else weakens the pose."""
     findings = []
     known = [one for one in predictions if np.isfinite(one.cov).all()]
@@ -312,7 +312,7 @@ def _pose_findings(layout: Layout, predictions: tuple[Prediction, ...]) -> list[
                 f"rotations move it: its position is known {worse:.1f} times worse than the middle's"
             )
             findings.append(Finding("weak", "origin", text, "put markers around the point that matters"))
-    if layout.disc_count == 3 and not layout.coded:
+    if layout.disc_count == 3 and not layout.parts:
         text = "three discs leave nothing over: where one is hidden there is no pose"
         findings.append(Finding("note", "spare", text, "a fourth disc, best off the plane of the three"))
     return findings

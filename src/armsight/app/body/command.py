@@ -47,7 +47,7 @@ def check(path: str, rig_path: str | None, distances: tuple[float, ...], as_json
 
     from armsight.app.body.check import assess
     from armsight.app.body.text import body_report
-    from armsight.vision.markers.body_layout import read_layout
+    from armsight.vision.markers.targets import read_layout
     from armsight.vision.pose.predict import plain_rig
     from armsight.vision.rig import StereoRig
 

@@ -32,10 +32,10 @@ from armsight.vision.markers.aprilgrid import AprilGrid
 from armsight.vision.markers.apriltag3 import LAYOUTS, printed
 from armsight.vision.markers.aruco import cells
 from armsight.vision.markers.board import BOARDS, KALIBR, open_board
-from armsight.vision.markers.body_layout import Layout, read_layout
 from armsight.vision.markers.charuco import Charuco
 from armsight.vision.markers.chessboard import Chessboard
 from armsight.vision.markers.circles import CircleGrid
+from armsight.vision.markers.targets import Composite, read_layout
 from armsight.vision.pose.predict import face_axes, look_direction
 
 if TYPE_CHECKING:
@@ -118,7 +118,7 @@ class Page(Record):
         return [mark.name for mark in self.marks]
 
 
-def pages(path: str | Path, layout: Layout) -> tuple[tuple[Page, ...], list[str]]:
+def pages(path: str | Path, layout: Composite) -> tuple[tuple[Page, ...], list[str]]:
     """Sort a body's markers by the plane they lie in.
 
     Args:
@@ -150,7 +150,7 @@ def pages(path: str | Path, layout: Layout) -> tuple[tuple[Page, ...], list[str]
     return tuple(out), notes
 
 
-def _discs(path: str | Path, layout: Layout, notes: list[str]) -> list[Mark]:
+def _discs(path: str | Path, layout: Composite, notes: list[str]) -> list[Mark]:
     """Return the discs; one without a normal takes that of the one plane in which all markers lie."""
     if (discs := layout.discs) is None:
         return []
@@ -184,7 +184,7 @@ def _discs(path: str | Path, layout: Layout, notes: list[str]) -> list[Mark]:
     ]
 
 
-def _patterns(layout: Layout) -> list[Mark]:
+def _patterns(layout: Composite) -> list[Mark]:
     """Return tags and boards."""
     markers = []
     for one in () if layout.tags is None else layout.tags.tags:

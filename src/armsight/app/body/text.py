@@ -10,7 +10,7 @@ import numpy as np
 from armsight.app.body.check import Assessment, Prediction, ambiguity_text, sigma_px
 from armsight.app.show.report import Block, Fact, Report
 from armsight.app.show.table import TextTable
-from armsight.vision.markers.body_layout import Layout
+from armsight.vision.markers.targets import Composite
 from armsight.vision.rig import StereoRig
 
 #: More distances between discs than this are printed by the closest pairs only.
@@ -28,7 +28,7 @@ def _cameras(rig: StereoRig, path: str | None) -> str:
     )
 
 
-def _distances(layout: Layout) -> list[tuple[str, str, float]]:
+def _distances(layout: Composite) -> list[tuple[str, str, float]]:
     """Return all distances between discs, m, the shortest first."""
     if layout.discs is None:
         return []
@@ -47,7 +47,7 @@ def _closest(distances: list[tuple[str, str, float]]) -> list[str]:
     ]
 
 
-def body_report(path: str, layout: Layout, rig: StereoRig, rig_path: str | None, assessment: Assessment) -> Report:
+def body_report(path: str, layout: Composite, rig: StereoRig, rig_path: str | None, assessment: Assessment) -> Report:
     """Return what an assessment says: mm, degrees, px; ``rig_path`` None: two perfect cameras."""
     count = {
         "disc": layout.disc_count,
@@ -64,7 +64,7 @@ def body_report(path: str, layout: Layout, rig: StereoRig, rig_path: str | None,
         "sigma_px": sigma_px(rig),
         "points": len(layout.body.points),
         "discs": layout.disc_count,
-        "coded": layout.coded,
+        "coded": bool(layout.parts),
         "ambiguities": _ambiguities(layout, assessment),
         "findings": [{**vars(f), "text": f.text or None, "change": f.change or None} for f in assessment.findings],
     }
@@ -88,9 +88,9 @@ def body_report(path: str, layout: Layout, rig: StereoRig, rig_path: str | None,
     return Report("body", "Assessment of a body", path, headline, {"result": ("Result", blocks)}, values=values)
 
 
-def _unique(layout: Layout, assessment: Assessment) -> str:
+def _unique(layout: Composite, assessment: Assessment) -> str:
     """Say whether the body can be identified, in one line."""
-    if layout.coded:
+    if layout.parts:
         return "yes, where a tag or a board is in view"
     if any(f.grade == "bad" and f.kind == "ambiguous" for f in assessment.findings):
         return "no"
@@ -117,7 +117,7 @@ def _pixels(one: Prediction) -> str:
     return f"{low:.1f} px" if high - low < 0.05 else f"{low:.1f} to {high:.1f} px"
 
 
-def _ambiguities(layout: Layout, assessment: Assessment) -> list[dict[str, Any]]:
+def _ambiguities(layout: Composite, assessment: Assessment) -> list[dict[str, Any]]:
     """Return what may be taken for what, for programs."""
     return [
         {

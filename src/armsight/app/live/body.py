@@ -25,8 +25,7 @@ from armsight.errors import ArmsightError, InputError
 from armsight.vision.calibrate.guide import CalibrationAim
 from armsight.vision.image import grey
 from armsight.vision.markers.board import BOARDS, board_in_view, open_board
-from armsight.vision.markers.body_layout import read_layout
-from armsight.vision.markers.targets import open_target
+from armsight.vision.markers.targets import open_target, read_layout
 from armsight.vision.pose.predict import plain_rig
 from armsight.vision.rig import StereoRig
 

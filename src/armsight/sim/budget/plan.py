@@ -38,8 +38,8 @@ from armsight.vision.calibrate.budget import (
 )
 from armsight.vision.camera import Camera
 from armsight.vision.markers.board import open_board
-from armsight.vision.markers.body_layout import Layout, read_layout
 from armsight.vision.markers.chessboard import Chessboard
+from armsight.vision.markers.targets import Composite, read_layout
 from armsight.vision.pose.predict import PredictedView
 from armsight.vision.rig import StereoRig
 
@@ -347,11 +347,11 @@ class RigPlan:
         return self.cameras.usb * 1e6 / (2 * width * height * self.cameras.bytes_px)
 
     @cached_property
-    def layout(self) -> Layout:
+    def layout(self) -> Composite:
         """The body."""
         if self.body:
             return read_layout(Path(self.folder) / self.body)
-        return Layout("tool_body", body_target(self.body_scale).discs, None, None)
+        return Composite("tool_body", (), body_target(self.body_scale).discs)
 
     @cached_property
     def stereo_rig(self) -> StereoRig:

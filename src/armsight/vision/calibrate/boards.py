@@ -1,6 +1,6 @@
 """Pairs of board images in, a calibrated rig and its held-out errors out.
 
-1. Start from nothing (``start.py``), correct boards named in another order, reject gross errors (``screen.py``). 2.
+1. Correct boards named in another order, start from nothing (``start.py``), reject gross errors (``screen.py``). 2.
 Adjust cameras, relative pose, poses of the board and the board itself jointly. A print is distorted and bowed by a
 tenth
    of a millimetre, several times the error of a good corner; if it is not estimated, it biases the cameras (Strobl and
@@ -45,7 +45,6 @@ from armsight.vision.calibrate.screen import (
     LEAST_CORNERS,
     MOTION_EASE,
     Screened,
-    correct_symmetries,
     noise_px,
     robust_sigma,
     screen,
@@ -597,29 +596,15 @@ def _start(
                 break
         return min(found, key=lambda s: s.cost)
 
-    def sorted_by(orders: dict[int, Ids]) -> list[Pair]:
-        return [
-            replace(pair, right=renamed(pair.right, orders[j])) if j in orders else pair
-            for j, pair in enumerate(usable)
-        ]
-
-    found, names = attempt(usable), usable
-    notes: list[str] = []
+    if not board.symmetries:
+        return attempt(usable), usable, []
     observations = Observations.from_shots([join(pair.left, pair.right) for pair in usable])
-    corrected = correct_symmetries(points, found.state, observations, board.symmetries)
-    if corrected:
-        names = sorted_by(corrected)
-        found = attempt(names)
-        notes = [
-            f"{usable[j].name}: the right image names the corners in another order; corrected"
-            for j in sorted(corrected)
-        ]
-    if board.symmetries and residual_rms_px(found) > _MISNAMED_PX:
-        agreed = agreed_symmetries(points, sizes, observations, board.symmetries, next(iter(families)))
-        if agreed and (again := attempt(sorted_by(agreed))).cost < found.cost:
-            found, names = again, sorted_by(agreed)
-            notes = [f"{len(agreed)} right images name the corners in another order; corrected"]
-    return found, names, notes
+    orders = agreed_symmetries(points, sizes, observations, board.symmetries, next(iter(families)))
+    named = [replace(p, right=renamed(p.right, orders[j])) if j in orders else p for j, p in enumerate(usable)]
+    notes = [f"{usable[j].name}: the right image names the corners in another order; corrected" for j in orders]
+    if 2 * len(orders) > len(usable):
+        notes = [f"{len(orders)} right images name the corners in another order; corrected"]
+    return attempt(named), named, notes
 
 
 @dataclass(frozen=True, eq=False)

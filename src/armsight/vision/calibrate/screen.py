@@ -1,4 +1,4 @@
-"""Reject what would spoil a calibration: gross corner errors, bad pairs, boards named in another order.
+"""Reject what would spoil a calibration: gross corner errors and bad pairs.
 
 A robust adjustment comes first; the noise is estimated from its residuals, so no threshold is in pixels. Everything
 rejected is named with its reason.
@@ -12,12 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from armsight.data import Array, Ids, Record
-from armsight.geometry.pose import inverse, transform
+from armsight.data import Array, Record
 from armsight.vision.calibrate.result import RejectedPair
-from armsight.vision.camera import Camera
 from armsight.vision.pose.bundle import DAMPING, NEAR, BundleModel, BundleSolution, BundleState, Observations, minimise
-from armsight.vision.pose.pnp import body_poses
 
 #: A corner this many standard deviations off the robust fit is gross: one in 10^7 for clean noise.
 CORNER_SIGMAS = 6.0
@@ -215,46 +212,3 @@ def _bad_pairs(
             bad[int(j)] = f"only {len(common)} corners are good in both images, {LEAST_CORNERS} are needed"
     worst = max(level.values(), default=0.0)
     return {j: reason for j, reason in bad.items() if level[j] > worst / 3 or level[j] <= PAIR_RATIO * usual}
-
-
-def correct_symmetries(
-    points: Array, state: BundleState, observations: Observations, symmetries: tuple[Ids, ...]
-) -> dict[int, Ids]:
-    """Find pairs whose right image names the board's corners in another order than the left one.
-
-    Args:
-        points: (M, 3) points of the board, m.
-        state: cameras and relative pose that most pairs agree on.
-        observations: all detections.
-        symmetries: permutations (M,) under which the board looks the same.
-
-    Returns:
-        Shot -> the permutation that sorts its right detections into the left's order.
-    """
-    found: dict[int, Ids] = {}
-    T_right_left = inverse(state.T_left_right)
-    right = state.cameras[1]
-    for shot in range(observations.shot_count):
-        rows = [(observations.shot == shot) & (observations.camera == side) for side in (0, 1)]
-        uv = [observations.uv[r] for r in rows]
-        ids = [observations.point[r] for r in rows]
-        if not all(len(seen) for seen in ids):
-            continue  # an image of one camera alone
-        candidates = body_poses(points[ids[0]], state.cameras[0], uv[0])
-        scores = []
-        for order in (np.arange(len(points)), *symmetries):
-            renamed = points[order[ids[1]]]
-            errors = [
-                np.median(np.linalg.norm(_project(right, T_right_left @ T, renamed) - uv[1], axis=1))
-                for T, _ in candidates
-            ]
-            scores.append(min(errors, default=np.inf))
-        best = int(np.argmin(scores))
-        if best and scores[best] < 0.2 * scores[0]:
-            found[shot] = symmetries[best - 1]
-    return found
-
-
-def _project(camera: Camera, T_camera_body: Array, points: Array) -> Array:
-    """Project body points; far away where they are behind the camera."""
-    return np.nan_to_num(camera.project(transform(T_camera_body, points)), nan=1e6)

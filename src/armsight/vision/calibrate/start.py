@@ -144,7 +144,7 @@ def agreed_symmetries(
     symmetries: tuple[Ids, ...],
     model: str,
 ) -> dict[int, Ids]:
-    """Find pairs whose right image names the points in another order than the left one, where most pairs may be such.
+    """Find pairs whose right image names the points in another order than the left one, even in most pairs.
 
     A camera that is mounted upside down sees the other end of a symmetric board as its first. One order of each pair gives
     the relative pose that the others give, too; wrong ones give another one wherever the board is.

@@ -20,7 +20,7 @@ from armsight.geometry.pose import transform
 from armsight.vision.markers.aruco import APRILTAGS, tag_family
 from armsight.vision.markers.board import open_board
 from armsight.vision.markers.body_file import Marker
-from armsight.vision.markers.marker import CalibrationBoard, Target
+from armsight.vision.markers.marker import CalibrationBoard, Target, detect_parts
 
 #: T_marker_board of a board whose y axis runs up and whose z axis points out of the face.
 _ABOUT_X = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -89,21 +89,14 @@ class BoardTarget(Record, Target):
         points = [transform(mounted.T_body_board, mounted.board.body.points) for mounted in self.boards]
         return Body(self.name, names, np.concatenate(points))
 
+    @cached_property
+    def normals(self) -> Array:
+        """(M, 3) unit vectors out of the face of each point, body frame."""
+        return np.repeat([m.normal for m in self.boards], [len(m.board.body.points) for m in self.boards], axis=0)
+
     def detect(self, image: NDArray[np.uint8]) -> Detections:
         """Find the boards in one grey image; see :class:`~armsight.vision.markers.marker.Target`."""
-        first, found, problems = 0, [], []
-        for mounted in self.boards:
-            seen = mounted.board.detect(image)
-            if seen.problem is None:
-                found.append(Detections(seen.ids + first, seen.uv, seen.cov_uv, common=seen.common))
-            else:
-                problems.append(f"{mounted.name}: {seen.problem}")
-            first += len(mounted.board.body.point_names)
-        if not found:
-            return Detections.none("; ".join(problems))
-        ids, uv, cov = zip(*((seen.ids, seen.uv, seen.cov_uv) for seen in found), strict=True)
-        common = max((seen.common for seen in found), key=np.linalg.norm)
-        return Detections(np.concatenate(ids), np.concatenate(uv), np.concatenate(cov), common=common)
+        return detect_parts(image, ((f"{mounted.name}: ", mounted.board) for mounted in self.boards))
 
 
 def _checked(spec: str) -> str:

@@ -6,7 +6,10 @@ To add a family: write one file with a class that fulfils :class:`Target`, and a
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Protocol
+
+import numpy as np
 
 from armsight.data import Body, Detections, Ids, Image
 from armsight.vision.markers.discs import DiscTarget
@@ -53,6 +56,28 @@ class Target(Protocol):
             covariance that the image itself supports. Nothing found is ``Detections.none(reason)``, never an exception.
         """
         ...
+
+
+def detect_parts(image: Image, parts: Iterable[tuple[str, Target]], nothing: str = "") -> Detections:
+    """Find the parts of a body in one grey image (H, W) whose points follow one another in the body.
+
+    Args:
+        image: (H, W) uint8.
+        parts: what the reason of a part that is not found begins with, and the part.
+        nothing: the reason where there is no part.
+    """
+    first, found, problems = 0, list[Detections](), list[str]()
+    for name, part in parts:
+        seen = part.detect(image)
+        if seen.problem is None:
+            found.append(Detections(seen.ids + first, seen.uv, seen.cov_uv, common=seen.common))
+        else:
+            problems.append(f"{name}{seen.problem}")
+        first += len(part.body.points)
+    if not found:
+        return Detections.none("; ".join(problems) or nothing)
+    ids, uv, cov = (np.concatenate([getattr(seen, key) for seen in found]) for key in ("ids", "uv", "cov_uv"))
+    return Detections(ids, uv, cov, common=max((seen.common for seen in found), key=np.linalg.norm))
 
 
 class CalibrationBoard(Target, Protocol):

@@ -86,6 +86,11 @@ class TagTarget(Record, Target):
         points = [transform(tag.T_body_tag, CORNERS * (tag.size_m / 2)) for tag in self.tags]
         return Body(self.name, names, np.concatenate(points))
 
+    @cached_property
+    def normals(self) -> Array:
+        """(M, 3) unit vectors out of the face of each point, body frame."""
+        return np.repeat([-tag.T_body_tag[:3, 2] for tag in self.tags], 4, axis=0)
+
     def detect(self, image: NDArray[np.uint8]) -> Detections:
         """Find the body in one grey image; a marker that is detected twice is left out: one of them is foreign."""
         ids, uv, cov, problems = [], [], [], []

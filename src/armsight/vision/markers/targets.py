@@ -20,7 +20,7 @@ from armsight.vision.markers.body_file import Marker, check_points, load_body_cs
 from armsight.vision.markers.calibrated_board import EstimatedBoard, load_board_file
 from armsight.vision.markers.charuco import Charuco
 from armsight.vision.markers.discs import DiscTarget
-from armsight.vision.markers.marker import Target
+from armsight.vision.markers.marker import Target, detect_parts
 from armsight.vision.markers.tag import TagTarget
 
 #: Kind of marker in a body file -> what makes a target of all markers of that kind on a body of a given name. Discs
@@ -57,39 +57,57 @@ class Composite(Record, Target):
         names = tuple(name for body in bodies for name in body.point_names)
         return Body(self.name, names, np.concatenate([body.points for body in bodies]))
 
+    @cached_property
+    def normals(self) -> Array:
+        """(M, 3) unit vectors out of the face of each point, body frame; NaN where the file does not give it."""
+        return np.concatenate([part.normals for part in (self.tags, self.boards, self.discs) if part is not None])
+
+    @property
+    def tags(self) -> TagTarget | None:
+        """Its tags."""
+        return next((part for part in self.parts if isinstance(part, TagTarget)), None)
+
+    @property
+    def boards(self) -> BoardTarget | None:
+        """Its boards."""
+        return next((part for part in self.parts if isinstance(part, BoardTarget)), None)
+
+    @property
+    def disc_count(self) -> int:
+        """How many discs there are; they are the last points."""
+        return 0 if self.discs is None else len(self.discs.radii_m)
+
     def detect(self, image: NDArray[np.uint8]) -> Detections:
         """Find every coded part in one grey image; discs are identified by both cameras together."""
-        first, found, problems = 0, [], []
-        for part in self.parts:
-            seen = part.detect(image)
-            if seen.problem is None:
-                found.append(Detections(seen.ids + first, seen.uv, seen.cov_uv, common=seen.common))
-            else:
-                problems.append(seen.problem)
-            first += len(part.body.point_names)
-        if not found:
-            return Detections.none(
-                "; ".join(problems) or "plain discs carry no codes: one image alone cannot identify them"
-            )
-        ids, uv, cov = zip(*((seen.ids, seen.uv, seen.cov_uv) for seen in found), strict=True)
-        common = max((seen.common for seen in found), key=np.linalg.norm)
-        return Detections(np.concatenate(ids), np.concatenate(uv), np.concatenate(cov), common=common)
+        return detect_parts(
+            image,
+            (("", part) for part in self.parts),
+            "plain discs carry no codes: one image alone cannot identify them",
+        )
 
 
-def load_body_toml(path: str | Path) -> Target:
-    """Make the target that a body file describes.
+def read_layout(path: str | Path) -> Composite:
+    """Read a body file.
 
     Raises:
-        InputError: missing, malformed, or an unknown kind of marker; the message names file and entry.
+        InputError: missing, malformed, an unknown kind of marker, no TOML, or a body that no command accepts
+            (``check_points``); the message names file and entry.
     """
+    if Path(path).suffix.lower() != ".toml":
+        raise InputError(f"{path}: expected a TOML body file, which describes its markers (docs/howto/targets.md)")
     name, markers = read_body_file(path, (*MARKERS, DISC))
     of_kind = {kind: [m for m in markers if m.kind == kind] for kind in (*MARKERS, DISC)}
     parts = tuple(make(name, of_kind[kind]) for kind, make in MARKERS.items() if of_kind[kind])
-    discs = DiscTarget.from_markers(name, of_kind[DISC]) if of_kind[DISC] else None
-    target = parts[0] if len(parts) == 1 and discs is None else Composite(name, parts, discs)
-    check_points(path, target.body)
+    body = Composite(name, parts, DiscTarget.from_markers(name, of_kind[DISC]) if of_kind[DISC] else None)
+    check_points(path, body.body)
     check_codes(of_kind["tag"], of_kind["board"])
-    return target
+    return body
+
+
+def load_body_toml(path: str | Path) -> Target:
+    """Make the target that a body file describes; errors as :func:`read_layout`."""
+    body = read_layout(path)
+    return body.parts[0] if len(body.parts) == 1 and body.discs is None else body
 
 
 def open_target(spec: str | Path) -> Target:
