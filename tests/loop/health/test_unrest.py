@@ -115,3 +115,10 @@ def test_a_camera_that_nods_is_not_said_to_have_rotated_besides():
     """What was summed before it was known to nod had too little noise."""
     (found,) = ended(54102, nod=(0, np.radians(0.03) * X, 3.0), seconds=9.0)
     assert "nods" in found.what
+
+
+@pytest.mark.parametrize("side", [0, 1])
+def test_a_camera_that_nods_slowly_is_named(side):
+    """It is found to nod in a test in which nothing else is left to compare: that ended in an IndexError."""
+    found = ended(42, nod=(side, np.radians(0.03) * Y, 0.7), seconds=20.0)
+    assert "rig" in {each.cause for each in found}

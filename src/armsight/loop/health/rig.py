@@ -371,8 +371,12 @@ class RigWatch:
         """Return the derivatives (n, 4) of a shot's rows by what moves to and fro."""
         return np.asarray(rows[:, 1 : 1 + self._size] @ self._to_and_fro)
 
-    def _take_unrest(self, stays: Sequence[Sequence[_ShotResiduals]]) -> None:
-        """Compare what the shots of a test say of the right camera's rotation and a focal length."""
+    def _unrest_began(self, stays: Sequence[Sequence[_ShotResiduals]]) -> bool:
+        """Compare what the shots of a test say of the right camera's rotation and a focal length.
+
+        Returns:
+            Whether they are found to move to and fro since this test.
+        """
         shots = [shot for stay in stays for shot in stay]
         J, r = [self._moving(each.rows) for each in shots], [each.rows[:, 0] for each in shots]
         H, b = np.array([each.T @ each for each in J]), np.array([j.T @ e for j, e in zip(J, r, strict=True)])
@@ -382,11 +386,7 @@ class RigWatch:
         excess = (sum(float(e @ e) for e in r) - float(np.vdot(b, d))) / max(freedom, 1.0)
         rested = not self._unrest.cov.any()
         self._unrest.take(np.array([each.t_s for each in shots]), d, cov, max(excess, 1.0))
-        if rested and self._unrest.cov.any():  # sums so far do not have it in their noise
-            self._window.scale(0.0)
-            self._history.clear()
-            self._plain.clear()
-            self._alarms, self.alarm, self.alarmed, self.suspected = 0, False, False, None
+        return rested and bool(self._unrest.cov.any())
 
     def _unrest_weighed(self, rows: Array, other: Array | None = None) -> Array:
         """Return rows of a shot, or others (n, K) of it, with what moves to and fro in their noise."""
@@ -618,8 +618,9 @@ class RigWatch:
         if alarm and moments and not self._alarms and self._poses > 1:
             newest, change, alarm = self._less_worst(moments, newest, change, doubted)
         self._keep(newest, change, alarm)
-        if nodded:
-            self._take_unrest(nodded)
+        if nodded and self._unrest_began(nodded):  # newest sums do not have it in their noise
+            self._take_back([each.begin_s for each in self._history[-TOGETHER:]])
+            return
         due = 0 < self._alarms <= _FRESH or self._tests % _LENS_TESTS == 0
         if due and self._tests < _LENS_KEPT and self._poses >= _LENS_POSES:
             self.lens = self._lens()
