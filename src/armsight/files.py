@@ -14,7 +14,6 @@ import json
 import os
 import re
 import stat
-import tempfile
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
@@ -376,6 +375,18 @@ def write_text(path: str | Path, text: str) -> None:
         file.write(text)
 
 
+def try_writing(folder: Path) -> None:
+    """Write a file in a folder and remove it.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    import tempfile  # not above: who prints a pose writes none
+
+    with tempfile.TemporaryFile(dir=folder):
+        pass
+
+
 def check_writable(path: str | Path, *, apart_from: Iterable[str | Path | None] = ()) -> None:
     """Find out before long work whether a file can be written at ``path``; nothing is left there.
 
@@ -397,8 +408,7 @@ def check_writable(path: str | Path, *, apart_from: Iterable[str | Path | None] 
     try:
         with contextlib.suppress(FileNotFoundError):
             os.lstat(_beside(target))  # a name that is too long
-        with tempfile.TemporaryFile(dir=folder):
-            pass
+        try_writing(folder)
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from None
 
@@ -472,8 +482,7 @@ def check_folder(
         for part in whole.relative_to(there).parts:
             with contextlib.suppress(FileNotFoundError):
                 (there / part).lstat()  # a name too long comes up here
-        with tempfile.TemporaryFile(dir=there):
-            pass
+        try_writing(there)
     except OSError as error:
         raise InputError(f"{folder}: {problem}: {error.strerror}{advice}") from None
     others = [other for other in apart_from if other is not None]

@@ -18,9 +18,9 @@ _HELP = (
 
 def _kept(ctx: click.Context, _: click.Parameter, spec: str | None) -> None:
     """Read who the cell is, so that a mistake is said before anything begins."""
-    from armsight.app.stream.cell_file import read_cell
-
     if spec is not None:
+        from armsight.app.stream.cell_file import read_cell
+
         read_cell(spec)
         ctx.meta[CELL] = (CELL + spec,)
 

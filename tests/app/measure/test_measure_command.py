@@ -55,6 +55,22 @@ def measured(rendered, tmp_path_factory):
         return records, list(csv.DictReader(file)), done.stderr
 
 
+#: What no pair needs, and a process that measures one would wait for.
+SLOW = ("scipy", "numpy.ma", "matplotlib", "pyarrow", "zenoh", "yaml", "sqlite3", "tempfile", "hashlib", "html")
+SLOW_OURS = ("sim", "robot.kinematics.arm", "loop.estimators.kalman", "loop.references", "app.stream.cell_file")
+
+
+@pytest.mark.parametrize("of", ["board", "arm"])
+def test_a_measure_of_one_pair_imports_nothing_slow(rendered, of):
+    left, right = (min(rendered.folder.glob(f"{of}/{side}*.png")) for side in ("left", "right"))
+    target = rendered.plate if of == "arm" else rendered.board[-1]
+    missing = (*SLOW, *(f"armsight.{name}" for name in SLOW_OURS))
+    code = f"import sys; sys.modules.update(dict.fromkeys({missing})); from armsight.app.main import main; main()"
+    arguments = ["measure", rendered.rig, "--target", target, "--left", left, "--right", right]
+    done = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
 def tangents(rendered, records):
     """Errors (N, 6) and covariances (N, 6, 6) in the body's axes."""
     errors, covs = [], []

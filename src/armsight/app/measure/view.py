@@ -14,7 +14,6 @@ import cv2
 
 from armsight.app.measure.chart import chart
 from armsight.app.measure.picture import draw_shot, header, marks_of
-from armsight.app.show.page import writable_folder
 from armsight.app.show.plotting import require_matplotlib
 from armsight.data import Body, Missed, PoseEstimate, Shot
 from armsight.errors import InputError
@@ -132,6 +131,8 @@ class PictureFolder:
     def _put(self, name: str, data: bytes) -> None:
         """Write a file, complete or not at all."""
         if not self._written:
+            from armsight.app.show.page import writable_folder
+
             writable_folder(self.folder, "no pictures")
         with replacing(self.folder / name, "wb") as file:
             file.write(data)

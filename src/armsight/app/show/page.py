@@ -9,13 +9,12 @@ from __future__ import annotations
 import base64
 import html
 import re
-import tempfile
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from armsight.app.show.plotting import plain
 from armsight.errors import InputError
-from armsight.files import replacing
+from armsight.files import replacing, try_writing
 
 #: A number, with its sigma or its unit.
 _NUMBER = re.compile(r"[-+\u2212]?\d[\d.,]*(?: \u00b1 [\d.,]+)?(?: ?[%a-z\u00b0]{1,3})?")
@@ -178,8 +177,7 @@ def writable_folder(directory: str | Path, contents: str, advice: str = "") -> P
     folder = Path(directory).expanduser()
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
+        try_writing(folder)
     except OSError as error:
         raise InputError(f"{folder}: {contents} can be written here: {error.strerror}{advice}") from None
     return folder

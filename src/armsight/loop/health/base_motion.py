@@ -23,11 +23,10 @@ from armsight.data import Array
 from armsight.geometry.pose import adjoint, inverse
 from armsight.loop.estimators import Innovation, KalmanEstimator, Outcome, Remembered
 from armsight.loop.estimators.errormodel import NOTHING
+from armsight.loop.health.change import DATED_S
 
 #: A measurement is kept every so often, s, and so many: those between say nearly the same of the arm.
 _EVERY_S, _KEPT = 1.0 / 15.0, 900
-#: A change is dated to about so much, s: so close to its beginning a measurement may be from before or after it.
-DATED_S = 0.7
 #: Priors so wide that they decide nothing: of a motion, and of its speed in a second (m, rad).
 _WIDE, _SPEED = np.repeat([0.05, 0.1], 3), np.repeat([5e-4, 1e-3], 3)
 #: Of the poses that the arm visited at most so many are looked at.

@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 ALIKE = 12.0
 #: A change that begins so much later than another is not the same one, s: beginnings are known to about a second.
 LATER_S = 3.0
+#: A change is dated to about so much, s: so close to its beginning a measurement may be from before or after it.
+DATED_S = 0.7
 #: The errors of an arm have longer tails than Gaussian ones: chi-squares count by this factor less.
 MARGIN = 1.4
 #: The estimate of a drift is off by about this share of it, in any direction: seen in simulated drifts of constant rate,

@@ -13,8 +13,7 @@ from armsight.geometry.pose import transform
 from armsight.loop.estimators import Outcome
 from armsight.loop.finding import HealthFinding, Trust, displacement_m
 from armsight.loop.frame_clock import FrameClock
-from armsight.loop.health.base_motion import DATED_S
-from armsight.loop.health.change import Change, ToolView, doubtful, finding, happened_besides, suspected
+from armsight.loop.health.change import DATED_S, Change, ToolView, doubtful, finding, happened_besides, suspected
 from armsight.loop.health.fixed import FixedWatch, ShakeWatch
 from armsight.loop.health.host import HostWatch
 from armsight.loop.health.landmarks import LandmarkWatch

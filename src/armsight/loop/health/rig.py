@@ -34,6 +34,7 @@ from collections import deque
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
+from statistics import median
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -239,7 +240,8 @@ class RigWatch:
 
     def __init__(self, rig: StereoRig, body: Body, sync_s: float, *, printed: bool = False) -> None:
         self.rig, self._body, self._sync_s = rig, body, sync_s
-        self._points = np.unique(np.linspace(0, len(body.points) - 1, MOST_POINTS).astype(int))
+        held = len(body.points)
+        self._points = np.linspace(0, held - 1, min(held, MOST_POINTS)).astype(int)
         count, shape = rig.parameter_count, 3 * len(self._points)
         self._size = count + 1 + shape + 2
         self.prior = np.zeros((self._size, self._size))
@@ -249,7 +251,7 @@ class RigWatch:
         self.prior[rest, rest] = np.append(SCALE, np.full(shape, SHAPE_M))
         self._by_fault = _fault_directions(rig, self._size)
         names = tuple(body.point_names[k] for k in self._points)
-        many = len(body.points) > MOST_POINTS
+        many = held > MOST_POINTS
         points = np.asarray(body.points, float)[self._points]
         self._focal = _focal_changes(rig, self._size)
         self._shape = ShapeWatch(
@@ -858,7 +860,7 @@ class RigWatch:
     def pose_sigma_m(self) -> float | None:
         """Standard deviation of the newest measured positions, median, m; None without any."""
         covs = [cov for _, cov in self._effects]
-        return float(np.median(np.sqrt(np.trace(np.array(covs)[:, :3, :3], axis1=1, axis2=2)))) if covs else None
+        return float(median(np.sqrt(np.trace(np.array(covs)[:, :3, :3], axis1=1, axis2=2)))) if covs else None
 
     def _of_part(self, change: RigChange, part: slice) -> Array:
         """Return the change of the parameters (K + M,) that a part of the seven numbers makes."""

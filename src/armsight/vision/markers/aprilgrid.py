@@ -14,7 +14,6 @@ from functools import cached_property
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize_scalar
 
 from armsight.data import Array, Body, Detections, Ids, Record
 from armsight.vision.markers.aruco import cells, family_size, find_squares
@@ -83,7 +82,7 @@ class AprilGrid(Record, CalibrationBoard):
         def error(spacing: float) -> float:
             return _off_plane(replace(board, spacing=spacing).body.points[seen.ids, :2] / tag_m, seen.uv)
 
-        return replace(board, spacing=round(float(minimize_scalar(error, bounds=(0.05, 1.0)).x), 2))
+        return replace(board, spacing=min((k / 100 for k in range(5, 101)), key=error))
 
     @property
     def y_up(self) -> bool:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from statistics import median
 
 import cv2
 import numpy as np
@@ -206,8 +207,8 @@ def _in_smaller_copy(image: NDArray[np.uint8], fits: CornerFits, squares: Array,
     """
     if not fits.kept.any():
         return fits
-    blur_px = float(np.median(np.sqrt(fits.models[fits.kept, 4:6])))
-    side_px = float(np.median(np.linalg.norm(squares[fits.kept], axis=2)))
+    blur_px = float(median(np.sqrt(fits.models[fits.kept, 4:6]).flat))
+    side_px = float(median(np.linalg.norm(squares[fits.kept], axis=2).flat))
     factor = int(min(blur_px / COPY_BLUR_PX, side_px / SMALLEST_SIDE_PX))
     if factor < 2:
         return fits

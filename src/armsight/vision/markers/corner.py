@@ -21,6 +21,7 @@ every corner of an image; its kernels are in ``crossing.py``.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from statistics import median
 from typing import Any
 
 import numpy as np
@@ -432,7 +433,7 @@ def refine_corners(
     lost = ~np.isfinite(residual)  # no pixel, or hardly one, determines these
     outcome[lost], residual[lost], cov[lost] = _DIVERGED, 0.0, 0.0
     share, good = residual / np.maximum(np.abs(models[:, 7]), 1e-9), outcome == _KEPT
-    usual = 0.0 if rough or good.sum() < _MANY else float(np.median(share[good]))
+    usual = 0.0 if rough or good.sum() < _MANY else median(share[good].tolist())
     outcome[good & (share > max(MISFIT_MAX, min(MISFIT_RATIO * usual, MISFIT_LIMIT)))] = _MISFIT
     good = (outcome == _KEPT) & np.isfinite(noise).all(axis=(1, 2, 3))
     if not rough and good.sum() >= _MANY:
