@@ -13,7 +13,6 @@ from armsight.app.measure import view as view_module
 from armsight.app.measure.chart import SHOT, TIME, _intervals, chart, chart_data
 from armsight.app.measure.picture import WIDTH, _Panel, ascii_text, draw_shot, ellipse, header, marks_of, wrapped
 from armsight.app.measure.view import CHART, EACH_UP_TO, PictureFolder, view_folder
-from armsight.app.show import page
 from armsight.data import SIDES, Detections, Dropped, Missed, PoseEstimate, Shot
 from armsight.errors import InputError
 from armsight.geometry.pose import inverse, transform
@@ -416,7 +415,7 @@ def test_a_folder_without_leave_to_write(tmp_path, monkeypatch):
     def no(**_):
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr(page.tempfile, "TemporaryFile", no)
+    monkeypatch.setattr("tempfile.TemporaryFile", no)
     with pytest.raises(InputError, match="no pictures can be written here: Permission denied"):
         view_folder(tmp_path / "v")
 
