@@ -251,23 +251,27 @@ def _half(key: str, node: Any, half: re.Match[str]) -> Record:  # noqa: ANN401
     position = half["position"] is not None
     if isinstance(node, Mapping):
         numbers = _numbers(node)
-        prefix = {frozenset(_XYZ): "" if position else "r", frozenset("wxyz"): None if position else "q"}
-        before = prefix.get(frozenset(numbers))
-        return {} if before is None else {f"{before}{k}": one for k, one in numbers.items()}
+        before = {frozenset(_XYZ): "r", frozenset("wxyz"): "q"} if not position else {frozenset(_XYZ): ""}
+        prefix = before.get(frozenset(numbers))
+        return {} if prefix is None else {f"{prefix}{k}": one for k, one in numbers.items()}
     array = _array(node)
-    if array is None:
-        return {}
     unit = found[0] if (found := _UNIT.search(key)) else ""
-    vector = not position and any(word in key.lower() for word in ("rvec", "rotvec", "axis"))
-    names = [f"{'' if position else 'r'}{axis}{unit or ('_rad' if vector else '')}" for axis in "xyz"]
-    if array.shape == (4,):
-        order = next((order for order in ("xyzw", "wxyz") if order in key.lower()), None)
-        names = [f"q{k}" for k in order] if order else ["n1", "n2", "n3", "n4"]
-    elif array.shape in ((3, 3), (9,)):
-        names = _ROTATION
-    if array.size != len(names) or array.ndim > 2 or (position and array.size != 3):
+    names = [f"{axis}{unit}" for axis in "xyz"] if position else _rotation_names(key.lower(), unit, array)
+    if array is None or array.size != len(names) or array.ndim > 2:
         return {}
     return dict(zip(names, (repr(float(one)) for one in array.ravel()), strict=True))
+
+
+def _rotation_names(key: str, unit: str, array: np.ndarray[Any, np.dtype[np.float64]] | None) -> list[str]:
+    """Return the names of a rotation's numbers by their shape, and by what they are called."""
+    shape = () if array is None else array.shape
+    if shape == (4,):
+        order = next((order for order in ("xyzw", "wxyz") if order in key), None)
+        return [f"q{k}" for k in order] if order else ["n1", "n2", "n3", "n4"]
+    if shape in ((3, 3), (9,)):
+        return _ROTATION
+    vector = any(word in key for word in ("rvec", "rotvec", "axis"))
+    return [f"r{axis}{unit or ('_rad' if vector else '')}" for axis in "xyz"]
 
 
 def _beside(item: Any) -> Record:  # noqa: ANN401

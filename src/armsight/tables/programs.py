@@ -191,17 +191,26 @@ def _points(path: Path, text: str, program: Program) -> ProgramPoints | None:
             f"joints (line {_line(text, joints[0])}): keep one kind in a file"
         )
     frames = dict.fromkeys(re.findall(r"\bUF\s*:\s*(\w+)\s*,\s*UT\s*:\s*(\w+)", kept))
-    if program.maker == "FANUC" and len(frames) > 1:  # their poses do not belong together
+    if len(frames) > 1:  # FANUC's; their poses do not belong together
         named = ", ".join(f"UF {uf}, UT {ut}" for uf, ut in frames)
         raise InputError(f"{path}: its points are of several frames or tools ({named}): keep those of one in a file")
     if joints:
-        cells = [re.split(r"[\s,]+", one[1].strip()) if one.re.groups == 1 else list(one.groups()) for one in joints]
-        head = [f"q{k}_deg" for k in range(1, len(cells[0]) + 1)]
-        rows = [(_line(text, one), [cell.strip() for cell in row]) for one, row in zip(joints, cells, strict=True)]
-        return ProgramPoints(head, rows, None, notes)
+        return _joint_points(text, joints, notes)
+    return _pose_points(path, text, program, poses, notes) if poses else None
+
+
+def _joint_points(text: str, joints: list[re.Match[str]], notes: tuple[str, ...]) -> ProgramPoints:
+    """Return joints, degrees: of each one group with commas, or one a joint."""
+    cells = [re.split(r"[\s,]+", one[1].strip()) if one.re.groups == 1 else list(one.groups()) for one in joints]
+    rows = [(_line(text, one), [cell.strip() for cell in row]) for one, row in zip(joints, cells, strict=True)]
+    return ProgramPoints([f"q{k}_deg" for k in range(1, len(cells[0]) + 1)], rows, None, notes)
+
+
+def _pose_points(
+    path: Path, text: str, program: Program, poses: list[re.Match[str]], notes: tuple[str, ...]
+) -> ProgramPoints:
+    """Return poses, mm and degrees or quaternions."""
     rows = [(_line(text, one), list(one.groups())) for one in poses]
-    if not rows:
-        return None
     how = f"degrees, {program.rotation}" if program.rotation else "quaternions"
     said = f"{path}: {len(rows)} points read as {program.maker}'s: mm, {how}"
     if program.rotation == "ZYZ":  # not among the conventions of three axes

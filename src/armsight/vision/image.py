@@ -47,22 +47,21 @@ def _quiet() -> Iterator[None]:
             os.close(null)
 
 
-def _jpeg_complete(data: bytes) -> bool:
-    """Whether JPEG data holds the end of its image: walk the segments to the scan, then look for its end marker.
+def jpeg_in(data: bytes) -> bytes | None:
+    """Return the JPEG that data begins with, None if it is none, or cut short: walk the segments to the scan and its end.
 
     Inside a scan FF is always escaped, so the first FF D9 after its start is the end; a thumbnail's lies before.
     """
-    at = 2
-    while at + 4 <= len(data):
-        if data[at] != 0xFF:
-            return False
+    at = 2 if data.startswith(b"\xff\xd8\xff") else len(data)
+    while at + 4 <= len(data) and data[at] == 0xFF:
         if data[at + 1] == 0xFF:  # fill byte
             at += 1
         elif data[at + 1] == 0xDA:
-            return data.find(b"\xff\xd9", at) >= 0
+            end = data.find(b"\xff\xd9", at)
+            return data[: end + 2] if end >= 0 else None
         else:
             at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
-    return False
+    return None
 
 
 def _png_complete(data: bytes) -> bool:
@@ -76,7 +75,7 @@ def _png_complete(data: bytes) -> bool:
 
 
 #: First bytes of a file -> its format, and the check that it is complete.
-_FORMATS = {b"\xff\xd8\xff": ("JPEG", _jpeg_complete), b"\x89PNG\r\n\x1a\n": ("PNG", _png_complete)}
+_FORMATS = {b"\xff\xd8\xff": ("JPEG", jpeg_in), b"\x89PNG\r\n\x1a\n": ("PNG", _png_complete)}
 
 
 def read_image(path: str | Path) -> Image:

@@ -26,6 +26,7 @@ import numpy as np
 
 from armsight.data import Image, Shot
 from armsight.errors import DeviceError, InputError
+from armsight.vision.image import jpeg_in
 from armsight.vision.source import Source
 from armsight.vision.sources.capture import Rhythm, allowed_skew, open_capture
 
@@ -299,5 +300,5 @@ def _image(frame: bytes | Image | None) -> Image | None:
     """Decode a JPEG file; None if it is not one or is truncated."""
     if not isinstance(frame, bytes):
         return frame
-    whole = frame.startswith(b"\xff\xd8") and frame.rstrip(b"\r\n\0").endswith(b"\xff\xd9")
-    return cv2.imdecode(np.frombuffer(frame, np.uint8), cv2.IMREAD_UNCHANGED) if whole else None
+    whole = jpeg_in(frame)
+    return None if whole is None else cv2.imdecode(np.frombuffer(whole, np.uint8), cv2.IMREAD_UNCHANGED)

@@ -19,15 +19,15 @@ import re
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Protocol
 
 import cv2
 import numpy as np
 
 from armsight.data import Image, Shot
 from armsight.errors import DeviceError, InputError
+from armsight.vision.image import jpeg_in
 from armsight.vision.source import Source
-from armsight.vision.sources.capture import Rhythm, allowed_skew, open_capture
+from armsight.vision.sources.capture import QuietCapture, Rhythm, allowed_skew, open_capture
 from armsight.vision.sources.v4l2 import EXPOSURE_UNIT_MS
 
 STALL_S = 5.0  # without a frame for that long a camera has stalled
@@ -41,30 +41,6 @@ _MJPG = cv2.VideoWriter.fourcc(*"MJPG")
 Settings = dict[int, tuple[str, float]]
 
 
-class Capture(Protocol):
-    """The methods of cv2.VideoCapture that are used; tests bring their own."""
-
-    def set(self, prop: int, value: float, /) -> bool:
-        """Set a property."""
-        ...
-
-    def get(self, prop: int, /) -> float:
-        """Read a property back."""
-        ...
-
-    def grab(self) -> bool:
-        """Take the next frame, undecoded; False when none came."""
-        ...
-
-    def retrieve(self) -> tuple[bool, Image]:
-        """Decode the grabbed frame."""
-        ...
-
-    def release(self) -> None:
-        """Close the device."""
-        ...
-
-
 _COMMAND = (
     80  # characters of another process' command in a message; half: its configuration is cut, double: a long line
 )
@@ -73,13 +49,13 @@ _COMMAND = (
 class UsbCamera:
     """One camera, set up, with its newest frame's time stamp."""
 
-    def __init__(self, device: str, capture: Capture, shape: tuple[int, int]) -> None:
+    def __init__(self, device: str, capture: QuietCapture, shape: tuple[int, int]) -> None:
         self.device, self.capture = device, capture
         self.rhythm, self.t_s = Rhythm(), 0.0
         self._shape = shape
 
     @staticmethod
-    def set_up(device: str, settings: Settings, capture: Capture) -> UsbCamera:
+    def set_up(device: str, settings: Settings, capture: QuietCapture) -> UsbCamera:
         """Set all properties requested, and read them back.
 
         Raises:
@@ -143,7 +119,7 @@ class UsbCamera:
             return None
         encoded: bytes | None = None
         if image.shape[:2] != self._shape and image.size == max(image.shape):  # one row or column: bytes as they came
-            encoded = _one_jpeg(np.asarray(image, np.uint8).tobytes())
+            encoded = jpeg_in(np.asarray(image, np.uint8).tobytes())
             decoded = None if encoded is None else cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_COLOR)
             if decoded is None:
                 return None
@@ -195,7 +171,7 @@ class UsbSource(Source):
         self._right.capture.release()
 
 
-def open_usb(rest: str, capture: Callable[[str], Capture] | None = None) -> UsbSource:
+def open_usb(rest: str, capture: Callable[[str], QuietCapture] | None = None) -> UsbSource:
     """Open ``LEFT,RIGHT[@WIDTHxHEIGHT][@FPS][,exposure=5ms|auto][,gain=20][,format=MJPG]``.
 
     Args:
@@ -208,7 +184,7 @@ def open_usb(rest: str, capture: Callable[[str], Capture] | None = None) -> UsbS
     """
     devices, settings = parsed_usb(rest)
     cameras: list[UsbCamera] = []
-    opened: list[Capture] = []
+    opened: list[QuietCapture] = []
     try:
         for device in devices:
             opened.append((capture or _v4l2)(device))
@@ -259,16 +235,7 @@ def parsed_usb(rest: str) -> tuple[list[str], Settings]:
     return devices, settings
 
 
-def _one_jpeg(buffer: bytes) -> bytes | None:
-    """Return the JPEG at the beginning of a driver's buffer, which an older one may follow; None if it is cut short."""
-    at = 2
-    while buffer[at : at + 1] == b"\xff" and buffer[at + 1 : at + 2] != b"\xda":  # segments, each with its length
-        at += 2 + int.from_bytes(buffer[at + 2 : at + 4], "big")
-    end = buffer.find(b"\xff\xd9", at)  # within compressed data no such pair can stand
-    return buffer[: end + 2] if buffer[:2] == b"\xff\xd8" and end >= 0 else None
-
-
-def _v4l2(device: str) -> Capture:
+def _v4l2(device: str) -> QuietCapture:
     """Open a device with OpenCV."""
     if not os.path.exists(device):
         raise DeviceError(f"{device}: no such camera; `armsight cameras` lists those attached")
