@@ -116,6 +116,18 @@ def print_cases() -> Iterator[Case]:
                 yield Case(f"{word} camera nods by 0.03 deg at {hz:g} Hz ({name})", nod, "rig")
 
 
+def drift_cases() -> Iterator[Case]:
+    """Cameras that go on changing, as those that warm up do: a focal length, a rotation."""
+    for share in (5e-4, 1e-3, 2e-3):
+        for side, word in enumerate(("left", "right")):
+            by = share * np.eye(2)[side]
+            drifts = {"focal": lambda t, by=by: by * t / 15.0, "at_s": 5.0}
+            yield Case(f"{word} focal length drifts by {100 * share:g} % in 15 s", drifts, "lens")
+    for axis, name in zip(np.eye(3), "xyz", strict=True):
+        drifts = {"nod": (1, 0.05 * DEG * axis, lambda t: t / 15.0), "at_s": 5.0}
+        yield Case(f"right camera drifts by 0.05 deg in 15 s ({name})", drifts, "rig")
+
+
 def lens_cases() -> Iterator[Case]:
     """Lenses and sensors that the model of the cameras cannot express, on two patches."""
     for px in (0.15, 0.3, 0.6):
@@ -325,6 +337,7 @@ def main(words: list[str], seeds: range, results: Path | None) -> None:
         (body_run, body_cases()),
         (body_run, shape_cases()),
         (body_run, print_cases()),
+        (body_run, drift_cases()),
         (body_run, lens_cases()),
         (body_run, passing_cases()),
         (arm_run, arm_cases()),

@@ -20,6 +20,9 @@ from armsight.estimate.chance import chi_square_limit
 Cause = Literal["rig", "body", "fixed", "time", "lens", "joint", "estimator", "host"]
 #: Probability of a false alarm of each test within a minute, while its noise model holds.
 FALSE_ALARMS_PER_MINUTE = 1e-4
+#: Chance of a test below which what it shows widens poses, though it is not said yet; half: a change of its size costs NEES
+#: for longer, double: poses of a healthy run are too wide more often.
+SUSPECTED = 0.02
 #: What displaces the tool by less, m, forbids no result: of cameras and lenses it is not said, as poses are widened by it.
 #: Half: what webcams leave after processing is said, double: a stand that shakes by 0.2 mm is not.
 COSTS_M = 1e-4

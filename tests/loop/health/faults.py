@@ -117,9 +117,10 @@ def watched_body(
 
     From ``at_s`` on cameras and points of the body are displaced, the right camera exposes late by ``skew_s`` (or that of
     the number of the shot, s) and each row of it (of both, where two are given) by ``row_s`` later than the one above,
-    and focal lengths change by a share of themselves, ``focal`` of the time since then, left and right. ``nod``: of a side,
-    its camera rotates about its own axes by (side, amplitude (3,), rad, frequency, Hz). ``measure``: returns the pose of a
-    shot at a time, s, from rig, body, pixels and the true pose as a function of time; as by simultaneous cameras if None.
+    and focal lengths change by a share of themselves, ``focal`` of the time since then, left and right. ``nod``: of a
+    side, its camera rotates about its own axes by (side, amplitude (3,), rad, frequency, Hz, or a function of the time
+    since then, s, that the amplitude is multiplied by). ``measure``: returns the pose of a shot at a time, s, from rig,
+    body, pixels and the true pose as a function of time; as by simultaneous cameras if None.
     """
     rng = np.random.default_rng(seed)
     if lens is None:
@@ -152,7 +153,7 @@ def watched_body(
         uv[:, 1] = uv_late[:, 1]
         if nod is not None and t >= at_s:
             side, amplitude, hz = nod
-            by = exp_so3(amplitude * np.sin(2 * np.pi * hz * t)).T
+            by = exp_so3(amplitude * (hz(t - at_s) if callable(hz) else np.sin(2 * np.pi * hz * t))).T
             frame_of = [np.eye(4), inverse(true.T_left_right)][side] @ T
             at = (there @ frame_of[:3, :3].T + frame_of[:3, 3]) @ by.T
             uv[:, side] = true.cameras[side].project(at)

@@ -11,6 +11,7 @@ from armsight.geometry.pose import inverse, log_se3, pose
 from armsight.geometry.rotation import exp_so3
 from armsight.loop.health import HealthMonitor
 from armsight.loop.health.rig import RigWatch
+from armsight.loop.health.shape import ResidualSums, grown
 from armsight.vision.pose.locate import locate
 from armsight.vision.triangulate import triangulate
 from views import both_pixels
@@ -163,3 +164,27 @@ def test_points_that_do_not_fit_change_nothing_of_the_other_tests():
     column = 1 + rig.parameter_count + 1 + 3 * DISC
     assert not found.rows[:, column : column + 3].any()
     assert found.every[:, column : column + 3].any()
+
+
+def test_a_focal_length_that_drifts_is_said_to_go_on_and_poses_are_widened():
+    """The newest NEES is that of a change as large as it is now: 27 where a step since its beginning is taken."""
+    *run, (monitor, *_) = watched_body(71, focal=lambda t: (1e-3 * t / 15.0, 0.0), at_s=5.0, seconds=20.0)
+    (found,) = monitor.findings()
+    assert (found.cause, found.unit) == ("lens", "%")
+    assert "goes on" in found.what
+    assert found.size == pytest.approx(0.1, abs=3.0 * found.sigma)
+    offs = [(log_se3(inverse(given.T_left_body) @ T), given.cov) for _, _, T, _, given in run[-150:]]
+    assert np.mean([off @ np.linalg.solve(cov, off) for off, cov in offs]) < 12.0
+
+
+def test_sums_of_what_grows_are_those_of_its_own_columns():
+    """Of rows whose last columns are multiplied by the share of a test's time, added up one by one."""
+    rng = np.random.default_rng(8)
+    rows, begins_s = rng.normal(size=(5, 9, 6)), [2.0, 3.0, 4.5, 5.0, 7.0]
+    tests, slow = [], np.zeros((6, 6))
+    for each, begin_s in zip(rows, begins_s, strict=True):
+        tests.append(ResidualSums(5, begin_s))
+        tests[-1].take(each, 9.0)
+        scaled = each * np.append(np.ones(4), np.full(2, (begin_s - 2.0) / 5.0))
+        slow += scaled.T @ scaled
+    np.testing.assert_allclose(grown(tests, 3).M, slow, rtol=1e-12)

@@ -37,13 +37,13 @@ def test_a_elongated_or_sheared_body_is_named_and_poses_are_widened(shift, seed)
     assert nees < 12.0  # 65 to 250 without
 
 
-@pytest.mark.parametrize(("side", "axis", "hz"), [(0, X, 3.0), (1, Y, 7.0), (1, X, 5.0)])
+@pytest.mark.parametrize(("side", "axis", "hz"), [(0, X, 3.0), (0, Y, 3.0), (1, Y, 7.0), (1, X, 5.0)])
 def test_a_camera_that_nods_is_named_and_poses_are_widened(side, axis, hz):
     nees, found = nees_and_findings(41, nod=(side, np.radians(0.03) * axis, hz))
     assert [each.cause for each in found] == ["rig"]
     assert "nods" in found[0].what
     assert found[0].size == pytest.approx(0.03 / np.sqrt(2.0), rel=0.15)
-    assert nees < 16.0
+    assert nees < 12.0  # 50 without, 19 where the left camera is taken to rotate the other way
 
 
 def test_asking_for_findings_is_no_evidence():

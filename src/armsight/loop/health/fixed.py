@@ -25,6 +25,7 @@ counts where chance does not explain its variance. Moments of a component of var
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from copy import copy
 from typing import Any, NamedTuple
 
@@ -34,7 +35,14 @@ from armsight.data import Array, Ids
 from armsight.estimate.chance import chi_square_chance
 from armsight.loop.estimators import Innovation, Outcome
 from armsight.loop.estimators.armerror import layout
-from armsight.loop.finding import COSTS_M, FALSE_ALARMS_PER_MINUTE, HealthFinding, alarm_limit, displacement_m
+from armsight.loop.finding import (
+    COSTS_M,
+    FALSE_ALARMS_PER_MINUTE,
+    SUSPECTED,
+    HealthFinding,
+    alarm_limit,
+    displacement_m,
+)
 from armsight.loop.health.change import RAMPS, Change, Suspect, changing, ranked, suspects
 
 #: A beginning is tried every so often, s; older than this many seconds their distances grow with their age.
@@ -267,11 +275,12 @@ class Unrest:
 
     Attributes:
         cov: (D, D) covariance of what they vary beyond it; zero while chance explains it.
+        suspected: the same by the newest window alone, while nothing is certain.
     """
 
     def __init__(self, size: int) -> None:
         self._windows: deque[tuple[Any, ...]] = deque(maxlen=_NEWEST)
-        self.cov = np.zeros((size, size))
+        self.cov = self.suspected = np.zeros((size, size))
 
     def take(self, t_s: Array, values: Array, covs: Array, excess: float = 1.0) -> None:
         """Take a window.
@@ -292,19 +301,29 @@ class Unrest:
         shares = 1.0 / sizes**2
         sums = (left.T * shares) @ left, np.einsum("n,nij->ij", shares, noise), shares.sum(), np.square(shares).sum()
         self._windows.append((float(np.trace(np.linalg.solve(sums[1], sums[0]))), len(t_s), *sums))
-        self.cov = np.zeros_like(self.cov)
-        if len(self._windows) < _FEWEST:
-            return
-        usual = sorted(self._windows, key=lambda each: each[0])[: -max(round(_ODD * len(self._windows)), 1)]
-        _, counts, seen, expected, once, twice = (sum(part) for part in zip(*usual, strict=True))
-        freedom = float(once**2 / twice) * (1.0 - _TERMS * len(usual) / counts)
+        self.cov = self.suspected = np.zeros_like(self.cov)
+        if len(self._windows) >= _FEWEST:
+            usual = sorted(self._windows, key=lambda each: each[0])[: -max(round(_ODD * len(self._windows)), 1)]
+            self.cov = self._beyond(usual, FALSE_ALARMS_PER_MINUTE / 60.0)
+        if not self.cov.any():
+            self.suspected = self._beyond([self._windows[-1]], SUSPECTED)
+
+    @staticmethod
+    def _beyond(windows: Sequence[tuple[Any, ...]], chance: float) -> Array:
+        """Return the covariance (D, D) of what windows vary beyond their noise, in axes of less than a chance."""
+        _, counts, seen, expected, once, twice = (sum(part) for part in zip(*windows, strict=True))
+        freedom = float(once**2 / twice) * (1.0 - _TERMS * len(windows) / counts)
         L = np.linalg.cholesky(expected / once)
         inner = np.linalg.solve(L, np.linalg.solve(L, seen / once).T)
         values, vectors = np.linalg.eigh((inner + inner.T) / 2.0)
         chances = np.array([chi_square_chance(freedom, freedom * value) for value in values])
-        certain = chances * len(values) < FALSE_ALARMS_PER_MINUTE / 60.0
         axes = L @ vectors
-        self.cov = (axes * np.where(certain, values - 1.0, 0.0)) @ axes.T
+        return np.asarray((axes * np.where(chances * len(values) < chance, values - 1.0, 0.0)) @ axes.T)
+
+    @property
+    def shows(self) -> bool:
+        """Whether there is anything certain or suspected."""
+        return bool(self.cov.any() or self.suspected.any())
 
     def copied(self) -> Unrest:
         """Return a copy that windows can be tried on; this one goes on without them."""

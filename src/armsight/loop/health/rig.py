@@ -45,7 +45,7 @@ from armsight.estimate.chance import chi_square_limit
 from armsight.geometry.matrix import product, solved
 from armsight.geometry.pose import adjoint, inverse, log_se3, pose
 from armsight.kernels import kernel
-from armsight.loop.finding import COSTS_M, HealthFinding, alarm_limit, displacement_m
+from armsight.loop.finding import COSTS_M, SUSPECTED, HealthFinding, alarm_limit, displacement_m
 from armsight.loop.health.fixed import Unrest
 from armsight.loop.health.passing import (
     TOGETHER,
@@ -62,7 +62,7 @@ from armsight.loop.health.passing import (
     noisier,
     velocity,
 )
-from armsight.loop.health.shape import FURTHEST_M, SMOOTH, ResidualSums, ShapeWatch, eliminated, total
+from armsight.loop.health.shape import FURTHEST_M, SMOOTH, STEPS, ResidualSums, ShapeWatch, eliminated, grown, total
 from armsight.vision.camera import pair_arguments
 from armsight.vision.pose.posefit import differentiate
 from armsight.vision.rig import StereoRig
@@ -91,8 +91,10 @@ _LEAST_POINTS, _APART_S = 4, 0.5
 TEST_S, TEST_SHOTS, FORGET_TESTS = 1.0, 60, 30.0
 #: Residuals are not linear in the size of a body that is off by more than this share of it.
 _LINEAR = 0.005
-#: In so many tests after an alarm what was before the change is dropped; it began at most so many tests before the alarm.
+#: In so many tests after an alarm the lenses are tested each time; a test counts for what images leave after so many more.
 _FRESH, _BEFORE = 6, 3
+#: Beginnings that are tried; half: an old change is dated to a half of its age, double: twice the time after a fault.
+_BEGINS = 16
 #: Tests that are kept, to find since when: then the older half is merged in pairs, and so on. half: an old beginning is
 #: known half as closely, double: 4 MB more. So many first ones say what the lenses lack.
 _MOST_KEPT, _LENS_KEPT = 64, 600
@@ -117,8 +119,8 @@ _ALARM, _ALARMS = (
 )
 #: A change matters or not at so many of the newest poses: a skew does so in motion alone.
 _POSES = 60
-#: Chi-square from which on a change that matters widens the poses: chance exceeds it in one of fifty tests.
-_SUSPECTED = chi_square_limit(len(_WIDE), 0.02)
+#: Chi-square from which on a change that matters widens the poses.
+_SUSPECTED = chi_square_limit(len(_WIDE), SUSPECTED)
 #: The polynomials of the position in an image are all products of x and y up to this degree; their count.
 _DEGREE = 4
 _POLYNOMIALS = (_DEGREE + 1) * (_DEGREE + 2) // 2
@@ -147,6 +149,7 @@ class RigChange(Record):
         without: the same of the others.
         gained: sum of squares that the seven explain.
         left: sum of squares that nothing explains.
+        slow: whether it goes on, and is as large as it was in the newest test.
     """
 
     f: Array
@@ -156,6 +159,7 @@ class RigChange(Record):
     without: dict[Part, float]
     gained: float
     left: float
+    slow: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -360,13 +364,14 @@ class RigWatch:
 
         Either camera may be the one; by a rotation of the left one, in whose frame poses are, the body moves as well.
         """
-        if not self._unrest.cov.any():
+        if not self._unrest.shows:
             return np.zeros((6, 6))
+        cov = self._unrest.cov + self._unrest.suspected
         by_rotation = response[:, : self._size] @ self._to_and_fro[:, :3]
         by_focal = response[:, : self._size] @ self._alone
         by_right = np.column_stack([by_rotation, by_focal[:, 0]])
-        by_rotation = by_rotation + adjoint(inverse(T))[:, 3:] @ self.rig.T_left_right[:3, :3]
-        by_left, cov = np.column_stack([by_rotation, by_focal[:, 1]]), self._unrest.cov
+        by_rotation = by_rotation - adjoint(inverse(T))[:, 3:] @ self.rig.T_left_right[:3, :3]
+        by_left = np.column_stack([by_rotation, by_focal[:, 1]])
         return np.asarray(0.5 * (by_right @ cov @ by_right.T + by_left @ cov @ by_left.T))
 
     def _moving(self, rows: Array) -> Array:
@@ -438,7 +443,7 @@ class RigWatch:
             or self.lens is not None
             or self._shape.found is not None
             or self._shape.doubt is not None
-            or self._unrest.cov.any()
+            or self._unrest.shows
             or self.passing.now
             or not self._timed
             or not 0.0 <= passed_s < _LIKE_S
@@ -638,8 +643,8 @@ class RigWatch:
         self._plain.append(newest.whole.of(len(newest.test.b)).over(newest.noise))
         self._history.append(newest.test)
         self._alarms = self._alarms + 1 if alarm else 0
-        if 0 < self._alarms <= _FRESH:
-            change = self._begun(change)
+        if alarm:
+            self._window, change, _ = self._split(self._history)
         matters = alarm or (change.chi_square > _SUSPECTED and self._matters(change, slice(None)))
         self.suspected = change if matters else None
         self.alarm, self.alarmed = alarm, self.alarmed or alarm
@@ -833,14 +838,6 @@ class RigWatch:
         cov = scale_px**2 * spread[-_LENS:, -_LENS:]
         return scale_px * found[-_LENS:], cov, evidence
 
-    def _begun(self, change: RigChange) -> RigChange:
-        """Return the change estimated from its beginning on; drop what was before."""
-        count = self._alarms + _BEFORE
-        if len(self._history) <= count:
-            return change
-        self._window, change, _ = self._split(self._history[-count:])
-        return change
-
     @property
     def wrong_at_rest(self) -> bool:
         """Whether what is suspected makes poses wrong also where nothing moves."""
@@ -902,25 +899,27 @@ class RigWatch:
     def _split(self, tests: Sequence[ResidualSums]) -> tuple[ResidualSums, RigChange, float]:
         """Return the sums of the tests after the beginning of a change, the change that they show, and what is left.
 
-        The test before its beginning may be of both times: it is left out, and counts as noise.
+        The test before its beginning may be of both times: it is left out, and counts as noise. A change that goes on is as
+        large as it was in the newest test.
         """
-        size = len(self._window.b)
-        after, before = ResidualSums(size, 0.0), total(tests)  # less the test in which it began
-        least, best = np.inf, len(tests) - 1
-        for k in reversed(range(len(tests))):
-            after.add(tests[k], 1.0)
-            before.add(tests[k], -1.0)
-            mixed = tests[k - 1] if k else ResidualSums(size, tests[0].begin_s)
-            before.add(mixed, -1.0)
-            (_, left), (gained, none) = self._gained(after), self._gained(before)
-            before.add(mixed, 1.0)
-            left += none + gained + mixed.freedom
-            if left < least:
-                least, best = left, k
-        found = ResidualSums(size, tests[max(best - 1, 0)].begin_s)
-        for test in reversed(tests[best:]):
-            found.add(test, 1.0)
-        return found, self._estimated(found), float(least)
+        every = total(tests)
+
+        def begun(k: int) -> tuple[float, int, bool, ResidualSums]:
+            after, mixed = total(tests[k:]), ResidualSums(len(every.b), tests[0].begin_s)
+            if k:
+                mixed.add(tests[k - 1], 1.0)
+            without = sum(self._gained(every.less(after).less(mixed))) + mixed.freedom
+            shapes = (after, grown(tests[k:], self._size)) if len(tests) - k > STEPS else (after,)
+            lefts = [self._gained(each)[1] + without for each in shapes]
+            best = int(np.argmin(lefts))
+            return lefts[best], k, best > 0, shapes[best]
+
+        coarse = len(tests) - np.unique(np.geomspace(1.0, len(tests), _BEGINS).round().astype(int))  # the newest first
+        k = min((begun(int(each)) for each in coarse), key=lambda each: each[0])[1]
+        between = range(max(coarse[coarse < k], default=k), min(coarse[coarse > k], default=k) + 1)
+        least, k, slow, found = min(map(begun, between), key=lambda each: each[0])
+        found.begin_s = tests[max(k - 1, 0)].begin_s
+        return found, replace(self._estimated(found), slow=slow), least
 
     def _gained(self, sums: ResidualSums) -> tuple[float, float]:
         """Return what the seven numbers explain of a sum of squares, and what nothing does."""
@@ -1168,7 +1167,7 @@ def _rig_finding(change: RigChange, since_s: float | None, alone: bool) -> Healt
     return HealthFinding(
         "rig",
         f"the right camera is rotated by {np.degrees(size):.3f} deg and shifted by {moved_mm:.2f} mm against the left one, "
-        f"compared with the calibration{unsure}",
+        f"compared with the calibration{', and goes on to' * change.slow}{unsure}",
         since_s,
         float(np.degrees(size)),
         float(np.degrees(sigma)),

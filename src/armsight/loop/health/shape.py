@@ -12,6 +12,8 @@ r^T S^-1 r of the sum of squares, with
 where H and b are the sums, J selects the point, and M has the standard deviations of everything else as its columns. The
 point that explains most is taken, then the next one besides it, while one explains more than chance: a body that is bent.
 
+A change is a step, or a ramp that goes on: then what it did at a test is its share of what it does at the newest one.
+
 What the sums from before a change say of everything else (M) is added to those from after it: a body may be off by its
 tolerance, but by the same all the time, so a point that moves is found where it moved by less than that.
 
@@ -67,6 +69,8 @@ _CERTAIN = float(np.log(1e3))
 _STRAINS = (1e-3, 4e-3)
 #: So many newest tests, together, may be those after a change, or all; all points may be displaced by about so much, m.
 _AFTER, _BENT_M = (1, 2, 4, 8, 16), (2e-4, 1e-3)
+#: A change that goes on is looked for in more tests than this; half: steps are taken for it, double: it is found later.
+STEPS = 4
 #: Tests that are not kept are forgotten with this time constant, in tests.
 _SETTLED = 30.0
 #: The seven numbers are expected to change by such shares of their priors, which are wide.
@@ -177,6 +181,7 @@ class ShapeError(Record):
         seven: by how much the seven numbers explain more than they all do.
         alike: what explains nearly as much as the first.
         begin_s: since when, s.
+        slow: whether it goes on; it is as large as it was in the newest test.
     """
 
     chosen: tuple[int, ...]
@@ -186,6 +191,7 @@ class ShapeError(Record):
     seven: float
     alike: tuple[int, ...]
     begin_s: float
+    slow: bool = False
 
     @property
     def seven_needed(self) -> bool:
@@ -399,26 +405,28 @@ class ShapeWatch:
     def _suspected(self, tests: list[_ShapeTest], before: ShapeError | None) -> ShapeError | None:
         """Return what the tests show now, since when; ``before`` is what they showed last time."""
         if before is None:
-            shown = next(filter(None, (self._shown(len(tests) - count) for count in self._counts(every=True))), None)
+            windows = ((len(tests) - count, slow) for count, slow in self._windows(every=True))
+            shown = next(filter(None, (self._shown(*each) for each in windows)), None)
         else:
             later = sum(each.sums.begin_s >= before.begin_s for each in tests)
-            shown = self._shown(len(tests) - max(later, 1))
+            shown = self._shown(len(tests) - max(later, 1), before.slow)
         if shown is not None and self._alarms < _FRESH:
             return self._dated()
         if shown is not None and before is not None and before.is_of(shown):
             return replace(shown, begin_s=before.begin_s)  # though the tests of that time are no longer kept
         return shown
 
-    def _counts(self, *, every: bool) -> tuple[int, ...]:
-        """Return how many newest tests may be those after a change.
+    def _windows(self, *, every: bool) -> tuple[tuple[int, bool], ...]:
+        """Return how many newest tests may be those after a change, and whether it goes on.
 
         Unless ``every``, those that begin with this test anew: as many windows as tests are looked at twice.
         """
         tests = len(self._history)
         counts = (*(count for count in _AFTER if count < tests), tests)
-        return tuple(count for count in counts if every or self._tests % min(count, _AFTER[2]) == 0)
+        due = tuple(count for count in counts if every or self._tests % min(count, STEPS) == 0)
+        return (*((count, False) for count in due), *((count, True) for count in due if count > STEPS))
 
-    def _since(self, begin: int, *, usual: bool = False) -> ResidualSums:
+    def _since(self, begin: int, slow: bool, *, usual: bool = False) -> ResidualSums:
         """Return the sums of the tests from one on, with what those before it say of what does not change.
 
         The test before may be of both times: it is left out.
@@ -428,7 +436,7 @@ class ShapeWatch:
         before = self._all[usual].less(after)
         if begin:
             before.add(tests[begin - 1], -1.0)
-        return after.besides(before, self._size)
+        return (grown(tests[begin:], self._size) if slow else after).besides(before, self._size)
 
     def _doubted(self, *, every: bool) -> tuple[float, Array | None]:
         """Return since when something may have changed, s, and its second moment (7 + C, 7 + C).
@@ -437,7 +445,7 @@ class ShapeWatch:
         """
         tests = len(self._history)
         if self.found is None:
-            sums = [self._since(tests - count, usual=True) for count in self._counts(every=every)]
+            sums = [self._since(tests - count, slow, usual=True) for count, slow in self._windows(every=every)]
             mixtures = [self._mixture(each, self._hypotheses) for each in sums]
             best = max(range(len(sums)), key=lambda n: mixtures[n][0])
             evidence, moment = mixtures[best]
@@ -446,7 +454,7 @@ class ShapeWatch:
             return self.found.begin_s, None
         # Cameras that moved cannot be excluded.
         later = sum(each.usual.begin_s >= self.found.begin_s for each in self._history)
-        sums_since = self._since(tests - max(later, 1), usual=True)
+        sums_since = self._since(tests - max(later, 1), self.found.slow, usual=True)
         return self.found.begin_s, self._mixture(sums_since, self._hypotheses[:1])[1]
 
     def evidence(self, sums: ResidualSums, excess: float, skewed: bool) -> float:
@@ -502,18 +510,18 @@ class ShapeWatch:
         excess = max((float(M[0, 0]) - gain) / max(sums.freedom, 1.0), 1.0)  # what all together do not explain is noise
         return self._with_smooth.T @ M @ self._with_smooth, excess
 
-    def _shown(self, begin: int) -> ShapeError | None:
-        """Return what the tests from one on show for certain; None where that is nothing."""
+    def _shown(self, begin: int, slow: bool) -> ShapeError | None:
+        """Return what the tests from one on show for certain, of what goes on or stepped; None where that is nothing."""
         tests = list(self._history)[begin:]
         views = [view for each in tests for view in each.views]
         if len(views) < _LEAST_POSES or not _differ(np.array(views)):
             return None
-        sums = self._since(begin)
+        sums = self._since(begin, slow)
         found = self._reduced(sums)
         error = self._focal_alone(found, sums.begin_s)
-        if error is not None and _one_is_enough(self._reduced(tests[-1].sums)):
-            return error
-        return self._deformed(sums) or self._displaced(found, sums.begin_s)
+        if error is None or not _one_is_enough(self._reduced(tests[-1].sums)):
+            error = self._deformed(sums) or self._displaced(found, sums.begin_s)
+        return None if error is None else replace(error, slow=slow)
 
     def _deformed(self, sums: ResidualSums) -> ShapeError | None:
         """Return a smooth deformation of the body that tests show for certain, beside any change of the seven numbers.
@@ -644,12 +652,15 @@ class ShapeWatch:
 
         The test before its beginning may be of both times: it is left out, and counts as noise.
         """
-        lefts, free = list[float](), np.concatenate([[0, 1], *(_columns([each]) for each in self._candidates)])
-        for k in range(len(self._history)):
-            whole = self._reduced(self._since(k)).whole
-            mixed = self._history[k - 1].sums.freedom if k else 0.0
-            lefts.append(whole.square - whole.gain(free) + mixed)
-        return self._shown(int(np.argmin(lefts)))
+        free, tests = np.concatenate([[0, 1], *(_columns([each]) for each in self._candidates)]), len(self._history)
+
+        def left(begin: int, slow: bool) -> float:
+            whole = self._reduced(self._since(begin, slow)).whole
+            mixed = self._history[begin - 1].sums.freedom if begin else 0.0
+            return whole.square - whole.gain(free) + mixed
+
+        begins = [(k, slow) for k in range(tests) for slow in (False, True) if not slow or tests - k > STEPS]
+        return self._shown(*min(begins, key=lambda each: left(*each)))
 
     def added(self, response: Array) -> Array:
         """Return the covariance (6, 6) of what was found, of a pose with a response (6, K) to the parameters."""
@@ -801,6 +812,18 @@ def total(tests: Sequence[ResidualSums]) -> ResidualSums:
     return found
 
 
+def grown(tests: Sequence[ResidualSums], size: int) -> ResidualSums:
+    """Return the sums of tests in which all but the first parameters grow with time, from zero to what they are now."""
+    begin_s, last_s = tests[0].begin_s, tests[-1].begin_s
+    found = ResidualSums(len(tests[0].b), begin_s)
+    for each in tests:
+        by = np.ones(len(each.M))
+        by[1 + size :] = (each.begin_s - begin_s) / (last_s - begin_s)
+        found.M += each.M * by * by[:, None]
+        found.freedom += each.freedom
+    return found
+
+
 def _differ(views: Array) -> bool:
     """Return whether directions (N, 3) differ enough from their mean."""
     mean = views.mean(axis=0)
@@ -810,11 +833,12 @@ def _differ(views: Array) -> bool:
 def _focal_finding(error: ShapeError, since_s: float | None) -> HealthFinding:
     """Return the finding of a focal length that changed."""
     share, sigma = 100.0 * float(error.value[0]), 100.0 * float(np.sqrt(error.cov[0, 0]))
+    goes_on = " so far, and it goes on" if error.slow else ""
     longer, shorter = ("left", "right") if share > 0 else ("right", "left")
     return HealthFinding(
         "lens",
         f"the focal length of the {longer} camera is {abs(share):.3f} % longer against that of the {shorter} one than "
-        "calibrated; which of the two changed cannot be distinguished",
+        f"calibrated{goes_on}; which of the two changed cannot be distinguished",
         since_s,
         abs(share),
         sigma,
