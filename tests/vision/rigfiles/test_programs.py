@@ -103,6 +103,20 @@ def test_users_files(files, options, fx, k1, size, T_left_right):
     np.testing.assert_allclose(rig.T_left_right, T_left_right, atol=1e-12)
 
 
+def test_a_fisheye_of_multical_is_told_by_the_shape_of_its_coefficients(tmp_path):
+    """multical 0.4.0 writes the model "standard" for both lenses; cv2.fisheye.calibrate returns a column."""
+    document = json.loads(PROGRAMS["multical"][2]["calibration.json"])
+    for camera in document["cameras"].values():
+        camera["dist"] = [[-0.02], [0.005], [-0.002], [0.0005]]
+    paths = write(tmp_path, {"calibration.json": json.dumps(document)})
+    rig = import_rig(None, paths)
+    K, far = np.array(document["cameras"]["cam1"]["K"]), np.array([[0.7, 0.1, 1.0]])
+    D, still = np.array([-0.02, 0.005, -0.002, 0.0005]), np.zeros((3, 1))
+    expected = cv2.fisheye.projectPoints(far[None], still, still, K, D)[0]
+    assert (rig.left.model, rig.right.model) == ("fisheye", "fisheye")
+    np.testing.assert_allclose(rig.left.project(far), expected[0], atol=1e-9)
+
+
 # --- what goes wrong -------------------------------------------------------------------------------------------------
 
 TITLES = {name: re.escape(open_format(name).TITLE) for name in FORMATS}

@@ -17,7 +17,8 @@ are in m, aniposelib's in the unit of the board.
 multical: multical's calibration.json: ``cameras`` with K, dist, image_size, and ``camera_poses`` with R and T, m.
 
 A pose takes the coordinates of the rig, or of the master camera, to the camera's: p_cam2 = R p_cam1 + T in the entry
-``cam2_to_cam1`` (which is what its name does not say).
+``cam2_to_cam1`` (which is what its name does not say). The model of a fisheye lens is called ``standard``, too (0.4.0,
+camera_fisheye.py): its four coefficients are a column, as ``cv2.fisheye.calibrate`` returns them, others are a row.
 
 stereolabs: Stereolabs' SN*.conf of a ZED camera: sections LEFT_CAM_HD, RIGHT_CAM_HD, .. for each resolution, and STEREO.
 
@@ -202,12 +203,18 @@ def _multical_recognises(documents: Sequence[Document]) -> bool:
     )
 
 
+def _multical_entry(entry: Foreign) -> Foreign:
+    """Return a camera's entry, with the lens that the shape of its coefficients tells."""
+    fisheye = isinstance(entry, Mapping) and np.shape(np.asarray(entry.get("dist"), object)) == (4, 1)
+    return {**entry, "model": "fisheye"} if fisheye else entry
+
+
 def _multical_read(documents: Sequence[Document], paths: Sequence[Path], options: ImportOptions) -> StereoRig:
     """Read two cameras."""
     count_paths(paths, (1,), "one file, calibration.json")
     with naming(paths[0]):
         poses = {str(k).partition("_to_")[0]: value for k, value in need_named(documents[0], "camera_poses").items()}
-        entries = {str(k): entry for k, entry in need_named(documents[0], "cameras").items()}
+        entries = {str(k): _multical_entry(entry) for k, entry in need_named(documents[0], "cameras").items()}
 
     def posed(name: str) -> tuple[Array, list[str]]:
         if name not in poses:
