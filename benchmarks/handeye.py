@@ -226,7 +226,7 @@ def kuka2(data: Path, _: Path) -> list[str]:
     """Return the arguments for a camera in a KUKA's hand, calibrated from the same images."""
     folder = data / "handeye" / "kuka2"
     eye = ["--robot", folder / "RobotPosesVec.txt", "--eye", "in-hand"]
-    return [*eye, "--images", folder / "im_*.png", "--camera", "fit", "--target", "chessboard:24x17:15mm"]
+    return [*eye, "--source", folder / "im_*.png", "--camera", "fit", "--target", "chessboard:24x17:15mm"]
 
 
 def open3dv(data: Path, work: Path) -> list[str]:
@@ -238,8 +238,17 @@ def open3dv(data: Path, work: Path) -> list[str]:
     rows = [(f"pos{k}.png", *np.loadtxt(folder / f"pos{k}.txt")) for k in range(8)]
     names = "image,rx_deg,ry_deg,rz_deg,x_mm,y_mm,z_mm"
     (work / "robot.csv").write_text("\n".join([names, *(",".join(map(str, row)) for row in rows)]))
-    robot = ["--robot", work / "robot.csv", "--rotation", "xyz", "--eye", "in-hand", "--camera", work / "camera.json"]
-    return [*robot, "--images", folder / "pos*.png", "--target", "acircles:7x11:10mm"]
+    robot = [
+        "--robot",
+        work / "robot.csv",
+        "--columns",
+        "rotation=xyz",
+        "--eye",
+        "in-hand",
+        "--camera",
+        work / "camera.json",
+    ]
+    return [*robot, "--source", folder / "pos*.png", "--target", "acircles:7x11:10mm"]
 
 
 def ur3a(data: Path, work: Path) -> list[str]:
@@ -248,9 +257,8 @@ def ur3a(data: Path, work: Path) -> list[str]:
     Its camera 2 stands to the left.
     """
     folder = data / "real" / "ur3a"
-    pairs = ["--left", folder / "cam2_*.png", "--right", folder / "cam1_*.png", "--target", "chessboard:9x7:20mm"]
-    alone = ["--left-intrinsics", folder / "intrinsics_cam2" / "*.jpg"]
-    alone += ["--right-intrinsics", folder / "intrinsics_cam1" / "*.jpg"]
+    pairs = ["--source", f"pairs:{folder}/cam2_*.png,{folder}/cam1_*.png", "--target", "chessboard:9x7:20mm"]
+    alone = ["--alone", f"{folder}/intrinsics_cam2/*.jpg,{folder}/intrinsics_cam1/*.jpg"]
     command("calibrate", *pairs, *alone, "-o", work / "rig.json")
     names, *rows = (folder / "joints.csv").read_text().split()
     rows = [f"cam2_{int(row.split(',')[0]):02d}.png{row[row.index(',') :]}" for row in rows]

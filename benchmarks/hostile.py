@@ -34,7 +34,7 @@ COMMANDS = {
     "robot's poses": ("handeye", "--robot", "FILE", "--seen", "seen.csv", "--eye", "to-hand"),
     "video": ("record", "video:FILE", "-o", "out"),
     "recording": ("record", "bag:FILE", "-o", "out"),
-    "image": ("calibrate", "--left", "FILE", "--right", "FILE", "--target", BOARD, "-o", "out.json"),
+    "image": ("calibrate", "--source", "pairs:FILE,FILE", "--target", BOARD, "-o", "out.json"),
     "check": ("check", "FILE"),
 }
 #: Suffixes that lead to other readers of a kind.

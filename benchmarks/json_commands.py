@@ -30,9 +30,9 @@ OPTIONAL = {
     "board config get": ("--board", "X"), "board config set": ("--board", "X"), "board config store": ("--board", "X"),
     "board build": ("--board", "X"), "board flash": ("--board", "X"), "board gains": ("--board", "X"),
     "board home": ("--board", "X"), "board monitor": ("--board", "X"), "board offsets": ("--board", "X"),
-    "board release": ("--board", "X"), "board selftest": ("--board", "X"), "calibrate": ("--left", "X", "--right", "X"),
+    "board release": ("--board", "X"), "board selftest": ("--board", "X"), "calibrate": ("--source", "pairs:X,X"),
     "demo": ("--arm", "X", "-o", "OUT"), "identify": ("--data", "X"), "live": ("--source", "X", "--no-browser"),
-    "measure": ("--left", "X", "--right", "X"), "dense match": ("X", "X", "X"), "cameras": ("X",), "arm list": ("X",),
+    "measure": ("--source", "pairs:X,X"), "dense match": ("X", "X", "X"), "cameras": ("X",), "arm list": ("X",),
 }  # fmt: skip
 #: Commands with good input.
 GOOD = (

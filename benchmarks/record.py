@@ -63,7 +63,7 @@ def containers() -> None:
     with tempfile.TemporaryDirectory() as name:
         here = Path(name)
         lefts, rights = f"{folder}/left*", f"{folder}/right*"
-        done = armsight("calibrate", "--left", lefts, "--right", rights, "--target", spec, "-o", here / "rig.json",
+        done = armsight("calibrate", "--source", f"pairs:{lefts},{rights}", "--target", spec, "-o", here / "rig.json",
                         "--lens-model", "brown5", "--folds", 2)  # fmt: skip
         assert done.returncode == 0, done.stderr
         source = PairsSource.open(lefts, rights)
@@ -88,7 +88,7 @@ def containers() -> None:
         for container in CONTAINERS[1:]:
             (poses,) = compare(outputs[CONTAINERS[0]], outputs[container])
             report(f"{container}: poses", f"{poses.rows} rows, same to the last digit: {poses.same}", poses.same)
-        direct = armsight("measure", here / "rig.json", "--target", spec, "--left", lefts, "--right", rights,
+        direct = armsight("measure", here / "rig.json", "--target", spec, "--source", f"pairs:{lefts},{rights}",
                           "-o", here / "direct.csv")  # fmt: skip
         assert direct.returncode in (0, 3), direct.stderr
         rows = [line.split(",")[4:] for line in (here / "direct.csv").read_text().splitlines()]
@@ -314,7 +314,7 @@ def batch(count: int = 100) -> None:
         here = Path(name)
         folder = DATA / "stereo" / "opencv-480p"
         spec = "chessboard:9x6:25mm"
-        done = armsight("calibrate", "--left", f"{folder}/left*", "--right", f"{folder}/right*", "--target", spec,
+        done = armsight("calibrate", "--source", f"pairs:{folder}/left*,{folder}/right*", "--target", spec,
                         "-o", here / "rig.json", "--lens-model", "brown5", "--folds", 2)  # fmt: skip
         assert done.returncode == 0, done.stderr
         lefts = sorted(folder.glob("left*"))

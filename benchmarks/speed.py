@@ -69,8 +69,8 @@ def first_measurement(folder: Path, *, alone: bool) -> None:
     """Time one pair of a board, cold and warm, beside importing OpenCV; ``alone``: beside OpenCV's script alone."""
     pairs = DATA / "stereo" / "opencv-480p"
     rig, target = str(folder / "rig.json"), ("--target", "chessboard:9x6:25mm")
-    many = ("--left", str(pairs / "left*.jpg"), "--right", str(pairs / "right*.jpg"))
-    one = ("--left", str(pairs / "left01.jpg"), "--right", str(pairs / "right01.jpg"))
+    many = ("--source", f"pairs:{pairs}/left*.jpg,{pairs}/right*.jpg")
+    one = ("--source", f"pairs:{pairs}/left01.jpg,{pairs}/right01.jpg")
     seconds(ARMSIGHT, "calibrate", *many, *target, "-o", rig)
     measure = (ARMSIGHT, "measure", rig, *target, *one)
     opencv = (sys.executable, "-c", "import cv2")
@@ -118,7 +118,7 @@ def beside_opencv(measure: tuple[str, ...], images: tuple[str, ...]) -> None:
 def calibration(folder: Path) -> None:
     """Time a calibration of 29 pairs of 640x360 with its report."""
     pairs = DATA / "stereo" / "webcams-360p"
-    images = ("--left", str(pairs / "left*.jpg"), "--right", str(pairs / "right*.jpg"))
+    images = ("--source", f"pairs:{pairs}/left*.jpg,{pairs}/right*.jpg")
     outputs = ("-o", str(folder / "webcams.json"), "--report", str(folder / "report"))
     took_s = seconds(ARMSIGHT, "calibrate", *images, "--target", "chessboard:9x6:24.23mm", *outputs)
     report("calibrate, 29 pairs of 640x360, with report", took_s, 15.0)

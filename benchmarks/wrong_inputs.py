@@ -128,8 +128,8 @@ CASES["metres taken for mm"] = wrong(quaternions(A, head=QUATERNION.replace("_m"
 CASES["metres taken for mm, seen"] = wrong(
     None, "are they metres", seen=quaternions(B, head=QUATERNION.replace("_m", "_mm"))
 )
-CASES["mm without a unit"] = wrong(quaternions(A, 1e3, "x,y,z,qw,qx,qy,qz"), "--units mm")
-CASES["mm without names"] = wrong(poses(A, "wxyz", 1e3), "--units mm", rotation="wxyz")
+CASES["mm without a unit"] = wrong(quaternions(A, 1e3, "x,y,z,qw,qx,qy,qz"), "units=mm")
+CASES["mm without names"] = wrong(poses(A, "wxyz", 1e3), "units=mm", rotation="wxyz")
 mixed = A.copy()
 mixed[5:9, :3, 3] *= 1e3
 CASES["some rows in mm"] = wrong(quaternions(mixed), "are some rows in millimetres")
@@ -181,17 +181,22 @@ CASES["rotvec given as xyz"] = wrong(
 for true, given in (("wxyz", "xyzw"), ("xyzw", "wxyz")):
     CASES[f"{true} given as {given}"] = wrong(poses(A, true), f"the rotations are {true}, not {given}", rotation=given)
     CASES[f"{true} given as {given}, seen"] = wrong(
-        None, f"the rotations are {true}, not {given}: --seen-rotation", seen=poses(B, true), by={"rotation": given}
+        None,
+        f"the rotations are {true}, not {given}: --columns seen:rotation",
+        seen=poses(B, true),
+        by={"rotation": given},
     )
 CASES["quaternion columns exchanged"] = wrong(
     csv("x_m,y_m,z_m,qw,qx,qy,qz", A[:, :3, 3], rotations_as(A, "xyzw")), "the rotations are xyzw, not wxyz"
 )
 CASES["conjugate quaternions"] = wrong(quaternions(transposed(A)), "the rotations are inverse")
 CASES["conjugate quaternions, seen"] = wrong(None, "the rotations are inverse", seen=quaternions(transposed(B)))
-CASES["no convention of three angles"] = wrong(poses(A, "xyz", 1.0, EULER), "give --rotation")
+CASES["no convention of three angles"] = wrong(poses(A, "xyz", 1.0, EULER), "say --columns rotation=")
 CASES["no convention of a quaternion"] = wrong(poses(A), "which of the four numbers of a quaternion is w")
 CASES["an unknown convention"] = wrong(poses(A), "known are wxyz, xyzw, rotvec", rotation="rpy")
-CASES["a quaternion convention for angles"] = wrong(poses(A, "xyz", 1.0, EULER), "give --rotation", rotation="wxyz")
+CASES["a quaternion convention for angles"] = wrong(
+    poses(A, "xyz", 1.0, EULER), "say --columns rotation=", rotation="wxyz"
+)
 CASES["KUKA's angles as Fanuc's"] = wrong(
     csv("X,Y,Z,W,P,R", 1e3 * A[:, :3, 3], rotations_as(A, "ZYX")[:, ::-1]), "about x and z are exchanged|W about x"
 )

@@ -56,7 +56,7 @@ def test_no_shot_of_the_motoman_is_dropped_silently(data_dir, tmp_path, capsys):
     assert all(isinstance(r, PoseEstimate) or (isinstance(r, Missed) and r.reason) for r in results.values())
     assert all(isinstance(r, PoseEstimate) for r in results.values())
     capsys.readouterr()
-    arguments = ["--target", folder / "markers.csv", "--detections", folder / "detections.csv", "--json"]
+    arguments = ["--target", folder / "markers.csv", "--source", f"detections:{folder}/detections.csv", "--json"]
     assert run("measure", tmp_path / "rig.json", *arguments) == 0
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     every = read_detections(folder / "detections.csv", body)

@@ -35,7 +35,7 @@ class Files:
 
     def images(self, name):
         """Arguments that name the pictures of a folder."""
-        return ["--left", f"{self.folder / name}/left*.png", "--right", f"{self.folder / name}/right*.png"]
+        return ["--source", f"pairs:{self.folder / name}/left*.png,{self.folder / name}/right*.png"]
 
     @property
     def rig(self):

@@ -16,8 +16,8 @@ from strategies import ordinary_rig
 FILE_WRITERS = {
     "rig import": ("f.yml", "--format", "opencv"),
     "rig export": ("rig.json", "--format", "kalibr"),
-    "calibrate": ("--left", "left*.png", "--right", "right*.png", "--target", "chessboard:9x6:25mm"),
-    "measure": ("rig.json", "--target", "chessboard:9x6:25mm", "--left", "left*.png", "--right", "right*.png"),
+    "calibrate": ("--source", "pairs:left*.png,right*.png", "--target", "chessboard:9x6:25mm"),
+    "measure": ("rig.json", "--target", "chessboard:9x6:25mm", "--source", "pairs:left*.png,right*.png"),
     "body draw": ("body.toml",),
     "arm show": ("arm.toml",),
     "arm urdf": ("arm.toml",),

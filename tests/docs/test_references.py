@@ -137,6 +137,8 @@ def test_the_checks_find_what_is_planted():
     assert any(name.startswith("firmware/") for name in texts_of_code())
     assert missing_names("armsight.vision.nothing and armsight.vision.rig.StereoRig") == ["armsight.vision.nothing"]
     assert missing_names("from armsight.data import Shot, Nothing") == ["armsight.data.Nothing"]
-    planted = calls("    armsight measure rig.json --nothing 3\n`armsight calibrate --left a`\n$ armsight nowhere x\n")
+    planted = calls(
+        "    armsight measure rig.json --nothing 3\n`armsight calibrate --alone a,b`\n$ armsight nowhere x\n"
+    )
     assert [unknown_parts(words) for words in planted] == [["--nothing"], [], ["nowhere"]]
     assert set(COMMANDS) >= {"measure", "calibrate"}

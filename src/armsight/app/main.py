@@ -15,6 +15,7 @@ import sys
 import click
 
 from armsight.app.interrupts import terminate_as_interrupt
+from armsight.app.retired import in_todays_options
 from armsight.app.show.messages import colour, print_error, print_notes
 from armsight.errors import ArmsightError
 
@@ -97,6 +98,13 @@ class _Sections(click.Group):
         command: click.Command = module.command
         return command
 
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Read the command line, with today's options for those that are retired."""
+        args, notes = in_todays_options(args)
+        for note in notes:
+            click.echo(f"note: {note}", err=True)
+        return super().parse_args(ctx, args)
+
     def invoke(self, ctx: click.Context) -> object:
         """Run a command; an interrupt leaves as Abort, before click prints an empty line; `| head` is no error."""
         try:
@@ -152,9 +160,6 @@ def _usage_text(error: click.ClickException) -> str:
     text = " ".join(error.format_message().split()).replace("'. (", "' (").rstrip(".")
     text = text[:1].lower() + text[1:]
     text = text.replace("a valid integer range", "a whole number").replace("a valid float range", "a number")
-    if "extra argument" in text and {"--left", "--right"} & set(sys.argv):
-        text = re.sub(r"\((\S+) .+\)", r"(\1 ..)", text)
-        return f"{text}; quote a glob, --left 'DIR/left*.png', or the shell puts every file name there"
     context = error.ctx if isinstance(error, click.UsageError) else None
     if context is not None and isinstance(error, click.NoSuchOption):
         text = f"no such option: {error.option_name}{_meant_option(error.option_name, context)}"

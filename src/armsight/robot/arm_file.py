@@ -84,7 +84,7 @@ def open_arm(name_or_path: str | Path) -> Arm:
     if path.lower().endswith((".urdf", ".xml")) or ("/" in path and not path.lower().endswith(".toml")):
         return read_urdf(path, tool_link=link)
     if link is not None:
-        raise InputError(f"--tool-link belongs to .urdf files; {path} is none")
+        raise InputError(f"{text}: a link behind # belongs to .urdf files; {path} is none")
     if text.lower().endswith(".toml"):
         return read_arm_toml(text)
     if text not in MODELS:

@@ -1,4 +1,6 @@
-"""Open a board by its name: ``emulated:NAME``, ``serial:PORT``, ``feetech:PORT`` or ``ar4:PORT``.
+"""Open a board by its name: ``emulated:NAME``, ``serial:PORT``, ``feetech:PORT[,FILE.json]`` or ``ar4:PORT[,mk2]``.
+
+``,baud=N`` behind a port is its baud rate, where that is not its kind's; FILE.json is LeRobot's calibration of the servos.
 
 Here is the registry of the emulators that run our firmware, and of the arms that keep their own controller.
 :func:`open_board` opens a board with our firmware, whose gains and configuration can be changed;
@@ -67,33 +69,42 @@ def open_motion_board(
     plant: Plant | None = None,
     *,
     config: Configuration | None = None,
-    baud: int | None = None,
-    calibration: Path | None = None,
 ) -> MotionBoard:
     """Open any board that moves an arm: see :func:`open_board`, and the module for names.
 
     Args:
-        name: see the module; ``ar4:PORT,mk2`` names another model than mk3.
+        name: see the module.
         plant: the arm at an emulated board's motors.
         config: of an emulated board; the lab's without.
-        baud: of a port; the kind's own without.
-        calibration: LeRobot's calibration file, of a servo bus only.
 
     Raises:
-        InputError: there is no such kind of board, or it needs no calibration.
+        InputError: there is no such kind of board, or something is behind its port that it does not take.
         DeviceError: it does not answer, or is of another kind.
     """
-    if calibration is not None and not name.startswith(FEETECH):
-        raise InputError(f"{name} needs no --calibration: that is LeRobot's file, of {FEETECH}PORT")
     if name.startswith(FEETECH):
-        servos = None if calibration is None else read_calibration(calibration)
-        port, baud = name.removeprefix(FEETECH), feetech_bus.BAUD if baud is None else baud
+        port, baud, file = serial_port(name, feetech_bus.BAUD)
+        servos = read_calibration(Path(file)) if file else None
         return FeetechBoard.connect(ServoBus(SerialLink.open(port, baud), port, baud), servos)
     if name.startswith(AR4):
-        port, _, model = name.removeprefix(AR4).partition(",")
-        link = SerialLink.open(port, ar4_board.BAUD if baud is None else baud)
-        return Ar4Board.connect(link, name=port, model=model or "mk3")
-    return open_board(name, plant, config=config, baud=BAUD if baud is None else baud)
+        port, baud, model = serial_port(name, ar4_board.BAUD)
+        return Ar4Board.connect(SerialLink.open(port, baud), name=port, model=model or "mk3")
+    return open_board(name, plant, config=config)
+
+
+def serial_port(name: str, baud: int) -> tuple[str, int, str]:
+    """Return the port of a board's name, its baud rate, and what else stands behind it."""
+    port, *given = name.partition(":")[2].split(",")
+    rates = [each.removeprefix("baud=") for each in given if each.startswith("baud=")]
+    others = [each for each in given if not each.startswith("baud=")]
+    if len(rates) > 1 or len(others) > 1 or not all(each.isdecimal() and int(each) > 0 for each in rates):
+        raise InputError(f"{name}: expected {name.partition(':')[0]}:PORT[,..][,baud=N], such as baud=115200")
+    return port, int(rates[0]) if rates else baud, others[0] if others else ""
+
+
+def calibration_of(name: str) -> Path | None:
+    """Return the calibration file behind the port of a servo bus's name; None where none is given."""
+    file = serial_port(name, 0)[2]
+    return Path(file) if file else None
 
 
 def slowed(arm: Arm, name: str) -> Arm:
@@ -102,9 +113,7 @@ def slowed(arm: Arm, name: str) -> Arm:
     return next((abilities.slowed(arm) for kind, abilities in own.items() if name.startswith(kind)), arm)
 
 
-def open_board(
-    name: str, plant: Plant | None = None, *, config: Configuration | None = None, baud: int = BAUD
-) -> Board:
+def open_board(name: str, plant: Plant | None = None, *, config: Configuration | None = None) -> Board:
     """Open a board with our firmware, an emulated one with a configuration (the lab's without) that waits for ``receive``.
 
     Raises:
@@ -112,7 +121,11 @@ def open_board(
         DeviceError: it does not answer, or is of another version.
     """
     if name.startswith(SERIAL):
-        port = name.removeprefix(SERIAL)
+        port, baud, other = serial_port(name, BAUD)
+        if other:
+            raise InputError(
+                f"{name}: {other} belongs to {FEETECH}PORT or {AR4}PORT; this board has armsight's firmware"
+            )
         return Board.connect(SerialLink.open(port, baud), name=port)
     emulator = emulator_name(name)
     if plant is None:

@@ -40,6 +40,40 @@ class Cells(NamedTuple):
     listed: bool = False  #: whether its rows are lists of numbers without names, which may be joints as well
 
 
+class Said(NamedTuple):
+    """What the option ``--columns`` says of a table."""
+
+    columns: str | None  #: the names of its columns, for :func:`read_columns`
+    unit: str | None = None  #: "m" or "mm", of lengths whose columns do not name one
+    detect_units: bool = False  #: whether lengths that cannot be metres are millimetres
+    rotation: str | None = None  #: the convention of its rotations
+    frames: str | None = None  #: of a recording's transforms, BASE:FLANGE
+
+
+def said_columns(text: str | None, known: Collection[str] = ("units", "rotation", "frames")) -> Said:
+    """Split the option ``--columns``: units=mm, units=detect, rotation=xyz and frames=BASE:FLANGE may stand among names.
+
+    Args:
+        text: its value; None where it is not given.
+        known: what of these the command takes.
+
+    Raises:
+        InputError: another unit, or something said twice.
+    """
+    names, said = list[str](), dict[str, str]()
+    for part in text.split(",") if text is not None else ():
+        key, equals, value = (piece.strip() for piece in part.partition("="))
+        if not equals or key not in known:
+            names.append(part)
+            continue
+        key = "detect" if (key, value) == ("units", "detect") else key
+        if key in said or (key == "units" and value not in ("m", "mm")):
+            raise InputError(f"--columns {text}: {part} is said twice, or is none of units=m, units=mm, units=detect")
+        said[key] = value
+    columns = ",".join(names) or None
+    return Said(columns, said.get("units"), "detect" in said, said.get("rotation"), said.get("frames"))
+
+
 def read_columns(text: str | None, known: Collection[str]) -> Mapping[str, str] | list[str]:
     """Read the option ``--columns``: NAME=THEIRS,... or the names of all columns in order, _ for one that is not used.
 

@@ -75,7 +75,9 @@ def understood(
     if theirs:
         return out, rotation or "xyz", (f"{path}: {said}; --columns says otherwise",)
     if rotation is None and any(name.startswith("roll") for name in bare):
-        note = f"{path}: roll, pitch, yaw read as rotations about the fixed x, y and z; --rotation says otherwise"
+        note = (
+            f"{path}: roll, pitch, yaw read as rotations about fixed x, y and z; --columns rotation=.. says otherwise"
+        )
         return out, "xyz", (note,)
     return out, rotation, ()
 
@@ -297,7 +299,7 @@ class Columns:
         """Return four numbers (N, 4) without names, and their convention; reject those that stand before the position."""
         if rotation not in ("wxyz", "xyzw"):
             raise InputError(
-                f"{self.path}: which of the four numbers of a quaternion is w? give --rotation wxyz or --rotation xyzw"
+                f"{self.path}: which of the four numbers of a quaternion is w? say --columns rotation=wxyz or rotation=xyzw"
             )
         last, first = self.numbers(["n1", "n2", "n3", "n4"]), self.numbers([*"xyz", "n1"])
         off, other = (float(np.abs(np.linalg.norm(four, axis=1) - 1).max()) for four in (last, first))
@@ -321,8 +323,8 @@ class Columns:
         convention = rotation or ("rotvec" if unit == "_rad" else None)
         if convention is None or convention in ("wxyz", "xyzw"):
             raise InputError(
-                f"{self.path}: what do the three numbers of a rotation mean? give --rotation rotvec, or the order of the "
-                "angles: xyz (about fixed axes), XYZ (about the rotated axes), zyx ..."
+                f"{self.path}: what do the three numbers of a rotation mean? say --columns rotation=rotvec, or the order "
+                "of the angles: xyz (about fixed axes), XYZ (about the rotated axes), zyx ..."
             )
         if unit == "_rad" and np.abs(found).max() > MOST_RAD:
             row, column = np.unravel_index(int(np.abs(found).argmax()), found.shape)

@@ -36,7 +36,7 @@ def misreadings(table: PoseTable, rows: NDArray[np.int64], Ts: Array, option: st
         table: the table.
         rows: (N,) which of its rows.
         Ts: (N, 4, 4) their poses as they were read, m.
-        option: what stands before the names of the options of this table: "" or "seen-".
+        option: what stands before what --columns says of this table: "" or "seen:".
     """
     R, p, width, given = Ts[:, :3, :3], Ts[:, :3, 3], table.numbers.shape[1], table.convention
     numbers = table.numbers[rows] if width else table.numbers
@@ -45,8 +45,8 @@ def misreadings(table: PoseTable, rows: NDArray[np.int64], Ts: Array, option: st
             f"convention {convention}",
             numbers,
             convention,
-            f"the rotations are {convention}, not {given}: --{option}rotation {convention}, or exchange the columns' names "
-            "where they have any",
+            f"the rotations are {convention}, not {given}: --columns {option}rotation={convention}, or exchange the "
+            "columns' names where they have any",
         )
         for convention in CONVENTIONS
         if width == (4 if convention in ("wxyz", "xyzw") else 3) and convention != given
@@ -70,7 +70,7 @@ def misreadings(table: PoseTable, rows: NDArray[np.int64], Ts: Array, option: st
     if table.written.shape[1] == 6:  # the first three numbers may be the rotation
         first, last = np.hsplit(table.written[rows], 2)
         degrees = np.degrees(first) if (np.abs(first) <= 2 * np.pi + 1e-3).all() else first
-        columns = f"--columns {'seen:' if option else ''}rx,ry,rz,x,y,z"
+        columns = f"--columns {option}rx,ry,rz,x,y,z"
         said = f"the rotation comes before the position: name the columns in their order, {columns}"
         yield Misread("order", pose(rotations_by(degrees, given, table.path), table.unit_m * last), said, table.path)
     for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):

@@ -220,7 +220,7 @@ def test_a_toml_file_is_an_arm_as_well(tmp_path, armsight):
         (("ik", "seven_r", 400, 0, 500, 0, 0, 0), ("'seven_r' is unknown",)),
         (("fk", "six_r", 1, 2, 3, 4, 5, 6, "--jsn"), ("no such option: --jsn",)),
         (("fk", "none.urdf", 1, 2, 3, 4, 5, 6), ("none.urdf: no such file",)),
-        (("show", "six_r", "--tool-link", "hand"), ("--tool-link belongs to .urdf files",)),
+        (("show", "six_r#hand"), ("a link behind # belongs to .urdf files",)),
         (("show", "six_r", "-o", "none/arm.png"), ("none/arm.png: cannot be written", "no folder")),
         (("urdf", "six_r", "-o", "none/arm.urdf"), ("none/arm.urdf: cannot be written", "no folder")),
         (("urdf", "seven_r", "-o", "arm.urdf"), ("'seven_r' is unknown",)),
@@ -268,10 +268,10 @@ def test_readings_of_an_identified_arm_are_corrected(armsight, tmp_path):
 
 def test_a_link_that_is_named_counts_everywhere(armsight):
     path = Path(__file__).parents[2] / "robot" / "data" / "fingers.urdf"
-    said = armsight("identify", "plan", "--arm", path, "--tool-link", "nothing", "-n", "1")
+    said = armsight("identify", "plan", "--arm", f"{path}#nothing", "-n", "1")
     assert said.code == 2
     assert "link 'nothing' is not behind 4 to 7 rotary joints alone; these are: tool0, camera_link" in said.err
-    said = armsight("arm", "fk", path, "--tool-link", "camera_link", "0", "0", "0", "0", "0")
+    said = armsight("arm", "fk", f"{path}#camera_link", "0", "0", "0", "0", "0")
     assert said.code == 0
     assert "note: " in said.err
     assert split_arm("a.urdf#b") == ("a.urdf", "b")

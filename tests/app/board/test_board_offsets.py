@@ -69,7 +69,7 @@ def test_offsets_are_printed_and_nothing_is_written(armsight, arm, tmp_path):
 def test_a_correction_makes_joints_report_where_they_are_and_is_taken_back(armsight, arm, tmp_path):
     device, name = arm
     file, keep = lerobot(tmp_path / "follower.json"), tmp_path / "old.json"
-    options = ("--board", name, "--calibration", file, "--yes", "--json")
+    options = ("--board", f"{name},{file}", "--yes", "--json")
     said = armsight("board", "offsets", *options, "--further", FURTHER, "--keep", keep)
     assert said.code == 0, said.err
     assert "the old offsets are in" in said.err
@@ -78,7 +78,7 @@ def test_a_correction_makes_joints_report_where_they_are_and_is_taken_back(armsi
     assert [each["homing_offset"] for each in json.loads(file.read_text()).values()] == [*counts[:5], 0]
     assert json.loads(keep.read_text())["homing_offsets"] == {str(k): 0 for k in range(1, 6)}
     assert all(table[55] == 1 for table in device.tables)  # locked again
-    said = armsight("board", "monitor", "--board", name, "--calibration", file, "--seconds", 0.05, "--json")
+    said = armsight("board", "monitor", "--board", f"{name},{file}", "--seconds", 0.05, "--json")
     assert said.lines[-1]["q_rad"] == pytest.approx(device.servos.true_q[:5], abs=1.1 * RAD_PER_COUNT)
     said = armsight("board", "offsets", *options, "--restore", keep, "--keep", tmp_path / "again.json")
     assert said.code == 0, said.err

@@ -70,7 +70,9 @@ def test_an_ar4_is_homed_watched_and_cleared(armsight, teensy):
     [
         (("gains", "--board", "feetech:PORT"), "feetech:PORT keeps its own controller: it has no gains"),
         (("selftest", "--board", "ar4:PORT"), "ar4:PORT keeps its own controller"),
-        (("monitor", "--board", "ar4:PORT", "--calibration", "a.json"), "needs no --calibration"),
+        (("monitor", "--board", "ar4:PORT,a,b"), "expected ar4:PORT"),
+        (("monitor", "--board", "serial:PORT,baud=fast"), "such as baud=115200"),
+        (("monitor", "--board", "serial:PORT,a.json"), "belongs to feetech:PORT or ar4:PORT"),
         (("monitor", "--board", "feetch:PORT"), "feetech:PORT and ar4:PORT"),
         (("monitor", "--board", "feetech:/dev/ttyNONE"), "/dev/ttyNONE: no such port"),
         (("monitor", "--board", "ar4:/dev/ttyNONE"), "/dev/ttyNONE: no such port"),
@@ -82,9 +84,9 @@ def test_what_such_a_board_cannot_do_is_one_line(armsight, arguments, words):
 
 def test_a_wrong_baud_rate_is_one_line(so101, teensy):
     with pytest.raises(DeviceError, match=r"is 115200 the servos' baud rate|are they set to 115200 baud"):
-        open_motion_board(f"feetech:{so101.name}", baud=115200)
+        open_motion_board(f"feetech:{so101.name},baud=115200")
     with pytest.raises(DeviceError, match=r"nothing answers ST|bytes come, but no answer to ST"):
-        open_motion_board(f"ar4:{teensy.name}", baud=9600)
+        open_motion_board(f"ar4:{teensy.name},baud=9600")
 
 
 def test_a_pulled_cable_is_one_line(so101, teensy):

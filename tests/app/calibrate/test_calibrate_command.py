@@ -35,7 +35,7 @@ def few(rendered, tmp_path):
 
 
 def images(folder):
-    return "--left", folder / "left*.png", "--right", folder / "right*.png"
+    return "--source", f"pairs:{folder}/left*.png,{folder}/right*.png"
 
 
 CHESS = ("--target", "chessboard:9x6:25mm")
@@ -81,23 +81,23 @@ def test_images_of_one_camera_alone_in_another_resolution_are_used(few, armsight
     for path in sorted(few.glob("left*.png")):
         image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
         cv2.imwrite(str(alone / path.name), cv2.resize(image, None, fx=1.5, fy=1.5, interpolation=cv2.INTER_CUBIC))
-    more = ("--left-intrinsics", alone / "*.png")
+    more = ("--alone", f"{alone}/*.png,")
     out = tmp_path / "rig.json"
     said = armsight("calibrate", *images(few), *more, *CHESS, *QUICK, "-o", out, "--json")
     assert said.code == 0, said.err
     (summary,) = said.lines
     assert (summary["pairs_found"], summary["pairs_used"], summary["rejected"]) == (5, 5, [])
     assert summary["heldout"]["epipolar_rms_px"] < 0.1
-    assert StereoRig.load(out).provenance["left_intrinsics"] == str(more[1])
+    assert StereoRig.load(out).provenance["left_intrinsics"] == str(more[1]).rstrip(",")
     square = np.zeros((300, 300), np.uint8)
     cv2.imwrite(str(alone / "square.png"), square)
     for options, words in (
-        (("--left-intrinsics", alone / "*.png"), ("square.png", "300x300", "same ratio")),
-        (("--right-intrinsics", alone / "*.jpg"), ("*.jpg", "no such file")),
+        (("--alone", f"{alone}/*.png,"), ("square.png", "300x300", "same ratio")),
+        (("--alone", f",{alone}/*.jpg"), ("*.jpg", "no such file")),
     ):
         assert_rejected(armsight("calibrate", *images(few), *options, *CHESS, *QUICK, "-o", out), *words)
-    known = ("--detections", "d.csv", "--cameras", "c.json", "--body", "b.csv")
-    assert_rejected(armsight("calibrate", *more, *known, "-o", out), "--left-intrinsics")
+    known = ("--source", "detections:d.csv", "--cameras", "c.json", "--target", "b.csv")
+    assert_rejected(armsight("calibrate", *more, *known, "-o", out), "--alone")
 
 
 def test_people_read_the_held_out_table_first(few, armsight, tmp_path):
@@ -136,7 +136,7 @@ def test_a_missing_file(few, armsight, tmp_path):
 
 def test_an_empty_glob(few, armsight, tmp_path):
     said = armsight(
-        "calibrate", "--left", tmp_path / "no*.png", "--right", few / "right*.png", *CHESS, "-o", tmp_path / "rig.json"
+        "calibrate", "--source", f"pairs:{tmp_path}/no*.png,{few}/right*.png", *CHESS, "-o", tmp_path / "rig.json"
     )
     assert_rejected(said, "no*.png", "no such file")
 
@@ -192,7 +192,7 @@ def test_two_image_sizes(few, armsight, tmp_path):
 
 def test_the_same_images_on_both_sides(few, armsight, tmp_path):
     said = armsight(
-        "calibrate", "--left", few / "left*.png", "--right", few / "left*.png", *CHESS, "-o", tmp_path / "rig.json"
+        "calibrate", "--source", f"pairs:{few}/left*.png,{few}/left*.png", *CHESS, "-o", tmp_path / "rig.json"
     )
     assert_rejected(said, "both a left and a right image")
 
@@ -277,7 +277,7 @@ def test_images_that_contradict_each_other_are_not_to_be_trusted(rendered, armsi
 
 def test_left_and_right_exchanged_is_an_error(few, armsight, tmp_path):
     said = armsight(
-        "calibrate", "--left", few / "right*.png", "--right", few / "left*.png", *CHESS, *QUICK,
+        "calibrate", "--source", f"pairs:{few}/right*.png,{few}/left*.png", *CHESS, *QUICK,
         "-o", tmp_path / "rig.json", "--json",
     )  # fmt: skip
     assert_rejected(said, "left and right are exchanged")
@@ -287,7 +287,7 @@ def test_left_and_right_exchanged_is_an_error(few, armsight, tmp_path):
 def test_a_video_is_named_with_what_to_do(armsight, tmp_path):
     for side in ("left", "right"):
         (tmp_path / f"{side}.mp4").write_bytes(b"")
-    videos = ("--left", tmp_path / "left.mp4", "--right", tmp_path / "right.mp4")
+    videos = ("--source", f"pairs:{tmp_path}/left.mp4,{tmp_path}/right.mp4")
     said = armsight("calibrate", *videos, *CHESS, "-o", tmp_path / "rig.json")
     assert_rejected(said, "left.mp4", "is a video", "--source video:LEFT,RIGHT")
 
@@ -314,12 +314,10 @@ def test_a_report_where_a_file_stands(few, armsight, tmp_path):
     "options",
     [
         (),
-        ("--left", "a*.png"),
-        ("--left", "a*.png", "--right", "b*.png"),
-        ("--left", "a", "--right", "b", "--target", "chessboard:9x6:25mm", "--detections", "d.csv"),
-        ("--left", "a", "--right", "b", "--target", "chessboard:9x6:25mm", "--refine-body", "d.csv"),
-        ("--detections", "d.csv", "--cameras", "c.json"),
-        ("--source", "s", "--left", "a", "--right", "b", "--target", "chessboard:9x6:25mm"),
+        ("--target", "chessboard:9x6:25mm"),
+        ("--source", "pairs:a,b", "--target", "chessboard:9x6:25mm", "--cameras", "c.json"),
+        ("--source", "pairs:a,b", "--target", "chessboard:9x6:25mm", "--refine-body", "d.csv"),
+        ("--source", "detections:d.csv", "--target", "b.csv"),
         ("--source", "s"),
     ],
 )
@@ -403,7 +401,7 @@ def test_the_rig_is_json_that_others_can_read(rendered):
 def test_figures_that_look_like_contradictions_are_explained(data_dir, armsight, tmp_path):
     """Two webcams that are not synchronised: the board moved between their exposures, and stayed away from the edges."""
     folder = data_dir / "stereo" / "webcams-360p"
-    images = ("--left", folder / "left*.jpg", "--right", folder / "right*.jpg", "--target", "chessboard:9x6:24.23mm")
+    images = ("--source", f"pairs:{folder}/left*.jpg,{folder}/right*.jpg", "--target", "chessboard:9x6:24.23mm")
     said = armsight("calibrate", *images, "--lens-model", "brown4", "-o", tmp_path / "rig.json", "--report", tmp_path)
     (fit,) = [line for line in said.out.splitlines() if line.startswith("fit: ")]
     epipolar, reprojection = (float(number) for number in re.findall(r"(\d\.\d+) px", fit)[:2])
@@ -423,8 +421,8 @@ def test_figures_that_look_like_contradictions_are_explained(data_dir, armsight,
 def test_nothing_is_recorded_for_options_that_do_not_work(armsight, tmp_path):
     (tmp_path / "report").write_text("a file of mine")
     given = ("calibrate", "--source", "sim:", *CHESS, "-o", tmp_path / "rig.json")
-    for wrong in (("--report", tmp_path / "report"), ("--left-intrinsics", tmp_path / "none*.png")):
+    for wrong in (("--report", tmp_path / "report"), ("--alone", f"{tmp_path}/none*.png,")):
         said = armsight(*given, *wrong)
-        assert_rejected(said, str(wrong[1]))
+        assert_rejected(said, str(wrong[1]).rstrip(","))
         assert "recording" not in said.err
     assert sorted(path.name for path in tmp_path.iterdir()) == ["report"]

@@ -132,7 +132,7 @@ def test_a_unit_or_a_rotation_that_is_given_counts(tmp_path):
     table = read_pose_table(euler, rotation="XYZ")
     np.testing.assert_allclose(table.Ts, A, atol=1e-8)
     assert table.notes == ()
-    assert "about the fixed x, y and z" in read_pose_table(euler).notes[0]
+    assert "about fixed x, y and z" in read_pose_table(euler).notes[0]
 
 
 @pytest.mark.parametrize(
@@ -266,7 +266,7 @@ def test_streams_with_an_unknown_clock_offset(armsight, tmp_path):
     other = armsight("handeye", "--robot", robot, "--seen", seen, "--eye", "to-hand", "--streams")
     assert_rejected(other, robot, "these poses fit --eye in-hand, not to-hand")
     large = named(tmp_path / "c.csv", head, np.hstack([t_hand[:, None], 39.37 * A[:, :3, 3], quaternions(A)]))
-    document, notes = found(armsight, large, seen, "--streams", "--detect-units")
+    document, notes = found(armsight, large, seen, "--streams", "--columns", "units=detect")
     assert "inches taken for metres; converted" in notes
     assert_right(document)
 
@@ -277,9 +277,9 @@ def test_millimetres_are_rejected_or_detected(armsight, tmp_path, seen):
     A[:, :3, 3] *= 1e3
     robot = matrices(tmp_path / "robot.txt", A)
     assert_rejected(
-        armsight("handeye", "--robot", robot, "--seen", seen, "--eye", "in-hand"), robot, "millimetres", "--units mm"
+        armsight("handeye", "--robot", robot, "--seen", seen, "--eye", "in-hand"), robot, "millimetres", "units=mm"
     )
-    document, notes = found(armsight, robot, seen, "--detect-units")
+    document, notes = found(armsight, robot, seen, "--columns", "units=detect")
     assert "read as millimetres" in notes
     assert_right(document)
     cm = B.copy()
@@ -295,8 +295,8 @@ def test_millimetres_are_rejected_or_detected(armsight, tmp_path, seen):
         "--eye",
         "in-hand",
     )
-    assert_rejected(armsight(*given), "centimetres taken for metres: correct --seen-units, or give --detect-units")
-    document, notes = found(armsight, robot, tmp_path / "cm.txt", "--detect-units")
+    assert_rejected(armsight(*given), "centimetres taken for metres: correct seen:units, or say --columns units=detect")
+    document, notes = found(armsight, robot, tmp_path / "cm.txt", "--columns", "units=detect")
     assert "the target's lengths are centimetres taken for metres; converted" in notes
     np.testing.assert_allclose(np.array(document["T_flange_rig"])[:3, 3], X[:3, 3] / 10, atol=1e-3)
     p_mm = np.array([[600, 10, 500], [500, 0, 400], [1, 1.5, 2]])  # one near the base's origin
@@ -326,8 +326,8 @@ def test_what_does_not_fit_is_named(armsight, tmp_path, seen):
     rejected(matrices(path, mirrored), "line 4", "left-handed")
     angles = Rotation.from_matrix(A[:, :3, :3]).as_euler("xyz", degrees=True)
     euler = named(tmp_path / "e.csv", "x_m,y_m,z_m,rx_deg,ry_deg,rz_deg", np.hstack([A[:, :3, 3], angles]))
-    rejected(euler, "the rotations are xyz, not zyx", more=("--rotation", "zyx"))
-    rejected(euler, "give --rotation")
+    rejected(euler, "the rotations are xyz, not zyx", more=("--columns", "rotation=zyx"))
+    rejected(euler, "say --columns rotation=")
     joints = named(tmp_path / "q.csv", ",".join(f"q{i}_rad" for i in range(1, 7)), q[:, [0, 2, 1, 3, 4, 5]])
     rejected(joints, "the joints are in another order", "q1, q3, q2", more=("--model", "six_r"))
     rejected(joints, "give --model")
@@ -451,11 +451,20 @@ def test_readings_of_rotations_axes_and_units(armsight, tmp_path, seen):
     x = Rotation.from_matrix(B[:, :3, :3]).as_quat()
     bare = tmp_path / "bare.csv"
     np.savetxt(bare, np.hstack([B[:, :3, 3], x]), delimiter=",")
-    by = ("--seen-rotation", "wxyz")
-    rejected(matrices(path, A), bare, "the rotations are xyzw, not wxyz: --seen-rotation xyzw", more=by, by=bare)
+    by = ("--columns", "seen:rotation=wxyz")
+    rejected(
+        matrices(path, A), bare, "the rotations are xyzw, not wxyz: --columns seen:rotation=xyzw", more=by, by=bare
+    )
     other = A.copy()
     other[5, :3, 3] *= 1e3
-    rejected(matrices(path, other), "are some rows in millimetres?", more=("--detect-units",))
+    rejected(
+        matrices(path, other),
+        "are some rows in millimetres?",
+        more=(
+            "--columns",
+            "units=detect",
+        ),
+    )
     head, arm = ",".join(f"q{i}_deg" for i in range(1, 7)), ("--model", "six_r")
     rejected(named(path, head, np.degrees(q + np.pi / 2 * np.eye(6)[2])), "another zero", "add -90 deg to q3", more=arm)
     ur = open_arm("ur3").home + q
@@ -555,12 +564,12 @@ def test_a_tcp_taken_for_the_flange_is_noted_where_the_joints_are_known(armsight
         ("p[0, 0, 0, 0, 0, 0] p[0, 0, 0, 0, 0, 1]\n", ["line 1", "expected one p[x, y, z, rx, ry, rz]"]),
         ("[0, 0, 0, 0, 0, 0]\nq=[0, 0, 0, 0, 0, 0]\n", ["line 2", "expected a list"]),
         ("[0, 0, 0]\n", ["line 1", "3 numbers without names; known are 16"]),
-        ("[0, 0, 0, 1, 0, 0, 0]\n", ["--rotation wxyz or --rotation xyzw"]),
+        ("[0, 0, 0, 1, 0, 0, 0]\n", ["rotation=wxyz or rotation=xyzw"]),
         ("1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 2\n", ["line 8", "expected 0 0 0 1"]),
         ("1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n1 0 0 0\n", ["line 5", "ends within a matrix"]),
         ("X,Y,Z,A,B\n0,0,0,0,0\n", ["line 1", "no rotation"]),
         ("1 0 0 0 0 1 0 0 0 0 1.5 0\n", ["line 1", "no rotation"]),
-        ("0 0 0 1 0 0 0\n", ["--rotation wxyz or --rotation xyzw"]),
+        ("0 0 0 1 0 0 0\n", ["rotation=wxyz or rotation=xyzw"]),
         ("", ["no rows"]),
     ],
 )
@@ -574,10 +583,10 @@ def test_a_damaged_table_is_one_line(armsight, tmp_path, seen, text, words):
     ("more", "words"),
     [
         ((), ["one way"]),
-        (("--images", "x*.png"), ["--images and --camera belong together"]),
-        (("--images", "x*.png", "--camera", "c.json"), ["--target"]),
-        (("--images", "x*.png", "--camera", "c.json", "--target", "chessboard:9x6:25mm"), ["no such images"]),
-        (("--rig", "r.json", "--target", "chessboard:9x6:25mm"), ["--rig, --left and --right"]),
+        (("--source", "x*.png"), ["--camera with --source"]),
+        (("--source", "x*.png", "--camera", "c.json"), ["--target"]),
+        (("--source", "x*.png", "--camera", "c.json", "--target", "chessboard:9x6:25mm"), ["no such images"]),
+        (("--rig", "r.json", "--target", "chessboard:9x6:25mm"), ["--rig with --source"]),
     ],
 )
 def test_options_that_do_not_go_together_are_rejected(armsight, tmp_path, more, words):
@@ -611,7 +620,7 @@ def test_images_of_one_camera(armsight, tmp_path):
     robot = matrices(tmp_path / "robot.txt", np.array(A))
     camera = tmp_path / "camera.json"
     camera.write_text(json.dumps({"image_size_px": [640, 480], "K": K.tolist(), "distortion": []}))
-    given = ("handeye", "--robot", robot, "--eye", "in-hand", "--images", tmp_path / "im*.png", "--json")
+    given = ("handeye", "--robot", robot, "--eye", "in-hand", "--source", tmp_path / "im*.png", "--json")
     said = armsight(*given, "--camera", camera, "--target", "chessboard:8x6:25mm")
     assert said.code == 0, said.err
     assert np.abs(log_se3(inverse(X) @ np.array(said.lines[0]["T_flange_rig"]))).max() < 3e-3

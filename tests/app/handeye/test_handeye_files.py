@@ -16,31 +16,38 @@ TRUTH = ([30, -60, 90], [3, -5, 88])
     [
         ("--robot", DATA / "samples.yaml"),
         ("--robot", DATA / "samples.yaml", "--seen", DATA / "samples.yaml"),
-        ("--robot", DATA / "samples.yaml", "--seen", DATA / "seen_xyzw.csv", "--seen-rotation", "xyzw"),
-        ("--robot", DATA / "matrices.json", "--seen", DATA / "seen_xyzw.csv", "--seen-rotation", "xyzw"),
+        ("--robot", DATA / "samples.yaml", "--seen", DATA / "seen_xyzw.csv", "--columns", "seen:rotation=xyzw"),
+        ("--robot", DATA / "matrices.json", "--seen", DATA / "seen_xyzw.csv", "--columns", "seen:rotation=xyzw"),
         *(
             (
                 "--robot",
                 DATA / name,
-                "--rotation",
-                "xyz",
-                "--units",
-                "mm",
+                "--columns",
+                "rotation=xyz",
+                "--columns",
+                "units=mm",
                 "--seen",
                 DATA / "seen_xyzw.csv",
-                "--seen-rotation",
-                "xyzw",
+                "--columns",
+                "seen:rotation=xyzw",
             )
             for name in ("poses.json", "poses.txt")
         ),
-        ("--robot", DATA / "poses.mod", "--seen", DATA / "seen_xyzw.csv", "--seen-rotation", "xyzw"),
+        ("--robot", DATA / "poses.mod", "--seen", DATA / "seen_xyzw.csv", "--columns", "seen:rotation=xyzw"),
         (
-            *("--robot", DATA / "rotation_first_robot.csv", "--rotation", "rotvec", "--columns", "rx,ry,rz,x,y,z"),
+            *(
+                "--robot",
+                DATA / "rotation_first_robot.csv",
+                "--columns",
+                "rotation=rotvec",
+                "--columns",
+                "rx,ry,rz,x,y,z",
+            ),
             *(
                 "--seen",
                 DATA / "rotation_first_seen.csv",
-                "--seen-rotation",
-                "rotvec",
+                "--columns",
+                "seen:rotation=rotvec",
                 "--columns",
                 "seen:rx,ry,rz,x,y,z",
             ),
@@ -60,8 +67,16 @@ def test_hand_eye_of_samples_that_other_programs_saved(armsight, given):
 )
 def test_a_rotation_before_the_position_is_named_as_such(armsight, robot, both):
     said = armsight(
-        *("handeye", "--robot", DATA / robot, "--rotation", "rotvec", "--seen", DATA / "rotation_first_seen.csv"),
-        *("--seen-rotation", "rotvec", "--eye", "in-hand"),
+        *(
+            "handeye",
+            "--robot",
+            DATA / robot,
+            "--columns",
+            "rotation=rotvec",
+            "--seen",
+            DATA / "rotation_first_seen.csv",
+        ),
+        *("--columns", "seen:rotation=rotvec", "--eye", "in-hand"),
     )
     assert said.code == 2
     assert "the rotation comes before the position" in said.err

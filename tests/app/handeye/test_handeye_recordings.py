@@ -89,7 +89,7 @@ def options(bag, rig, *more):
 
 def test_poses_at_the_times_of_the_shots(armsight, at_rest):
     bag, rig, _ = at_rest
-    said = armsight(*options(bag, rig, "--frames", "base_link:flange"))
+    said = armsight(*options(bag, rig, "--columns", "frames=base_link:flange"))
     assert said.code == 0, said.err
     document = json.loads(said.out)
     off = log_se3(inverse(T_BASE_RIG) @ np.array(document["T_base_rig"]))
@@ -172,17 +172,20 @@ def test_poses_of_a_tcp_beside_the_joints_are_those_of_the_tcp():
 
 def test_what_a_recording_lacks_is_said(armsight, at_rest, tmp_path):
     bag, rig, _ = at_rest
-    assert_rejected(armsight(*options(bag, rig)), "needs --frames BASE:FLANGE")
-    assert_rejected(armsight(*options(bag, rig, "--frames", "base_link")), "two frames are needed, such as")
+    assert_rejected(armsight(*options(bag, rig)), "needs --columns frames=BASE:FLANGE")
+    assert_rejected(armsight(*options(bag, rig, "--columns", "frames=base_link")), "two frames are needed, such as")
     assert_rejected(
-        armsight(*options(bag, rig, "--frames", "base_link:ee")), "no frame 'ee'", "base_link, flange, tool0"
+        armsight(*options(bag, rig, "--columns", "frames=base_link:ee")), "no frame 'ee'", "base_link, flange, tool0"
     )
-    assert_rejected(armsight(*options(bag, rig, "--frames", "tool0:flange")), "fixed transform")
+    assert_rejected(armsight(*options(bag, rig, "--columns", "frames=tool0:flange")), "fixed transform")
     assert_rejected(armsight(*options(bag, rig, "--model", "iiwa")), "holds the joints")
-    assert_rejected(armsight(*options(bag, rig, "--frames", "base_link:flange", "--units", "mm")), "belongs to tables")
+    assert_rejected(
+        armsight(*options(bag, rig, "--columns", "frames=base_link:flange", "--columns", "units=mm")),
+        "belongs to tables",
+    )
     (tmp_path / "poses.csv").write_text("x_m\n")
-    table = options(bag, rig, "--frames", "base_link:flange")
-    assert_rejected(armsight(*table[:2], tmp_path / "poses.csv", *table[3:]), "--frames belongs to recordings")
+    table = options(bag, rig, "--columns", "frames=base_link:flange")
+    assert_rejected(armsight(*table[:2], tmp_path / "poses.csv", *table[3:]), "--columns frames= belongs to recordings")
     assert_rejected(armsight(*table[:2], tmp_path / "none.bag", *table[3:]), "no such recording")
 
 
@@ -204,7 +207,7 @@ def test_an_arm_in_motion_and_images_that_come_late(armsight, tmp_path):
         sent.append(moved(k / 50, T_BASE_RIG @ T_rig_body(k / 50) @ inverse(T_FLANGE_BODY)))
     bag = write_bag(tmp_path / "run", "ros1", sorted(sent, key=lambda each: each.stamp_ns))
     rig.save(tmp_path / "rig.json")
-    frames = ("--frames", "base_link:flange")
+    frames = ("--columns", "frames=base_link:flange")
     said = armsight(*options(bag, tmp_path / "rig.json", *frames))
     assert "images come later than their stamps say: --streams" in said.err
     said = armsight(*options(bag, tmp_path / "rig.json", *frames, "--streams"))

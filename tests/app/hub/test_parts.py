@@ -41,8 +41,8 @@ def test_who_a_cell_is(tmp_path):
     ],
 )
 def test_a_wrong_name_is_one_line(text, message, armsight, tmp_path):
-    arguments = ("measure", tmp_path / "rig.json", "--target", "x.toml", "--left", "l*.png", "--right", "r*.png")
-    assert_rejected(armsight(*arguments, "--cell", text), message)
+    arguments = ("measure", tmp_path / "rig.json", "--target", "x.toml", "--source", "pairs:l*.png,r*.png")
+    assert_rejected(armsight(*arguments, "--stream", f"cell:{text}"), message)
 
 
 @pytest.mark.parametrize(

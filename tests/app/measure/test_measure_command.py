@@ -66,7 +66,7 @@ def test_a_measure_of_one_pair_imports_nothing_slow(rendered, of):
     target = rendered.plate if of == "arm" else rendered.board[-1]
     missing = (*SLOW, *(f"armsight.{name}" for name in SLOW_OURS))
     code = f"import sys; sys.modules.update(dict.fromkeys({missing})); from armsight.app.main import main; main()"
-    arguments = ["measure", rendered.rig, "--target", target, "--left", left, "--right", right]
+    arguments = ["measure", rendered.rig, "--target", target, "--source", f"pairs:{left},{right}"]
     done = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
 
@@ -165,7 +165,7 @@ def start(rendered):
 
 
 def images(folder):
-    return "--left", folder / "left*.png", "--right", folder / "right*.png"
+    return "--source", f"pairs:{folder}/left*.png,{folder}/right*.png"
 
 
 def test_people_read_millimetres_and_a_sigma(start, arm, armsight):
@@ -251,7 +251,7 @@ def test_images_that_a_driver_flipped_are_named(start, arm, armsight, tmp_path, 
     for side in ("left", "right"):
         image = cv2.imread(str(next(arm.glob(f"{side}*.png"))), cv2.IMREAD_GRAYSCALE)
         cv2.imwrite(str(tmp_path / f"{side}0.png"), cv2.flip(image, code) if side in sides else image)
-    said = armsight(*start, "--left", tmp_path / "left*.png", "--right", tmp_path / "right*.png")
+    said = armsight(*start, "--source", f"pairs:{tmp_path}/left*.png,{tmp_path}/right*.png")
     assert said.code == 2
     assert f"none of 1 shots could be measured: the {what} against those of the calibration" in said.err
 
@@ -260,13 +260,13 @@ def test_a_print_of_the_other_polarity_is_named(start, arm, armsight, tmp_path):
     for side in ("left", "right"):
         image = cv2.imread(str(next(arm.glob(f"{side}*.png"))), cv2.IMREAD_GRAYSCALE)
         cv2.imwrite(str(tmp_path / f"{side}0.png"), 255 - image)
-    said = armsight(*start, "--left", tmp_path / "left*.png", "--right", tmp_path / "right*.png")
+    said = armsight(*start, "--source", f"pairs:{tmp_path}/left*.png,{tmp_path}/right*.png")
     assert said.code == 2
     assert "none of 1 shots could be measured: it is in view inverted" in said.err
 
 
 def test_left_and_right_exchanged_is_the_reason(start, arm, armsight):
-    said = armsight(*start, "--left", arm / "right00[0-3].png", "--right", arm / "left00[0-3].png", "--json")
+    said = armsight(*start, "--source", f"pairs:{arm}/right00[0-3].png,{arm}/left00[0-3].png", "--json")
     assert said.code == 2
     assert all("left and right are exchanged" in record["reason"] for record in said.lines)
     assert "left and right are exchanged" in said.err
@@ -287,18 +287,9 @@ def test_a_missing_source(start, tmp_path, armsight):
     assert_rejected(armsight(*start, "--source", tmp_path / "nowhere"), "nowhere")
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        (),
-        ("--left", "a*.png"),
-        ("--left", "a", "--right", "b", "--source", "c"),
-        ("--source", "c", "--detections", "d.csv"),
-        ("--right", "b", "--detections", "d.csv"),
-    ],
-)
-def test_shots_given_no_way_or_two(start, armsight, options):
-    assert_rejected(armsight(*start, *options), "give the shots one way")
+@pytest.mark.parametrize("text", ["pairs:a*.png", "pairs:,b*.png", "pairs:a,b,c"])
+def test_pairs_are_two_globs(start, armsight, text):
+    assert_rejected(armsight(*start, "--source", text), "two globs are needed")
 
 
 def test_half_a_rig(rendered, arm, tmp_path, armsight):
@@ -314,7 +305,7 @@ def test_a_target_that_is_none(rendered, arm, armsight, target):
 
 def test_a_csv_body_cannot_be_found_in_images(rendered, arm, tmp_path, armsight):
     save_body_csv(open_body(str(rendered.plate)), tmp_path / "plate.csv")
-    assert_rejected(armsight("measure", rendered.rig, "--target", tmp_path / "plate.csv", *images(arm)), "--detections")
+    assert_rejected(armsight("measure", rendered.rig, "--target", tmp_path / "plate.csv", *images(arm)), "detections")
 
 
 def test_no_folder_for_the_result(start, arm, tmp_path, armsight):
@@ -352,7 +343,7 @@ def seen(rendered, tmp_path):
 
 
 def by_detections(rendered, folder):
-    return "measure", rendered.rig, "--target", folder / "plate.csv", "--detections", folder / "d.csv"
+    return "measure", rendered.rig, "--target", folder / "plate.csv", "--source", f"detections:{folder}/d.csv"
 
 
 def test_detections_are_measured_and_too_few_points_missed(rendered, seen, armsight):
@@ -401,7 +392,7 @@ def test_a_board_of_which_detections_are_given_is_known_to_be_a_print(rendered, 
         name = open_body(target).point_names[0]
         rows = [f"1,{side},{name},100,100" for side in ("left", "right")]
         (tmp_path / "d.csv").write_text("\n".join(["shot,camera,marker,u_px,v_px", *rows]) + "\n")
-        assert _detected(tmp_path / "d.csv", target)[2] is printed
+        assert _detected(str(tmp_path / "d.csv"), target)[2] is printed
 
 
 @pytest.mark.parametrize(
@@ -423,7 +414,7 @@ def test_a_wrong_line_in_a_table(rendered, seen, armsight, file, old, new, said)
 def test_a_bowed_board_is_measured_as_its_calibration_found_it(data_dir, armsight, tmp_path):
     """OpenCV's own recording: a print 0.13 mm off its drawing, which every shot of 13 shows as a misfit."""
     folder = data_dir / "stereo" / "opencv-480p"
-    given = ("--left", folder / "left*.jpg", "--right", folder / "right*.jpg")
+    given = ("--source", f"pairs:{folder}/left*.jpg,{folder}/right*.jpg")
     rig, board, spec = tmp_path / "rig.json", tmp_path / "rig.board.toml", "chessboard:9x6:25mm"
     said = armsight("calibrate", *given, "--target", spec, "-o", rig)
     assert f"--target {board}" in said.out
@@ -488,7 +479,7 @@ def test_fixed_bodies_that_cannot_be_watched(rendered, armsight, tmp_path):
     both = "both have the marker DICT_4X4 3"
     assert_rejected(armsight(*given, tmp_path / "d50.toml", "--fixed", tmp_path / "d100.toml"), both)
     assert_rejected(armsight(*given, tmp_path / "none.toml"), "none.toml")
-    seen = [*given[:4], "--detections", "d.csv", "--fixed", rendered.plate]
+    seen = [*given[:4], "--source", "detections:d.csv", "--fixed", rendered.plate]
     assert_rejected(armsight(*seen), "--fixed needs images")
 
 

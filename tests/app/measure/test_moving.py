@@ -84,7 +84,7 @@ def test_the_shutters_of_the_rig_are_used_for_recordings_only(late, armsight, tm
     said = armsight("measure", tmp_path / "rig.json", *TARGET, "--source", folder / "left", "--json")
     assert "note: skew 5.00 ms (right later)" in said.err
     assert rms_mm(said, truth) < 0.1
-    pairs = "--left", folder / "left" / "left*.png", "--right", folder / "left" / "right*.png"
+    pairs = "--source", f"pairs:{folder}/left/left*.png,{folder}/left/right*.png"
     said = armsight("measure", tmp_path / "rig.json", *TARGET, *pairs, "--json")
     assert "not used: no recording with times" in said.err
     assert all("shutters" not in r for r in said.lines)
@@ -107,7 +107,7 @@ def test_bad_times_are_rejected(late, armsight, options, reason):
 
 def test_images_without_times_are_rejected(late, armsight):
     folder = late[0]
-    pairs = "--left", folder / "left" / "left*.png", "--right", folder / "left" / "right*.png"
+    pairs = "--source", f"pairs:{folder}/left/left*.png,{folder}/left/right*.png"
     assert_rejected(armsight("measure", folder / "rig.json", *TARGET, *pairs, "--skew", "find"), "recording with times")
 
 

@@ -322,7 +322,7 @@ def start(rendered):
 
 
 def images(folder):
-    return "--left", folder / "left*.png", "--right", folder / "right*.png"
+    return "--source", f"pairs:{folder}/left*.png,{folder}/right*.png"
 
 
 @pytest.fixture
@@ -359,7 +359,7 @@ def test_every_shot_has_its_picture_and_foreign_files_stay(start, arm, armsight,
 
 def test_nothing_measured_has_pictures_too(rendered, start, armsight, tmp_path):
     where = f"{rendered.folder}/board/left00[01].png", f"{rendered.folder}/board/right00[01].png"
-    said = armsight(*start, "--left", where[0], "--right", where[1], "--view", tmp_path / "v")
+    said = armsight(*start, "--source", f"pairs:{where[0]},{where[1]}", "--view", tmp_path / "v")
     assert said.code == 2
     assert set(os.listdir(tmp_path / "v")) == {CHART, "view-left000.png", "view-left001.png"}
 
@@ -372,7 +372,7 @@ def test_detections_are_shown_on_empty_images(rendered, start, armsight, tmp_pat
             lines += [f"3,{side},{name},{u:.6f},{v:.6f}"]
     lines += ["9" + line[1:] for line in lines[1:3]]  # too few points
     (tmp_path / "d.csv").write_text("\n".join(lines) + "\n")
-    said = armsight(*start, "--detections", tmp_path / "d.csv", "--view", tmp_path / "v")
+    said = armsight(*start, "--source", f"detections:{tmp_path}/d.csv", "--view", tmp_path / "v")
     assert said.code == 0, said.err
     assert set(os.listdir(tmp_path / "v")) == {CHART, "view-3.png", "view-9.png"}
 

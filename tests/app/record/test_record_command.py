@@ -243,7 +243,10 @@ def test_the_command_stores_and_says_so(monkeypatch, capsys, stored, tmp_path):
 
 def test_the_commands_mistakes_are_one_line_and_code_2(monkeypatch, capsys, stored, tmp_path):
     for arguments, said in (
-        (("film:x", "-o", tmp_path / "a"), "film:x: not a source: known are folder:..., video:..., url:..., usb:..."),
+        (
+            ("film:x", "-o", tmp_path / "a"),
+            "film:x: not a source: known are folder:..., pairs:..., video:..., url:..., usb:...",
+        ),
         ((stored, "-o", stored), f"{stored}: already holds a recording; record into a new folder"),
         (("usb:97,98", "-o", tmp_path / "a"), "/dev/video97: no such camera; `armsight cameras` lists those attached"),
     ):

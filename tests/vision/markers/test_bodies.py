@@ -136,7 +136,7 @@ def test_one_tag_twice_on_a_body_is_rejected(tmp_path):
 @pytest.mark.parametrize(
     ("spec", "texts"),
     [
-        ("points.csv", ["points.csv", "--detections", "TOML"]),
+        ("points.csv", ["points.csv", "detections:", "TOML"]),
         ("none.toml", ["none.toml", "no such file"]),
         ("plate", ["'plate'", "chessboard", ".toml", ".csv"]),
         ("plate.json", ["'plate.json'"]),

@@ -202,5 +202,5 @@ def test_a_file_or_an_address_without_its_kind_is_given_one():
 
 @pytest.mark.parametrize("spec", ["film:a.mp4", "/no/such/folder", "usbcam", ""])
 def test_an_unknown_source_lists_the_known_ones(spec):
-    with pytest.raises(InputError, match=r"not a source: known are folder:..., video:..., url:..., usb:..."):
+    with pytest.raises(InputError, match=r"not a source: known are folder:..., pairs:..., video:..., url:..., usb:..."):
         open_source(spec)

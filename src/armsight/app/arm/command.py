@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from armsight.app.arm_option import arm_option
 from armsight.errors import InputError
 from armsight.files import check_suffix, check_writable, read_text, write_text
 
@@ -25,7 +24,7 @@ _NARROW_M = 0.15
 _POSE = ("x", "y", "z", "euler_z", "euler_y", "euler_x")
 
 _PATH = click.Path(path_type=Path)
-_ARM = arm_option("arm_name", metavar="ARM")
+_ARM = click.argument("arm_name", metavar="ARM")
 _JSON = click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
 _ANGLES = click.argument("angles", nargs=-1, metavar="Q1 Q2 ...")
 
@@ -252,7 +251,7 @@ def plan(arm_name: str, around: Path, output: Path, as_json: bool, **chosen: int
 
 @command.command()
 @click.argument("run", metavar="RUN", type=_PATH)
-@arm_option("--arm", "arm_name", metavar="ARM", help="The nominal arm; by default the one that the run names.")
+@click.option("--arm", "arm_name", metavar="ARM", help="The nominal arm; by default the one that the run names.")
 @click.option("--compare", multiple=True, metavar="FILE.json", type=_PATH, help="Another arm's report.json.")
 @click.option("-o", "--output", metavar="DIR", type=_PATH, help="Folder for report.html, .pdf and .json.")
 @_JSON

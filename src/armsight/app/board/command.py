@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 import click
 from click.core import ParameterSource
 
-from armsight.app.arm_option import arm_option
 from armsight.app.board.flash import FLASHED, PROGRAMMERS
 from armsight.app.show.messages import UNTRUSTED
 from armsight.errors import DeviceError, InputError
@@ -49,22 +48,17 @@ def _path(*names: str, metavar: str = "FILE", default: str | None = None, **give
     return click.option(*names, metavar=metavar, type=kind, default=start, show_default=shown, **given)
 
 
-def _board(action: Callable[..., Any]) -> Callable[..., Any]:
-    """Give a command the options that name a board."""
-    baud = click.option(
-        "--baud", type=click.IntRange(min=1), help="Baud rate of a port; by default the one of its kind of board."
-    )
-    what = "emulated:unicorn, emulated:qemu, emulated:host, serial:PORT, feetech:PORT or ar4:PORT."
-    return click.option("--board", "name", default="emulated:unicorn", show_default=True, metavar="BOARD", help=what)(
-        baud(action)
-    )
-
-
+_board = click.option(
+    "--board",
+    "name",
+    default="emulated:unicorn",
+    show_default=True,
+    metavar="BOARD",
+    help="emulated:unicorn, emulated:qemu, emulated:host, serial:PORT, feetech:PORT[,LEROBOT.json] or ar4:PORT; ,baud=N "
+    "behind a port.",
+)
 _compiler = click.option("--compiler", metavar="NAME", help="zig or gcc; by default the first one that is installed.")
 _folder = _path("-o", "--output", metavar="DIR", default="firmware-build")
-_calibration = _path(
-    "--calibration", help="LeRobot's calibration of a feetech: bus; without, a joint is at 0 at count 2048."
-)
 _yes = click.option("--yes", is_flag=True, help="Do not ask.")
 
 
@@ -73,22 +67,21 @@ def _show(as_json: bool, value: object, text: str) -> None:
     click.echo(json.dumps(value) if as_json else text)
 
 
-def _open(name: str, baud: int | None) -> Board:
+def _open(name: str) -> Board:
     """Open a board with our firmware; an emulated one has six free joints at its motors."""
     from armsight.robot.board_registry import SERIAL, open_board
-    from armsight.robot.boards.serial import BAUD
     from armsight.sim.joints import JointPlant
 
     plant = None if name.startswith(SERIAL) else JointPlant()
-    return open_board(name, plant, baud=BAUD if baud is None else baud)
+    return open_board(name, plant)
 
 
-def _open_any(name: str, baud: int | None, calibration: Path | None = None) -> MotionBoard:
+def _open_any(name: str) -> MotionBoard:
     """Open any board; an emulated one has six free joints at its motors."""
     from armsight.robot.board_registry import is_real, open_motion_board
     from armsight.sim.joints import JointPlant
 
-    return open_motion_board(name, None if is_real(name) else JointPlant(), baud=baud, calibration=calibration)
+    return open_motion_board(name, None if is_real(name) else JointPlant())
 
 
 @click.group("board")
@@ -147,13 +140,10 @@ def flash_(name: str, programmer: str | None, output: Path, compiler: str | None
 
 @command.command()
 @_board
-@_calibration
 @click.option("--seconds", type=click.FloatRange(min=0, min_open=True), help="Stop after this many seconds.")
 @click.option("--every", type=click.FloatRange(min=0.01), default=0.5, show_default=True, help="Seconds between lines.")
 @_JSON
-def monitor(
-    name: str, baud: int | None, calibration: Path | None, seconds: float | None, every: float, as_json: bool
-) -> None:
+def monitor(name: str, seconds: float | None, every: float, as_json: bool) -> None:
     """Print a board's state and angles, line by line, until Ctrl-C; with --json one object per line.
 
     Nothing is commanded: the drives stay as they are.
@@ -166,7 +156,7 @@ def monitor(
         seconds = _WATCH_S
     if click.get_current_context().get_parameter_source("name") is ParameterSource.DEFAULT:
         click.echo(f"note: no --board: this one is {name}, a program; --board serial:PORT is a board", err=True)
-    with _open_any(name, baud, calibration) as board:
+    with _open_any(name) as board:
         click.echo(text.welcome_text(board), err=True)
         if isinstance(board, Ar4Board) and not board.homed:
             angles = "these are not the arm's angles (armsight board home)"
@@ -185,7 +175,7 @@ def monitor(
 )
 @click.option("--store", is_flag=True, help="Keep them over a restart too; only with the drives off.")
 @_JSON
-def gains(name: str, baud: int | None, changes: tuple[str, ...], store: bool, as_json: bool) -> None:
+def gains(name: str, changes: tuple[str, ...], store: bool, as_json: bool) -> None:
     """Print the gains of all joints; with --set change them first.
 
     Changes are taken all at once, also in motion, without a jump of the duty; one that is out of range changes nothing.
@@ -194,7 +184,7 @@ def gains(name: str, baud: int | None, changes: tuple[str, ...], store: bool, as
     from armsight.robot.boards.codes import ConfigSource
     from armsight.robot.boards.configuration import gains_array
 
-    with _open(name, baud) as board:
+    with _open(name) as board:
         config = board.configuration()
         values = gains_array(config)
         if changes:
@@ -214,7 +204,7 @@ def gains(name: str, baud: int | None, changes: tuple[str, ...], store: bool, as
 @_board
 @click.option("--drives", is_flag=True, help="Let a real board move its arm, by less than 3 degrees.")
 @_JSON
-def selftest_(name: str, baud: int | None, drives: bool, as_json: bool) -> int:
+def selftest_(name: str, drives: bool, as_json: bool) -> int:
     """Run the scenario set on a board: motion, a bad wire, a silent host, bad sensors, emergency stop, new gains.
 
     A real board's drives are never switched on without --drives: then it runs only what is safe at rest. Exit code 1 where
@@ -224,13 +214,12 @@ def selftest_(name: str, baud: int | None, drives: bool, as_json: bool) -> int:
     from armsight.app.board.selftest import selftest
     from armsight.app.progress import steps
     from armsight.robot.board_registry import SERIAL
-    from armsight.robot.boards.serial import BAUD
 
     if name.startswith(SERIAL):
         keep_clear = "the arm will move by up to 3 degrees, keep clear of it"
         click.echo(f"{name}: {keep_clear if drives else 'drives stay off; --drives moves the arm'}", err=True)
     with steps() as progress:
-        result = selftest(name, drives=drives, baud=BAUD if baud is None else baud, progress=progress)
+        result = selftest(name, drives=drives, progress=progress)
     _show(as_json, result.record(), text.selftest_text(result))
     for scenario, found in result.scenarios.items():
         for problem in found.problems:
@@ -269,7 +258,6 @@ def selftest_(name: str, baud: int | None, drives: bool, as_json: bool) -> int:
 @_JSON
 def bringup(
     name: str,
-    baud: int | None,
     folder: Path,
     steps: tuple[str, ...],
     joints: tuple[int, ...],
@@ -300,7 +288,7 @@ def bringup(
     kinds = _encoders(encoders)
     check_folder(folder, problem="nothing of a bring-up can be written here")
     if name.startswith(SERIAL):
-        board = _open(name, baud)
+        board = _open(name)
         person: Operator = TerminalOperator(echo)
     else:
         plant, _ = drawn_workshop(seed, encoders=drawn_encoders(seed, {j: kind for j, (kind, _) in kinds.items()}))
@@ -344,7 +332,7 @@ def _encoders(given: tuple[str, ...]) -> dict[int, tuple[SensorKind, int]]:
 )
 @_yes
 @_JSON
-def home(name: str, baud: int | None, at_once: str, yes: bool, as_json: bool) -> None:
+def home(name: str, at_once: str, yes: bool, as_json: bool) -> None:
     """Home an AR4: its joints go to their limit switches, where the encoders are set, and then to rest at 0.
 
     A board with our firmware moves nothing: quadrature encoders take where the arm stands, drives off, for their home_rad.
@@ -355,7 +343,7 @@ def home(name: str, baud: int | None, at_once: str, yes: bool, as_json: bool) ->
     from armsight.robot.boards.board import Board
     from armsight.robot.boards.codes import Command, SensorKind
 
-    with _open_any(name, baud) as board:
+    with _open_any(name) as board:
         if isinstance(board, Ar4Board):
             question = "the arm will move to the ends of all joints: is everything out of its reach?"
         elif isinstance(board, Board) and SensorKind.QUADRATURE in board.configuration()["joint"]["encoder"]["sensor"]:
@@ -382,11 +370,11 @@ def home(name: str, baud: int | None, at_once: str, yes: bool, as_json: bool) ->
 @command.command()
 @_board
 @_JSON
-def clear(name: str, baud: int | None, as_json: bool) -> None:
+def clear(name: str, as_json: bool) -> None:
     """Reset the emergency stop and the faults whose causes are gone; the drives stay as they are."""
     from armsight.robot.boards.codes import BoardState, Command
 
-    with _open_any(name, baud) as board:
+    with _open_any(name) as board:
         if name.startswith("ar4:") or board.status.state is BoardState.STOPPED:
             board.confirm(board.command(Command.CLEAR_STOP))
         board.confirm(board.command(Command.CLEAR_FAULTS))
@@ -399,11 +387,11 @@ def clear(name: str, baud: int | None, as_json: bool) -> None:
 @command.command()
 @_board
 @_JSON
-def release(name: str, baud: int | None, as_json: bool) -> None:
+def release(name: str, as_json: bool) -> None:
     """Switch the drives off: the arm sinks, support it."""
     from armsight.robot.boards.codes import Command
 
-    with _open_any(name, baud) as board:
+    with _open_any(name) as board:
         board.confirm(board.command(Command.DISABLE))
         board.receive(0.05)
         state = board.status.state.name
@@ -412,11 +400,10 @@ def release(name: str, baud: int | None, as_json: bool) -> None:
 
 @command.command()
 @_board
-@_calibration
 @click.option(
     "--identified", metavar="ARM", help="Correct by what `armsight identify` found; with --arm, the arm it began with."
 )
-@arm_option("--arm", "nominal", metavar="ARM", help="The nominal arm of --identified.")
+@click.option("--arm", "nominal", metavar="ARM", help="The nominal arm of --identified.")
 @click.option(
     "--further", metavar="DEG,...", help="Correct by these: true angle less reported one of each joint, degrees."
 )
@@ -427,8 +414,6 @@ def release(name: str, baud: int | None, as_json: bool) -> None:
 @_JSON
 def offsets(
     name: str,
-    baud: int | None,
-    calibration: Path | None,
     identified: str | None,
     nominal: str | None,
     further: str | None,
@@ -447,6 +432,7 @@ def offsets(
     """
     from armsight.app.board import offsets as kept
     from armsight.robot.arm_file import open_arm
+    from armsight.robot.board_registry import calibration_of
     from armsight.robot.boards.feetech.board import FeetechBoard
 
     given = [each for each in (identified, further, restore) if each is not None]
@@ -474,12 +460,12 @@ def offsets(
     elif name.startswith("ar4:"):
         raise InputError(f"{name}: an AR4 keeps no zeros; its driver's joint_offsets file does: --ar4-offsets mk3.yaml")
     elif name.startswith("feetech:"):
-        with _open_any(name, baud, calibration) as board:
+        with _open_any(name) as board:
             assert isinstance(board, FeetechBoard)
             kept.offer_release(board, changes=bool(given), yes=yes)
-            offer(kept.servo_zeros(board, angles, restore, calibration))
+            offer(kept.servo_zeros(board, angles, restore, calibration_of(name)))
     else:
-        with _open(name, baud) as own:
+        with _open(name) as own:
             offer(kept.pot_zeros(own, angles, restore))
 
 
@@ -520,12 +506,12 @@ def config() -> None:
 @_board
 @_path("-o", "--output", help="Write it there.")
 @_JSON
-def get(name: str, baud: int | None, output: Path | None, as_json: bool) -> None:
+def get(name: str, output: Path | None, as_json: bool) -> None:
     """Print the configuration in use as a board.toml, or write it to a file."""
     from armsight.files import write_text
     from armsight.robot.boards.board_file import configuration_text, entries
 
-    with _open(name, baud) as board:
+    with _open(name) as board:
         used = board.configuration()
         text = configuration_text(used, board.welcome.board)
     if output is not None:
@@ -540,12 +526,12 @@ def get(name: str, baud: int | None, output: Path | None, as_json: bool) -> None
 @_FILE
 @_board
 @_JSON
-def diff(file: Path, name: str, baud: int | None, as_json: bool) -> int:
+def diff(file: Path, name: str, as_json: bool) -> int:
     """Print what differs between a board.toml and the board; exit code 1 where anything does."""
     from armsight.robot.boards.board_file import entries, read_configuration
 
     ours, board_name = read_configuration(file)
-    with _open(name, baud) as board:
+    with _open(name) as board:
         _same_board(file, board_name, board)
         theirs = dict(entries(board.configuration()))
     found = {path: [theirs.get(path), value] for path, value in entries(ours) if theirs.get(path) != value}
@@ -560,12 +546,12 @@ def diff(file: Path, name: str, baud: int | None, as_json: bool) -> int:
 @_FILE
 @_board
 @_JSON
-def store(file: Path, name: str, baud: int | None, as_json: bool) -> None:
+def store(file: Path, name: str, as_json: bool) -> None:
     """Store a board.toml on the board, with the drives off; it is in use after the board's next start."""
     from armsight.robot.boards.board_file import read_configuration
 
     stored, board_name = read_configuration(file)
-    with _open(name, baud) as board:
+    with _open(name) as board:
         _same_board(file, board_name, board)
         board.store(stored)
     _stored(as_json)
@@ -575,13 +561,13 @@ def store(file: Path, name: str, baud: int | None, as_json: bool) -> None:
 @click.argument("changes", nargs=-1, required=True, metavar="PATH=VALUE...")
 @_board
 @_JSON
-def set_(changes: tuple[str, ...], name: str, baud: int | None, as_json: bool) -> None:
+def set_(changes: tuple[str, ...], name: str, as_json: bool) -> None:
     """Change single values and store them, such as joint.3.soft_max_rad=1.2 or arm.silence_ticks=200."""
     import tomllib
 
     from armsight.robot.boards.board_file import put
 
-    with _open(name, baud) as board:
+    with _open(name) as board:
         changed, seen = board.configuration(), set[str]()
         for change in changes:
             path, _, text = (part.strip() for part in change.partition("="))

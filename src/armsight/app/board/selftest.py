@@ -21,7 +21,7 @@ from armsight import firmware
 from armsight.data import Array, JointCommand
 from armsight.errors import ArmsightError, DeviceError
 from armsight.firmware.elf import read_elf
-from armsight.robot.board_registry import SERIAL, configured, emulator_name, open_emulator
+from armsight.robot.board_registry import SERIAL, configured, emulator_name, open_emulator, serial_port
 from armsight.robot.boards.board import Board
 from armsight.robot.boards.codes import BoardState, Command, Fault, Rejection
 from armsight.robot.boards.configuration import JOINTS, gains_array
@@ -438,15 +438,12 @@ def speed(emulator: Emulator, ticks: int = _SPEED_TICKS) -> float:
         link.close()
 
 
-def selftest(
-    board: str, *, drives: bool = False, baud: int = BAUD, progress: Callable[[str], None] = print
-) -> SelftestResult:
+def selftest(board: str, *, drives: bool = False, progress: Callable[[str], None] = print) -> SelftestResult:
     """Run the scenarios on a board.
 
     Args:
         board: ``emulated:unicorn``, ``emulated:qemu``, ``emulated:host`` or ``serial:PORT``.
         drives: let a real board move its arm, by less than 3 degrees; without it its drives are never switched on.
-        baud: of a serial port.
         progress: called with what is being done, a line at a time.
 
     Raises:
@@ -455,7 +452,7 @@ def selftest(
     """
     scenarios = {}
     if board.startswith(SERIAL):
-        port, home_rad = board.removeprefix(SERIAL), None
+        (port, baud, _), home_rad = serial_port(board, BAUD), None
         for name in [each for each in DRIVEN if (each not in EMULATED_ONLY if drives else each in AT_REST)]:
             progress(name)
             scenarios[name], home_rad = _on_real(port, baud, DRIVEN[name], drives, home_rad)

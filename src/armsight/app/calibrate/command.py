@@ -10,6 +10,7 @@ from pathlib import Path
 import click
 
 from armsight.app.show.messages import UNTRUSTED
+from armsight.app.source_kinds import DETECTIONS
 from armsight.errors import InputError
 from armsight.files import check_folder, check_outputs, check_writable
 from armsight.vision.calibrate import FOLDS, MODELS
@@ -21,17 +22,12 @@ _FILE = click.Path(path_type=Path)
 class CalibrateOptions:
     """The options of ``armsight calibrate``, by their names; what each means is in its help."""
 
-    left: str | None
-    right: str | None
-    source: str | None
-    left_intrinsics: str | None
-    right_intrinsics: str | None
-    target: str | None
+    source: str
+    alone: str | None
+    target: str
     lens_model: str | None
     flat_target: bool
-    detections: Path | None
     cameras: Path | None
-    body: Path | None
     refine_body: Path | None
     folds: int
     output: Path
@@ -40,23 +36,25 @@ class CalibrateOptions:
 
 
 @click.command("calibrate")
-@click.option("--left", metavar="GLOB", help="Left images; quote the glob.")
-@click.option("--right", metavar="GLOB", help="Right images, matched to the left ones by sorted name.")
 @click.option(
     "--source",
+    required=True,
     metavar="SOURCE",
-    help="Instead: usb:0,1, recorded first, or a recording; finds the skew.",
+    help="Images: 'pairs:L*.png,R*.png', quoted; usb:0,1, recorded first, or a recording, which shows the skew; or "
+    "detections:D.csv of a body.",
 )
-@click.option("--left-intrinsics", metavar="GLOB", help="More images of the target, by the left camera alone.")
-@click.option("--right-intrinsics", metavar="GLOB", help="The same by the right camera.")
-@click.option("--target", metavar="SPEC", help="The target, such as chessboard:9x6:25mm (inner corners, square).")
+@click.option("--alone", metavar="LEFT,RIGHT", help="Globs of more images of the target by one camera alone, or empty.")
+@click.option(
+    "--target",
+    required=True,
+    metavar="SPEC|BODY.csv",
+    help="The target, such as chessboard:9x6:25mm (inner corners, square); of detections the body's points.",
+)
 @click.option(
     "--lens-model", type=click.Choice(MODELS), help="Distortion model; by default the held-out error chooses."
 )
 @click.option("--flat-target", is_flag=True, help="Do not estimate the target's deviation from its drawing.")
-@click.option("--detections", metavar="D.csv", type=_FILE, help="Detections of a body, not images.")
-@click.option("--cameras", metavar="CAMERAS.json", type=_FILE, help="Intrinsics of both cameras.")
-@click.option("--body", metavar="BODY.csv", type=_FILE, help="The body's points.")
+@click.option("--cameras", metavar="CAMERAS.json", type=_FILE, help="Intrinsics of both cameras, with detections.")
 @click.option(
     "--refine-body", metavar="OUT.csv", type=_FILE, help="Estimate the body's points too, and write them here."
 )
@@ -69,21 +67,20 @@ class CalibrateOptions:
 def command(**given: object) -> int:
     """Calibrate two cameras, and evaluate the calibration on pairs held out of the fit.
 
-    From images: --left, --right and --target. From a recording of a board that moves before cameras that may not expose
-    at one time: --source and --target. From detections of a known body with known intrinsics: --detections, --cameras
-    and --body. Exit code 3: the images contradict each other, and the rig must not be used.
+    From images of a board; from a recording of one that moves before cameras that may not expose at one time; or from
+    detections of a known body with known intrinsics. Exit code 3: the images contradict each other, and the rig must not
+    be used.
     """
     o = CalibrateOptions(**given)  # type: ignore[arg-type]
-    globs, points = (o.left, o.right), (o.detections, o.cameras, o.body)
-    images = (o.source, o.target) if o.source is not None else (*globs, o.target)
-    if (None in images) == (None in points) or any((*globs, *images)) == any(points) or (o.source and any(globs)):
+    images = not o.source.startswith(DETECTIONS)
+    if images == (o.cameras is not None):
         raise InputError(
-            "give --left, --right and --target, or --source and --target, or --detections, --cameras and --body"
+            "--cameras and --source detections:D.csv belong together; images show the intrinsics themselves"
         )
-    if o.refine_body is not None and o.detections is None:
-        raise InputError("--refine-body goes with --detections; a target in images is estimated without it")
-    if (o.left_intrinsics or o.right_intrinsics) and o.target is None:
-        raise InputError("--left-intrinsics and --right-intrinsics go with images of a --target")
+    if o.refine_body is not None and images:
+        raise InputError("--refine-body goes with detections; a target in images is estimated without it")
+    if o.alone is not None and not images:
+        raise InputError("--alone goes with images of a board")
 
     from armsight.app.calibrate.report import REPORT_FILES, calibration_report
     from armsight.app.calibrate.run import GivenDetections, GivenImages, provenance
@@ -97,11 +94,11 @@ def command(**given: object) -> int:
 
     if o.report is not None:
         require_matplotlib()
-    if o.target is not None:  # before a person shows it to cameras
+    if images:  # before a person shows it to cameras
         open_board(o.target)
         check_writable(o.output)
         check_report(o.output)
-    with contextlib.closing(GivenImages(o) if o.target is not None else GivenDetections(o)) as opened:
+    with contextlib.closing(GivenImages(o) if images else GivenDetections(o)) as opened:
         outputs = (o.output, o.refine_body, opened.board_file)
         check_outputs(outputs, opened.files)
         check_report(*outputs, *opened.files)

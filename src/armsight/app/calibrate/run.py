@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from armsight.app.calibrate.command import CalibrateOptions
 from armsight.app.progress import bar, steps
 from armsight.app.record.recording import record
+from armsight.app.source_kinds import DETECTIONS, SIM
 from armsight.data import SIDES, Detections, Shot
 from armsight.errors import CalibrationError, InputError
 from armsight.files import unused
@@ -35,17 +36,16 @@ from armsight.vision.markers.body_file import load_body_csv, save_body_csv
 from armsight.vision.markers.calibrated_board import save_board_file
 from armsight.vision.markers.marker import CalibrationBoard
 from armsight.vision.rig import CONTRADICTED
-from armsight.vision.sources import LIVE, PairsSource, Source, notes_of, open_source
+from armsight.vision.sources import LIVE, Source, notes_of, open_source
 from armsight.vision.sources.pairs import StoredSource, image_files, natural_key, no_files
 
-_VIDEOS = (".avi", ".mkv", ".mov", ".mp4", ".webm")
 #: Fewest markers of a family by which it is named as the one in view; in families of few cells less are chance.
 _LEAST_CODES = 4
 
 #: A person has so long to show the board to live cameras, s; half: too few poses, double: an arm that grows tired.
 _RECORDED_S = 60.0
 #: The simulated workcell as cameras, and how often its person shows the board.
-_SIM, _SIM_CAMERAS, _SIM_SHOTS = "sim:", "1280x720@60", 24
+_SIM_CAMERAS, _SIM_SHOTS = "1280x720@60", 24
 
 Grey = NDArray[np.uint8]
 
@@ -57,8 +57,8 @@ class GivenDetections:
 
     def __init__(self, options: CalibrateOptions) -> None:
         """Hold the files, which are read later."""
-        detections, cameras, body = options.detections, options.cameras, options.body
-        assert detections is not None and cameras is not None and body is not None  # noqa: PT018 - the command's check
+        detections, cameras, body = Path(options.source.removeprefix(DETECTIONS)), options.cameras, Path(options.target)
+        assert cameras is not None  # the command's check
         self._options, self.files = options, (detections, cameras, body)
         self.named = {"detections": str(detections), "cameras": str(cameras), "body": str(body)}
 
@@ -85,11 +85,11 @@ def _open(spec: str, folder: Path) -> Source:
     Raises:
         InputError: no such source, or nothing can be stored.
     """
-    if not spec.startswith((*LIVE, _SIM)):
+    if not spec.startswith((*LIVE, SIM)):
         return open_source(spec)
     stored = unused(folder)
     click.echo(f"recording for {_RECORDED_S:g} s into {stored}: move the target; Ctrl-C ends it earlier", err=True)
-    opened = _SimulatedBoard(spec) if spec.startswith(_SIM) else open_source(spec)
+    opened = _SimulatedBoard(spec) if spec.startswith(SIM) else open_source(spec)
     with contextlib.closing(opened) as live, bar("recording shots", live.count) as advance:
         done = record(live, stored, seconds=_RECORDED_S, on_shot=lambda _: advance())
     if (done.stopped and not done.interrupted) or not done.shots:
@@ -105,7 +105,7 @@ class _SimulatedBoard(Source):
     def __init__(self, spec: str) -> None:
         from armsight.sim.workcell.workcell import Workcell
 
-        self._workcell = Workcell.open(cameras=spec.removeprefix(_SIM) or _SIM_CAMERAS)
+        self._workcell = Workcell.open(cameras=spec.removeprefix(SIM) or _SIM_CAMERAS)
         self._shots = self._workcell.chessboard_shots(_SIM_SHOTS)
 
     def read(self) -> Shot | None:
@@ -128,21 +128,15 @@ class GivenImages:
             InputError: there is no such source, or nothing matches.
         """
         self.named: dict[str, str] = {}
-        self._options, self._spec, globs = options, str(options.target), (str(options.left), str(options.right))
-        alone = (options.left_intrinsics, options.right_intrinsics)
+        self._options, self._spec, spec = options, str(options.target), options.source
+        alone = ["", ""] if options.alone is None else options.alone.split(",")
+        if len(alone) != len(SIDES):
+            raise InputError(f"--alone {options.alone}: two globs are needed, LEFT,RIGHT; one of them may be empty")
         self._alone = [(side, file) for side, pattern in enumerate(alone) for file in _files_of(pattern)]
-        if (spec := options.source) is None:
-            opened = PairsSource.open(*globs)
-            video = next((file for file in opened.files if file.suffix.lower() in _VIDEOS), None)
-            if video is not None:
-                raise InputError(f"{video}: is a video: give both as --source video:LEFT,RIGHT")
-            self._source: Source = opened
-            self.named |= zip(SIDES, globs, strict=True)
-        else:
-            self._source, self.named["source"] = _open(spec, options.output.with_suffix(".board")), spec
+        self._source, self.named["source"] = _open(spec, options.output.with_suffix(".board")), spec
         self.board_file = options.output.parent / f"{options.output.stem}.board.toml"
         self.named |= {"target": self._spec, "board": self.board_file.name}
-        self.named |= {f"{side}_intrinsics": each for side, each in zip(SIDES, alone, strict=True) if each is not None}
+        self.named |= {f"{side}_intrinsics": each for side, each in zip(SIDES, alone, strict=True) if each}
 
     @property
     def files(self) -> tuple[Path, ...]:
@@ -198,10 +192,10 @@ class GivenImages:
         self._source.close()
 
 
-def _files_of(pattern: str | None) -> list[Path]:
+def _files_of(pattern: str) -> list[Path]:
     """Return the images that a glob matches, sorted; none without one."""
-    files = [] if pattern is None else sorted(image_files(pattern), key=natural_key)
-    if pattern is not None and not files:
+    files = sorted(image_files(pattern), key=natural_key) if pattern else []
+    if pattern and not files:
         raise InputError(no_files(pattern))
     return files
 

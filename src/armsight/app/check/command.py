@@ -7,7 +7,6 @@ from pathlib import Path
 
 import click
 
-from armsight.app.arm_option import arm_option
 from armsight.app.check import CYCLES
 from armsight.errors import InputError
 from armsight.files import check_folder, check_writable, write_text
@@ -108,7 +107,7 @@ def evaluated(
 
 
 @command.command("plan")
-@arm_option(
+@click.option(
     "--arm", "arm_name", required=True, metavar="ARM", help="The arm: a name (armsight arm list), a .toml or a .urdf."
 )
 @click.option(

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import click
 
-from armsight.app.arm_option import arm_option
 from armsight.app.show.messages import require
 
 
@@ -53,7 +52,7 @@ from armsight.app.show.messages import require
     type=click.Choice(["parallel", "verging"]),
     help="Layout of the cameras.",
 )
-@arm_option(
+@click.option(
     "--nominal-arm",
     metavar="FILE",
     help="The arm model to compute with, such as corrected.toml of armsight identify; by default the nominal table.",

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 
 import click
 
-from armsight.app.arm_option import arm_option
 from armsight.errors import InputError
 
 if TYPE_CHECKING:
@@ -19,9 +18,8 @@ if TYPE_CHECKING:
     from armsight.loop.handeye.handeye import HandEye
     from armsight.loop.handeye.recording import PairedPoses, Seen
     from armsight.robot.kinematics.arm import Arm
+    from armsight.tables.cells import Said
     from armsight.tables.poses import PoseTable
-
-_BY_RIG = "--rig with --left and --right, or with --source"
 
 
 @dataclass(frozen=True)
@@ -29,25 +27,16 @@ class Options:
     """What the command line says; the names are its options'."""
 
     robot: Path
-    frames: str | None
     eye: str
     model: str | None
-    rotation: str | None
-    units: str | None
     columns: tuple[str, ...]
     seen: Path | None
-    seen_rotation: str | None
-    seen_units: str | None
-    images: str | None
     camera: str | None
     rig: Path | None
-    left: str | None
-    right: str | None
     source: str | None
     target: str | None
     streams: bool
     scale: bool
-    detect_units: bool
     plan: int
     output: Path | None
     as_json: bool
@@ -61,42 +50,34 @@ class Options:
     type=click.Path(path_type=Path),
     help="Poses or joints: a table, or a recording with /tf or joint states.",
 )
-@click.option("--frames", metavar="BASE:FLANGE", help="Frames of the recording's transforms, such as base_link:tool0.")
 @click.option(
     "--eye",
     required=True,
     type=click.Choice(["in-hand", "to-hand"]),
     help="Does the arm carry the camera, or the target?",
 )
-@arm_option("--model", metavar="ARM", help="The arm whose joints the table has: a name, a .toml or a .urdf file.")
-@click.option(
-    "--rotation",
-    metavar="CONVENTION",
-    help="wxyz or xyzw; rotvec; or angles: xyz (fixed axes), XYZ (rotated axes), ...",
-)
-@click.option("--units", type=click.Choice(["m", "mm"]), help="Of lengths whose columns do not name a unit.")
+@click.option("--model", metavar="ARM", help="The arm whose joints the table has: a name, a .toml or a .urdf file.")
 @click.option(
     "--columns",
     metavar="[seen:]NAME=COLUMN,...",
     multiple=True,
-    help="Names of columns in your table, such as x_mm=X,rx_deg=A, or of all in order, such as rx,ry,rz,x,y,z; with seen: "
-    "of the target's table.",
+    help="Names of columns in your table, such as x_mm=X,rx_deg=A, or of all in order, such as rx,ry,rz,x,y,z. Also: "
+    "units=mm, or units=detect where lengths cannot be metres; rotation=rotvec, wxyz, xyzw, xyz (fixed axes), XYZ (rotated "
+    "axes) ...; of a recording frames=base_link:tool0. With seen: of the target's table.",
 )
 @click.option(
     "--seen", metavar="TARGET.csv", type=click.Path(path_type=Path), help="Poses of the target in the camera."
 )
-@click.option("--seen-rotation", metavar="CONVENTION", help="The same for the target's table.")
-@click.option("--seen-units", type=click.Choice(["m", "mm"]), help="The same for the target's table.")
-@click.option("--images", metavar="GLOB", help="Images of one camera; quote the glob.")
-@click.option("--camera", metavar="CAMERA|fit", help="Its calibration, .json or .yaml; fit: from these images.")
+@click.option("--camera", metavar="CAMERA|fit", help="Calibration of one camera, .json or .yaml; fit: from its images.")
 @click.option("--rig", metavar="RIG.json", type=click.Path(path_type=Path), help="A calibrated pair of cameras.")
-@click.option("--left", metavar="GLOB", help="Left images of the rig; quote the glob.")
-@click.option("--right", metavar="GLOB", help="Right images.")
-@click.option("--source", metavar="SOURCE", help="A folder or recording instead (see armsight record -h).")
+@click.option(
+    "--source",
+    metavar="SOURCE",
+    help="With --camera a quoted glob of images; with --rig a folder, a recording or pairs:LEFT,RIGHT.",
+)
 @click.option("--target", metavar="SPEC|BODY", help="A board such as chessboard:9x6:25mm, or a body file.")
 @click.option("--streams", is_flag=True, help="Both tables are streams (t_s) whose clocks differ: find the offset.")
 @click.option("--scale", is_flag=True, help="The target's size may be wrong: fit it.")
-@click.option("--detect-units", is_flag=True, help="Take lengths that cannot be metres for millimetres, and say so.")
 @click.option("--plan", metavar="N", type=click.IntRange(min=0, max=50), default=0, help="Choose the next N poses.")
 @click.option(
     "-o", "--output", metavar="DIR", type=click.Path(path_type=Path), help="Folder for the page and the files."
@@ -132,38 +113,37 @@ def command(**given: object) -> int:
     return report.echo(as_json=options.as_json, written=written)
 
 
-def _columns(options: Options, side: str) -> str | None:
-    """Return what --columns says of one table, "robot" or "seen"."""
+def _said(options: Options, side: str) -> Said:
+    """Return what --columns says of one table, "robot" or "seen"; units=detect holds for both."""
+    from armsight.tables.cells import said_columns
+
     parts = [text if text.startswith("seen:") else f"robot:{text.removeprefix('robot:')}" for text in options.columns]
-    return ",".join(text.partition(":")[2] for text in parts if text.startswith(f"{side}:")) or None
+    said = {
+        each: said_columns(",".join(text.partition(":")[2] for text in parts if text.startswith(f"{each}:")) or None)
+        for each in ("robot", "seen")
+    }
+    return said[side]._replace(detect_units=any(each.detect_units for each in said.values()))
 
 
 def _checked(options: Options) -> Options:
     """Reject options that do not go together; a robot's file that holds both sides is that of what was seen, too."""
     from armsight.tables.nested import has_both
 
-    given = (options.seen, options.images, options.camera, options.rig, options.left, options.right, options.source)
-    if not any(given) and has_both(options.robot):
+    if not any((options.seen, options.camera, options.rig, options.source)) and has_both(options.robot):
         options = replace(options, seen=options.robot)
-    ways = {
-        "--seen": options.seen is not None,
-        "--images with --camera": options.images is not None or options.camera is not None,
-        _BY_RIG: any(given[3:]),
-    }
-    pair = (options.left, options.right)
     if options.seen is not None and options.seen.resolve() == options.robot.resolve() and not has_both(options.robot):
         raise InputError(f"{options.seen}: one file for both: --robot has the arm's poses, --seen what the camera saw")
-    if sum(ways.values()) != 1:
-        raise InputError(f"give what the camera saw in one way: {', '.join(ways)}")
-    if (options.images is None) != (options.camera is None):
-        raise InputError("--images and --camera belong together: --camera CAMERA.json, or --camera fit")
-    if ways[_BY_RIG] and (options.rig is None or (any(pair) if options.source is not None else not all(pair))):
-        raise InputError("--rig, --left and --right belong together, or --rig and --source")
+    ways = [options.seen is not None, options.camera is not None, options.rig is not None]
+    if sum(ways) != 1 or (options.source is None) != ways[0]:
+        raise InputError(
+            "give what the camera saw in one way: --seen, --camera with --source (--camera CAMERA.json, or --camera fit), "
+            "or --rig with --source"
+        )
     if options.seen is None and options.target is None:
         raise InputError("images need --target, such as chessboard:9x6:25mm (inner corners, side of a square)")
-    if options.streams and options.seen is None and options.source is None:
+    if options.streams and options.camera is not None:
         raise InputError(
-            "--streams needs times: --seen, a table of the target's poses with t_s, or --source, a recording"
+            "--streams needs times: --seen, a table of the target's poses with t_s, or --rig with --source, a recording"
         )
     return options
 
@@ -186,12 +166,12 @@ def calibrate(options: Options, progress: Callable[[str], None]) -> HandEyeAnswe
     progress("reading")
     arm = None if options.model is None else open_arm(options.model)
     bag = recording_of(options.robot)
-    if bag is None and options.frames is not None:
-        raise InputError(f"{options.robot}: a table: --frames belongs to recordings (bag:FILE)")
-    for name in ("rotation", "units", "columns") if bag is not None else ():
-        if getattr(options, name):
-            raise InputError(f"{options.robot}: a recording: --{name} belongs to tables")
-    robot = _table(options, "robot", arm) if bag is None else robot_in_recording(bag, options.frames, arm)
+    said = _said(options, "robot")
+    if bag is None and said.frames is not None:
+        raise InputError(f"{options.robot}: a table: --columns frames= belongs to recordings (bag:FILE)")
+    if bag is not None and (said.columns or said.unit or said.rotation):
+        raise InputError(f"{options.robot}: a recording: --columns belongs to tables, all but frames=BASE:FLANGE")
+    robot = _table(options, "robot", arm) if bag is None else robot_in_recording(bag, said.frames, arm)
     seen = _seen(options, progress)
     offset_s, sigma_s = None, 0.0
     if options.streams:
@@ -200,7 +180,9 @@ def calibrate(options: Options, progress: Callable[[str], None]) -> HandEyeAnswe
         robot = robot if bag is None else at_shots(robot, seen)
         recording = paired(robot, seen, options.eye == "in-hand", arm)
         progress("looking at whether both sides fit")
-        recording = require_plausible(recording, arm, detect_units=options.detect_units, scale=options.scale)
+        recording = require_plausible(
+            recording, arm, detect_units=_said(options, "robot").detect_units, scale=options.scale
+        )
         links_at = links_of(recording.robot, arm, np.arange(len(robot.Ts), dtype=float))
         links = None if links_at is None else links_at(recording.rows.astype(float))
         found = calibrate_poses(recording.poses, t_s=recording.t_s, links=links, scale=options.scale, progress=progress)
@@ -213,14 +195,13 @@ def _table(options: Options, side: str, arm: Arm | None = None) -> PoseTable:
     """Read a table, of the side "robot" or "seen"."""
     from armsight.tables.poses import read_pose_table
 
-    robot = side == "robot" or options.seen is None
-    robot = side == "robot"
+    said = _said(options, side)
     return read_pose_table(
-        options.robot if robot or options.seen is None else options.seen,
-        rotation=options.rotation if robot else options.seen_rotation,
-        unit=options.units if robot else options.seen_units,
-        detect_units=options.detect_units,
-        columns=_columns(options, side),
+        options.seen if side == "seen" and options.seen is not None else options.robot,
+        rotation=said.rotation,
+        unit=said.unit,
+        detect_units=said.detect_units,
+        columns=said.columns,
         arm=arm,
         side=side,
     )
@@ -230,20 +211,16 @@ def _seen(options: Options, progress: Callable[[str], None]) -> Seen:
     """Read or measure the poses of the target."""
     from armsight.app.handeye.images import see_with_camera, see_with_rig
     from armsight.loop.handeye.recording import seen_in_table
-    from armsight.vision.sources import PairsSource, Source, open_source
+    from armsight.vision.sources import open_source
 
     target = str(options.target)
     if options.seen is not None:
         return seen_in_table(_table(options, "seen"))
-    if options.images is not None:
-        return see_with_camera(options.images, str(options.camera), target, progress)
-    assert options.rig is not None
-    by_globs = options.source is None
-    source: Source = (
-        PairsSource.open(str(options.left), str(options.right)) if by_globs else open_source(str(options.source))
-    )
-    with contextlib.closing(source):
-        return see_with_rig(options.rig, source, target, progress)
+    source = str(options.source)
+    if options.rig is None:
+        return see_with_camera(source, str(options.camera), target, progress)
+    with contextlib.closing(open_source(source)) as opened:
+        return see_with_rig(options.rig, opened, target, progress)
 
 
 def _streams(
@@ -274,7 +251,9 @@ def _streams(
     A, there = hand.at(eye.t_s + roughly_s)
     if there.sum() >= MIN_POSES:
         pairs = of_streams(robot, seen, (A[there], eye.Ts[there]), eye.t_s[there], roughly_s, in_hand)
-        checked = require_plausible(pairs, arm, detect_units=options.detect_units, scale=options.scale, streams=True)
+        checked = require_plausible(
+            pairs, arm, detect_units=_said(options, "robot").detect_units, scale=options.scale, streams=True
+        )
         notes, before, after = checked.notes, pairs.poses, checked.poses
         hand = replace(hand, Ts=resized(hand.Ts, before.A, after.A))
         eye = replace(eye, Ts=resized(eye.Ts, before.B, after.B))

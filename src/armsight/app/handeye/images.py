@@ -177,9 +177,7 @@ def see_with_rig(
         shown.append(result.points.ids)
         squares.append(result.reprojection_rms_px**2)
     if not squares:
-        raise InputError(
-            f"none of {len(names)} pairs was measured: are --target, --left and --right right? {missed[0]}"
-        )
+        raise InputError(f"none of {len(names)} pairs was measured: are --target and --source right? {missed[0]}")
     return Seen(
         np.array(Ts),
         np.array(covs),

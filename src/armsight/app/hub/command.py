@@ -33,7 +33,7 @@ _KEYS_OPTION = click.option(
 def command(ctx: click.Context, listen: str, http: str, keys: Path | None, output: Path, as_json: bool) -> None:
     """Show many cells on one page, first the one that needs a look; keep their events and history.
 
-    A cell is a command with --cell NAME: measure, run, live, record, replay. It sends the hub who it is, its state once a
+    A cell is a command with --stream cell:NAME: measure, run, live, record, replay. It sends who it is, its state once a
     second and its events; without a hub it keeps its events and sends them later. Ctrl-C ends the hub, and no cell.
 
     The hub is for this computer alone until it has the keys of a site. It stops no arm: the emergency stop is at the
@@ -83,7 +83,7 @@ def keys_command(site: str, cells: tuple[str, ...], output: Path, host: str, por
         return
     for each in made:
         click.echo(
-            f"{each.parent}: copy this folder to the cell's computer; there: --cell {each.parent.name}/cell.toml"
+            f"{each.parent}: copy this folder to the cell's computer; there: --stream cell:{each.parent.name}/cell.toml"
         )
     click.echo(f"{output}: start the hub with armsight hub --listen tls/0.0.0.0:{port} --keys {output}")
 

@@ -10,17 +10,15 @@ from typing import TYPE_CHECKING
 
 import click
 
-from armsight.app.arm_option import arm_option
 from armsight.errors import InputError
 from armsight.files import check_folder, check_writable, write_text
-from armsight.tables.rotations import ROTATIONS
 
 if TYPE_CHECKING:
     from armsight.loop.identify.plan import Plan
 
 
 @click.group("identify", invoke_without_command=True)
-@arm_option(
+@click.option(
     "--arm",
     "arm_name",
     metavar="ARM",
@@ -42,10 +40,11 @@ if TYPE_CHECKING:
     "--validate", "other", metavar="OTHER.csv", type=click.Path(path_type=Path), help="Poses to validate with."
 )
 @click.option(
-    "--rotation", type=click.Choice(ROTATIONS), help="What rx_deg, ry_deg, rz_deg mean; without it they are not used."
-)
-@click.option(
-    "--columns", metavar="NAME=COLUMN,...", help="Names of columns in your tables, such as q1_deg=J1,p1_x_mm=X."
+    "--columns",
+    multiple=True,
+    metavar="NAME=COLUMN,...",
+    help="Names of columns in your tables, such as q1_deg=J1,p1_x_mm=X; rotation=zyx: what rx_deg, ry_deg, rz_deg mean, "
+    "which are not used without.",
 )
 @click.option(
     "--prior", "priors", multiple=True, metavar="NAME=SIGMA", help="Sigma (m, rad) of a parameter or kind; 0 keeps it."
@@ -66,8 +65,7 @@ def command(
     data: Path | None,
     joints: Path | None,
     other: Path | None,
-    rotation: str | None,
-    columns: str | None,
+    columns: tuple[str, ...],
     priors: tuple[str, ...],
     output: Path | None,
     verbose: bool,
@@ -88,6 +86,7 @@ def command(
     from armsight.app.show.plotting import require_matplotlib
     from armsight.loop.identify.read import read_measured
     from armsight.robot.arm_file import open_arm, split_arm
+    from armsight.tables.cells import said_columns
 
     arm = open_arm(arm_name)
     if output is not None:
@@ -97,8 +96,10 @@ def command(
     started = time.perf_counter()
     with steps() as progress:
         progress("reading")
-        read = read_measured(data, arm, joints, rotation=rotation, columns=columns)
-        held = None if other is None else read_measured(other, arm, joints, rotation=rotation, columns=columns)
+        said = said_columns(",".join(columns) or None, ("rotation",))
+        how = {"rotation": said.rotation, "columns": said.columns}
+        read = read_measured(data, arm, joints, **how)
+        held = None if other is None else read_measured(other, arm, joints, **how)
         notes = read.notes if held is None else (*read.notes, *(f"{other}: {note}" for note in held.notes))
         run = run_identify(
             arm,
@@ -122,7 +123,9 @@ def command(
 
 
 @command.command()
-@arm_option("--arm", "arm_name", required=True, metavar="ARM", help="The nominal arm: a name, a .toml or a .urdf file.")
+@click.option(
+    "--arm", "arm_name", required=True, metavar="ARM", help="The nominal arm: a name, a .toml or a .urdf file."
+)
 @click.option("--data", metavar="DONE.csv", type=click.Path(path_type=Path), help="Poses that were measured already.")
 @click.option("--rig", metavar="RIG.json", type=click.Path(path_type=Path), help="The cameras that must see the poses.")
 @click.option(

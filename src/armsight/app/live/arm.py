@@ -29,7 +29,7 @@ from armsight.app.live.handeye import (
 )
 from armsight.app.live.measuring import MeasureStep
 from armsight.app.live.records import asked
-from armsight.app.live.step import SIM, PageStep, Shared, why
+from armsight.app.live.step import PageStep, Shared, why
 from armsight.app.run.angles import LoggedAngles, read_angles
 from armsight.app.run.devices import require_joints, setup_of
 from armsight.app.run.experiment import (
@@ -46,6 +46,7 @@ from armsight.app.run.motion_file import MotionPlan, read_motions
 from armsight.app.run.tracks import require_pyarrow
 from armsight.app.setup.finding import check_arm, check_model, find_board
 from armsight.app.show.plotting import require_matplotlib
+from armsight.app.source_kinds import SIM
 from armsight.data import Array, Missed, PoseEstimate, Shot
 from armsight.errors import ArmsightError, DeviceError, InputError
 from armsight.files import read_text, unused
@@ -196,7 +197,7 @@ class ArmStep(PageStep[ArmState]):
         else:
             check_model(name, self.shared.options.arm)
             try:
-                board = StoppableBoard(open_motion_board(name, calibration=self.shared.options.servo_calibration))
+                board = StoppableBoard(open_motion_board(name))
             except DeviceError:
                 check_arm(name)
                 raise

@@ -425,7 +425,9 @@ class CalibrationStep(Guided[CalibrationState]):
         """Return the command line that does the same with the stored shots."""
         folder = self.folder / "calibration" if self._writer is None else self._writer.folder
         out = self.folder / "rig.json"
-        return f"armsight calibrate --left '{folder}/left*.png' --right '{folder}/right*.png' --target {self.spec} -o {out}"
+        return (
+            f"armsight calibrate --source 'pairs:{folder}/left*.png,{folder}/right*.png' --target {self.spec} -o {out}"
+        )
 
     def now(self) -> CalibrationState:
         """Return what is shown, with how the board stands now."""

@@ -23,9 +23,10 @@ from numpy.typing import NDArray
 from armsight.app.live.capture import CameraCapture, LiveShot
 from armsight.app.live.records import asked
 from armsight.app.live.simulated import ACTIONS
-from armsight.app.live.step import SIM, PageStep, Shared
+from armsight.app.live.step import PageStep, Shared
 from armsight.app.setup.finding import COVERED, NOT_COVERED
 from armsight.app.show.messages import Level, Note
+from armsight.app.source_kinds import SIM
 from armsight.data import Array
 from armsight.errors import DeviceError, InputError
 from armsight.vision.image import grey

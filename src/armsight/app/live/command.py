@@ -10,9 +10,8 @@ from typing import Any
 
 import click
 
-from armsight.app.arm_option import arm_option
 from armsight.app.show.messages import require
-from armsight.app.stream_option import CELL, stream_options
+from armsight.app.stream_option import CELL, stream_option
 
 _HERE = ("127.0.0.1", "localhost", "::1")
 
@@ -24,16 +23,15 @@ _HERE = ("127.0.0.1", "localhost", "::1")
 @click.option("--calibration-board", metavar="SPEC", help="The calibration board, such as chessboard:9x6:25mm.")
 @click.option(
     "--board",
-    help="The arm's controller: serial:PORT, feetech:PORT, ar4:PORT; poses:FILE where another program moves it.",
+    help="The arm's controller: serial:PORT, feetech:PORT,LEROBOT.json, ar4:PORT; poses:FILE where another program moves "
+    "it.",
 )
 @click.option(
-    "--calibration",
-    "servo_calibration",
-    type=click.Path(path_type=Path),
-    help="LeRobot's calibration file of the servo bus, with feetech:.",
-)
-@arm_option(
-    "--arm", default="six_r", show_default=True, help="The arm: a name (armsight arm list), a .toml or a .urdf file."
+    "--arm",
+    default="six_r",
+    show_default=True,
+    help="The arm: a name (armsight arm list), a .toml or a .urdf file.",
+    metavar="ARM",
 )
 @click.option("--motion", type=click.Path(path_type=Path), help="The motions (TOML, docs/howto/run.md).")
 @click.option(
@@ -71,7 +69,7 @@ _HERE = ("127.0.0.1", "localhost", "::1")
     help="Put the rig right during a run where its cameras, or both, moved (docs/concepts/health.md).",
 )
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of the simulated workcell.")
-@stream_options("streams")
+@stream_option("streams")
 @click.option("--json", "as_json", is_flag=True, help="Print the address as one JSON object.")
 def command(host: str, port: int, sync_ms: float, as_json: bool, **given: Any) -> None:  # noqa: ANN401 - options' fields
     """Open a page in the browser that leads from two uncalibrated cameras to a closed loop, step by step.
@@ -85,7 +83,8 @@ def command(host: str, port: int, sync_ms: float, as_json: bool, **given: Any) -
 
     from armsight.app.live.server import LiveServer
     from armsight.app.live.session import LiveSession
-    from armsight.app.live.step import SIM, SessionOptions
+    from armsight.app.live.step import SessionOptions
+    from armsight.app.source_kinds import SIM
     from armsight.app.stream.datum import Published
     from armsight.app.stream.streams import open_streams
     from armsight.vision.sources import check_source

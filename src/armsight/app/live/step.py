@@ -20,7 +20,6 @@ from armsight.app.run.motion_file import DEFAULT_MOTION
 from armsight.app.show.messages import Level
 from armsight.errors import ArmsightError
 
-SIM = "sim:"
 S = TypeVar("S")
 
 
@@ -39,7 +38,6 @@ class SessionOptions:
     rate_hz: float = 30.0
     sync_s: float = 1e-3  # standard deviation of the time between the two exposures of a shot
     seed: int = 0
-    servo_calibration: Path | None = None
     streams: tuple[str, ...] = ()
     follow_rig: bool = False
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import click
 
 from armsight.app.show.messages import UNTRUSTED
-from armsight.app.stream_option import stream_options
-from armsight.errors import InputError
+from armsight.app.source_kinds import DETECTIONS
+from armsight.app.stream_option import stream_option
 
 _PATH = click.Path(path_type=Path)
 
@@ -21,10 +21,7 @@ class MeasureOptions:
 
     rig: Path
     target: str
-    left: str | None
-    right: str | None
-    source: str | None
-    detections: Path | None
+    source: str
     fixed: Sequence[str]
     skew: str | None
     readout: str | None
@@ -35,9 +32,9 @@ class MeasureOptions:
     as_json: bool
 
     @property
-    def globs(self) -> tuple[str | None, str | None]:
-        """The left and the right images."""
-        return self.left, self.right
+    def detections(self) -> str | None:
+        """The file of detections, or bag:FILE; None where images are measured."""
+        return self.source.removeprefix(DETECTIONS) if self.source.startswith(DETECTIONS) else None
 
 
 @click.command("measure")
@@ -48,11 +45,12 @@ class MeasureOptions:
     metavar="SPEC|BODY",
     help="A board such as chessboard:9x6:25mm, a body file, or calibrate's .board.toml.",
 )
-@click.option("--left", metavar="GLOB", help="Left images; quote the glob.")
-@click.option("--right", metavar="GLOB", help="Right images.")
-@click.option("--source", metavar="SOURCE", help="A folder, video, stream or pair of cameras (see armsight record -h).")
 @click.option(
-    "--detections", metavar="D.csv", type=_PATH, help="Detections instead of images; bag:FILE for tags in a bag."
+    "--source",
+    required=True,
+    metavar="SOURCE",
+    help="A folder, 'pairs:L*.png,R*.png', a video, stream or pair of cameras (see armsight record -h); or "
+    "detections:D.csv, detections:bag:FILE for tags in a bag.",
 )
 @click.option(
     "--fixed",
@@ -73,27 +71,21 @@ class MeasureOptions:
     help="Write the rig with the skew and readout found, and the noise of a moved body's discs.",
 )
 @click.option("-o", "--output", metavar="POSES.csv", type=_PATH, help="Write the poses as CSV.")
-@stream_options()
+@stream_option()
 @click.option("--view", "view_dir", metavar="DIR", type=_PATH, help="Write annotated pictures.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object per shot.")
 def command(**given: object) -> None:
     """Measure the pose of a target in the left camera's frame, with its uncertainty.
 
-    Give the images as --left and --right, as --source, or what was detected in them as --detections. RIG.json may also be
-    bag:FILE, a recording that holds the camera_info of a stereo pair. A shot that cannot be read or does not show the
-    target gives a line with the reason, and the run continues. rz, ry, rx are the angles about z, y and x, in this order
-    (euler_zyx_deg; in ROS they are yaw, pitch and roll). Exit code 3: the shots contradict the rig or the body file, and
-    the poses must not be trusted.
+    RIG.json may also be bag:FILE, a recording that holds the camera_info of a stereo pair. A shot that cannot be read or
+    does not show the target gives a line with the reason, and the run continues. rz, ry, rx are the angles about z, y and
+    x, in this order (euler_zyx_deg; in ROS they are yaw, pitch and roll). Exit code 3: the shots contradict the rig or the
+    body file, and the poses must not be trusted.
 
     With --skew or --readout, or where the rig file has them, a moving body's detections are moved to the time of the shot
     by its own motion, which the recording's other shots show.
     """
-    options = MeasureOptions(**given)  # type: ignore[arg-type]
-    ways = [options.globs.count(None) < 2, options.source is not None, options.detections is not None]
-    if sum(ways) != 1 or options.globs.count(None) == 1:
-        raise InputError("give the shots one way: --left and --right, or --source, or --detections")
-
     from armsight.app.measure.run import measure_shots
 
-    if any(each.forbids for each in measure_shots(options)):
+    if any(each.forbids for each in measure_shots(MeasureOptions(**given))):  # type: ignore[arg-type]
         click.get_current_context().exit(UNTRUSTED)

@@ -19,6 +19,7 @@ from armsight.app.measure.shots import NAMED, DetectedShots, ImageShots, Result,
 from armsight.app.measure.view import CHART, PictureFolder, view_folder
 from armsight.app.progress import bar
 from armsight.app.show.messages import colour, weak
+from armsight.app.source_kinds import DETECTIONS
 from armsight.app.stream.datum import Published
 from armsight.data import Body, Dropped, Missed, PoseEstimate, Shot
 from armsight.errors import ArmsightError, InputError
@@ -108,7 +109,10 @@ def _checked_outputs(options: MeasureOptions) -> Path | None:
     folder = None if options.view_dir is None else view_folder(options.view_dir)
     if options.output is not None:
         chart = folder and folder / CHART
-        check_writable(options.output, apart_from=(options.rig, options.target, options.detections, folder, chart))
+        check_writable(
+            options.output,
+            apart_from=(options.rig, options.target, options.source.removeprefix(DETECTIONS), folder, chart),
+        )
     return folder
 
 
@@ -116,8 +120,8 @@ def _check_detections(options: MeasureOptions, requested: Requested | None) -> N
     """Reject options that need images where only detections are given."""
     for given, why in (
         (requested is not None, "--skew and --readout need images with times: detections have none"),
-        (bool(options.fixed), "--fixed needs images: --detections has the markers of the target alone"),
-        (options.save_rig is not None, "--save-rig writes what images show of the cameras: --detections has none"),
+        (bool(options.fixed), "--fixed needs images: detections have the markers of the target alone"),
+        (options.save_rig is not None, "--save-rig writes what images show of the cameras: detections have none"),
     ):
         if options.detections is not None and given:
             raise InputError(why)

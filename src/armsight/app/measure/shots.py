@@ -33,7 +33,7 @@ from armsight.vision.pose.noise import DiscNoise
 from armsight.vision.pose.shot_pose import ShotPose
 from armsight.vision.pose.shutter import LOOSE_PX
 from armsight.vision.rig import Shutters, StereoRig
-from armsight.vision.sources import PairsSource, Source, notes_of, open_source
+from armsight.vision.sources import Source, notes_of, open_source
 from armsight.vision.sources.pairs import StoredSource
 
 #: So many shots that fit badly are named.
@@ -63,7 +63,7 @@ class DetectedShots:
 
     def __init__(self, options: MeasureOptions, rig: StereoRig) -> None:
         """Read them."""
-        self.body, shots, self.printed = _detected(Path(str(options.detections)), options.target)
+        self.body, shots, self.printed = _detected(str(options.detections), options.target)
         self._by_name, self.total = {shot.name: shot for shot in shots}, len(shots)
         self.skewed: list[HealthFinding] = []
         self.results: Iterator[Result] = (
@@ -111,7 +111,7 @@ class ImageShots:
         self.skewed: list[HealthFinding] = []
         self._missed: Shot | None = None  # the first with both images
         self._again: Source | None = None
-        self._source = source = self._open()
+        self._source = source = open_source(options.source)
         try:
             self._said = notes_of(source)
             say(self._said)
@@ -124,18 +124,11 @@ class ImageShots:
             if requested is None and rig.shutters is not None and not self._timed:
                 click.echo(f"note: {options.rig} has {rig.shutters}, not used: no recording with times", err=True)
             self._requested = rig.shutters if requested is None and self._timed else requested
-            self._again = self._open() if self._requested is not None and draws else None
+            self._again = open_source(options.source) if self._requested is not None and draws else None
         except BaseException:
             self.close()
             raise
         self.total, self.results = source.count, self._results()
-
-    def _open(self) -> Source:
-        """Open the images that are named."""
-        left, right = self._options.globs
-        return (
-            open_source(str(self._options.source)) if left is None or right is None else PairsSource.open(left, right)
-        )
 
     def _results(self) -> Iterator[Result]:
         """Measure shot after shot, by the shutters that are requested or stand in the rig's file."""
@@ -238,15 +231,15 @@ def open_shots(
     return ImageShots(options, rig, requested, draws)
 
 
-def _detected(detections: Path, target: str) -> tuple[Body, list[SeenShot], bool]:
+def _detected(detections: str, target: str) -> tuple[Body, list[SeenShot], bool]:
     """Return the body, and what was detected of it, in a table or a recording of tags (bag:FILE); whether it is a print."""
     opened = open_body(target) if target.lower().endswith(".csv") else open_target(target)
     body, printed = (opened, False) if isinstance(opened, Body) else (opened.body, is_print(opened))
-    if not str(detections).startswith("bag:"):
-        return body, read_detections(detections, body), printed
+    if not detections.startswith("bag:"):
+        return body, read_detections(Path(detections), body), printed
     from armsight.vision.sources.bag.tags import read_tags
 
-    shots, notes = read_tags(str(detections), opened)
+    shots, notes = read_tags(detections, opened)
     say(notes)
     return body, shots, printed
 

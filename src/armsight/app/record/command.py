@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from armsight.app.stream_option import stream_options
+from armsight.app.stream_option import stream_option
 from armsight.errors import ArmsightError
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 )
 @click.option("--shots", type=click.IntRange(min=1), help="Stop after so many shots.")
 @click.option("--seconds", type=click.FloatRange(min=0, min_open=True), help="Stop after so many seconds.")
-@stream_options()
+@stream_option()
 @click.option("--json", "as_json", is_flag=True, help="Print the result as one JSON object.")
 @click.pass_context
 def command(

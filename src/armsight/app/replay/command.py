@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from armsight.app.arm_option import arm_option
-from armsight.app.stream_option import stream_options
+from armsight.app.stream_option import stream_option
 
 if TYPE_CHECKING:
     from armsight.app.replay.run import Replayed
@@ -26,7 +25,7 @@ _REASONS = 3
 @click.option("-o", "--output", metavar="DIR", type=click.Path(path_type=Path), help="Write the tables to this folder.")
 @click.option("--rig", metavar="RIG.json", help="Another rig: needs images or tags in the recording.")
 @click.option("--target", metavar="SPEC|BODY", help="Another body: needs images or tags in the recording.")
-@arm_option("--arm", metavar="ARM", help="Another arm model.")
+@click.option("--arm", metavar="ARM", help="Another arm model.")
 @click.option("--estimator", type=click.Choice(["kalman", "latest"]), default="kalman", show_default=True)
 @click.option(
     "--references", metavar="REFERENCES.toml", type=click.Path(path_type=Path), help="Fuse an inertial unit, too."
@@ -34,7 +33,7 @@ _REASONS = 3
 @click.option(
     "--rate", type=click.FloatRange(min=0), default=0.0, help="1 is real time; by default as fast as possible."
 )
-@stream_options()
+@stream_option()
 @click.option(
     "--compare",
     "other",

@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from armsight.app.arm_option import arm_option
 from armsight.app.show.messages import UNTRUSTED, require
-from armsight.app.stream_option import stream_options
+from armsight.app.stream_option import stream_option
 from armsight.errors import InputError
 from armsight.files import read_text, write_text
 
@@ -36,14 +35,8 @@ _POSES = "poses:"
     "--board",
     "board_spec",
     required=True,
-    help="The controller: serial:PORT, feetech:PORT, ar4:PORT (docs/howto/board.md); emulated: with sim:; poses:FILE"
-    " where another program moves the arm and logs its angles.",
-)
-@click.option(
-    "--calibration",
-    metavar="FILE",
-    type=click.Path(path_type=Path),
-    help="LeRobot's calibration of a feetech: bus; without, a joint is at 0 at count 2048.",
+    help="The controller: serial:PORT, feetech:PORT,LEROBOT.json, ar4:PORT (docs/howto/board.md); emulated: with sim:;"
+    " poses:FILE where another program moves the arm and logs its angles.",
 )
 @click.option("--rig", "rig_path", required=True, type=click.Path(path_type=Path), help="The calibrated rig, rig.json.")
 @click.option("--target", "target_spec", required=True, help="The body on the tool: a body file of discs.")
@@ -53,12 +46,13 @@ _POSES = "poses:"
     metavar="BODY",
     help="A body in view that does not move; may be repeated. It shows cameras that move.",
 )
-@arm_option(
+@click.option(
     "--arm",
     "arm_spec",
     default="six_r",
     show_default=True,
     help="The arm: a name (armsight arm list), a .toml or a .urdf file.",
+    metavar="ARM",
 )
 @click.option(
     "--motion",
@@ -80,7 +74,7 @@ _POSES = "poses:"
     show_default=True,
     help="Sigma of the time between the exposures of a shot before a sweep of the arm finds it, ms; sim: knows its own.",
 )
-@stream_options()
+@stream_option()
 @click.option(
     "--sync-led",
     is_flag=True,
@@ -105,7 +99,6 @@ _POSES = "poses:"
 def command(
     source_spec: str,
     board_spec: str,
-    calibration: Path | None,
     rig_path: Path,
     target_spec: str,
     fixed: tuple[str, ...],
@@ -169,7 +162,7 @@ def command(
     targets = handeye_poses(arm, motions.ends, _HANDEYE_POSES, 0)
     files = {"motion.toml": text, "body.toml": read_text(target_spec)}
     open_folder(output)
-    devices = Devices(source_spec, board_spec, arm, target, rate, 1e-3 * sync_ms, calibration, sync_led)
+    devices = Devices(source_spec, board_spec, arm, target, rate, 1e-3 * sync_ms, sync_led)
     begun = False
     try:
         with steps() as progress:

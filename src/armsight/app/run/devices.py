@@ -5,11 +5,11 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from armsight.app.source_kinds import SIM
 from armsight.errors import InputError
 from armsight.loop.running.setup import HostClock, LiveShots, Setup
 from armsight.robot.board_registry import EMULATED, emulator_name, open_motion_board, slowed
@@ -22,7 +22,6 @@ from armsight.vision.sources import open_source
 if TYPE_CHECKING:
     from armsight.sim.workcell.workcell import Workcell
 
-_SIM = "sim:"
 #: The workcell's arm and cameras where ``sim:`` names none: those of ``armsight demo``.
 _SIM_ARM, _SIM_CAMERAS = "worn", "1280x720@60"
 
@@ -70,7 +69,6 @@ class Devices:
     target: Composite  #: the body on the tool
     rate_hz: float  #: rate of the cameras, Hz
     sync_s: float  #: standard deviation of the time between the two exposures of a shot, s
-    calibration: Path | None = None  #: LeRobot's calibration file of a servo bus; None without
     sync_led: bool = False  #: whether an LED on the board's clock is in view
 
 
@@ -97,24 +95,24 @@ def planned_for(arm: Arm, board: str) -> Arm:
 def open_devices(devices: Devices) -> Iterator[Setup]:
     """Open the devices, or the workcell instead of them, and close them at the end of the block."""
     source, board = devices.source, devices.board
-    if source.startswith(_SIM) != board.startswith(EMULATED):
+    if source.startswith(SIM) != board.startswith(EMULATED):
         raise InputError(
-            f"--source {source} --board {board}: {_SIM} and {EMULATED} are one workcell and go together; real ones are "
+            f"--source {source} --board {board}: {SIM} and {EMULATED} are one workcell and go together; real ones are "
             "usb:0,1 and serial:/dev/ttyACM0, feetech:PORT or ar4:PORT"
         )
     with contextlib.ExitStack() as stack:
-        if source.startswith(_SIM):
+        if source.startswith(SIM):
             from armsight.sim.workcell.workcell import Workcell
 
             emulator = "unicorn" if board == EMULATED else emulator_name(board)
-            cameras = source.removeprefix(_SIM) or _SIM_CAMERAS
+            cameras = source.removeprefix(SIM) or _SIM_CAMERAS
             led = devices.sync_led
             workcell = stack.enter_context(
                 Workcell.open(arm=_SIM_ARM, cameras=cameras, emulator=emulator, model=devices.arm, sync_led=led)
             )
             yield replace(setup_of(workcell), target=devices.target)
             return
-        opened = stack.enter_context(open_motion_board(board, calibration=devices.calibration))
+        opened = stack.enter_context(open_motion_board(board))
         require_joints(opened, board, devices.arm)
         bit_s = sync_led_bit_s(opened, f"--board {board}") if devices.sync_led else None
         shots = LiveShots(open_source(source))

@@ -40,7 +40,7 @@ _POSES = (
 )
 
 
-def _by_loop(arm: str, board: str, look: SetupStep, written: SetupStep, options: str = "") -> tuple[SetupStep, ...]:
+def _by_loop(arm: str, board: str, look: SetupStep, written: SetupStep) -> tuple[SetupStep, ...]:
     """Return the steps of an arm that armsight moves."""
     return (
         SetupStep(
@@ -52,7 +52,7 @@ def _by_loop(arm: str, board: str, look: SetupStep, written: SetupStep, options:
         look,
         SetupStep(
             "The arm moves on its own: clear the table, keep a hand on the switch.",
-            f"run --source {CAMERAS} --board {board}{options} --rig rig.json --target {PLATE} --arm {arm} --rate 30 -o run",
+            f"run --source {CAMERAS} --board {board} --rig rig.json --target {PLATE} --arm {arm} --rate 30 -o run",
         ),
         SetupStep("Accuracy and repeatability with the loop closed.", "check run --closed", needed=False),
         SetupStep("What the arm really is.", f"identify --arm {arm} --data run/handeye_poses.csv -o corrected"),
@@ -91,21 +91,20 @@ def _calibrated(arm: str, file: str) -> SetupStep:
 _LEROBOT = "my_arm.json"
 _SO101 = _by_loop(
     "so101",
-    f"feetech:{PORT}",
+    f"feetech:{PORT},{_LEROBOT}",
     SetupStep(
         "Bring the arm by hand near 0 in all joints, then press Ctrl-C.",
-        f"board monitor --board feetech:{PORT} --calibration {_LEROBOT}",
+        f"board monitor --board feetech:{PORT},{_LEROBOT}",
         given=_LEROBOT,
-        without=((f" --calibration {_LEROBOT}", ""),),
+        without=((f",{_LEROBOT}", ""),),
         endless=True,
         simulated="--seconds 1",
     ),
     SetupStep(
         "The zeros of the servos. It asks before it switches the drives off, and before it writes.",
-        f"board offsets --board feetech:{PORT} --calibration {_LEROBOT} --identified corrected/corrected.toml --arm so101",
+        f"board offsets --board feetech:{PORT},{_LEROBOT} --identified corrected/corrected.toml --arm so101",
         simulated="--yes",
     ),
-    f" --calibration {_LEROBOT}",
 )
 _YAML = "annin_ar4_driver/config/joint_offsets/mk3.yaml"
 _AR4 = _by_loop(

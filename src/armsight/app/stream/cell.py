@@ -239,7 +239,9 @@ class CellSink(Sink):
         def note(text: str) -> None:
             if text not in notes:
                 notes.add(text)
-                click.echo(f"note: --cell {self._cell.name}: {text}; its events are kept and sent later", err=True)
+                click.echo(
+                    f"note: --stream cell:{self._cell.name}: {text}; its events are kept and sent later", err=True
+                )
 
         while True:
             ending = self._ending.wait(_POST_S)

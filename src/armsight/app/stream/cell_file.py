@@ -68,7 +68,9 @@ def read_cell(spec: str) -> Cell:
     if spec.endswith(".toml"):
         return _from_file(Path(spec).expanduser())
     name, _, router = spec.partition("@")
-    return _checked(Cell(name, router=endpoint(router, f"--cell {spec}") if router else ROUTER), f"--cell {spec}")
+    return _checked(
+        Cell(name, router=endpoint(router, f"--stream cell:{spec}") if router else ROUTER), f"--stream cell:{spec}"
+    )
 
 
 def _from_file(path: Path) -> Cell:

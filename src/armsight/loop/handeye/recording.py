@@ -103,15 +103,15 @@ def robot_in_recording(path: Path, frames: str | None, arm: Arm | None) -> PoseT
     if frames is not None:
         base, _, flange = frames.partition(":")
         if not base or not flange:
-            raise InputError(f"--frames {frames}: two frames are needed, such as base_link:tool0")
+            raise InputError(f"--columns frames={frames}: two frames are needed, such as base_link:tool0")
         track = read_track(bag, base, flange)
         q = None if joints is None else joints.at(track.t_s)
     elif joints is not None and arm is not None:
         track, q = PoseTrack(joints.t_s, np.asarray(arm.forward(joints.q))), joints.q
     else:
         raise InputError(
-            f"{path}: a recording needs --frames BASE:FLANGE, frames of its transforms such as base_link:tool0, or --model,"
-            " the arm whose joint states it holds"
+            f"{path}: a recording needs --columns frames=BASE:FLANGE, frames of its transforms such as base_link:tool0, "
+            "or --model, the arm whose joint states it holds"
         )
     there = np.asarray(np.isfinite(np.zeros((len(track.t_s), 0)) if q is None else q).all(axis=1))
     n = int(there.sum())

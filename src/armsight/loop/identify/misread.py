@@ -281,7 +281,7 @@ def _readings(recording: PairedPoses, arm: Arm | None, streams: bool) -> Iterato
     )
     hands = {one.kind: one for one in misreadings(recording.robot, recording.rows, p.A, "")}
     seen = recording.seen.table
-    eyes = {} if seen is None else {one.kind: one for one in misreadings(seen, recording.matched, p.B, "seen-")}
+    eyes = {} if seen is None else {one.kind: one for one in misreadings(seen, recording.matched, p.B, "seen:")}
     yield from (_Reading(replace(p, A=one.Ts), one.said, one.path) for one in hands.values())
     yield from (_Reading(replace(p, B=one.Ts), one.said, one.path) for one in eyes.values())
     for kind in hands.keys() & eyes.keys():  # what one program wrote wrongly it may have written wrongly in both tables
@@ -345,9 +345,9 @@ def _scaled(recording: PairedPoses) -> Iterator[_Reading]:
     """Yield readings of the robot's and of the target's lengths in other units."""
     p, robot, seen = recording.poses, recording.robot, recording.seen.table
     sides: list[tuple[str, str, float, str, Path | None]] = []
-    sides += [("A", "robot", robot.unit_m, "--units", robot.path)] if not robot.of_joints else []
+    sides += [("A", "robot", robot.unit_m, "units", robot.path)] if not robot.of_joints else []
     sides += [("B", "target", 1.0, "--target's size", None)] if seen is None else []
-    sides += [("B", "target", seen.unit_m, "--seen-units", seen.path)] if seen is not None else []
+    sides += [("B", "target", seen.unit_m, "seen:units", seen.path)] if seen is not None else []
     for side, whose, unit_m, option, path in sides:
         T = np.array(getattr(p, side))
         lengths = np.linalg.norm(T[:, :3, 3], axis=1)
@@ -358,7 +358,9 @@ def _scaled(recording: PairedPoses) -> Iterator[_Reading]:
         given = next(name for name, length in UNITS.items() if length == unit_m)
         for name, length in UNITS.items():
             by = length / unit_m
-            said = f"the {whose}'s lengths are {name} taken for {given}: correct {option}, or give --detect-units"
+            said = (
+                f"the {whose}'s lengths are {name} taken for {given}: correct {option}, or say --columns units=detect"
+            )
             if name != given and side == "A":
                 yield _Reading(replace(p, A=_longer(p.A, by)), said, path, by, of_units=True)
             elif name != given:
@@ -798,7 +800,7 @@ def _check_rotations(arm: Arm, measured: Measured, rows: Rows) -> None:
             raise InputError(
                 f"the rotations fit this arm if rx_deg, ry_deg, rz_deg are meant as {' or '.join(same)}, not as "
                 f"{measured.rotation} (off by {np.degrees(off):.2f} deg as they are, {np.degrees(offs[best]):.2f} deg so): "
-                f"give --rotation {same[0]}"
+                f"say --columns rotation={same[0]}"
             )
     near = CLEAR * max(points_off(arm, q, p).right, ALIKE_M)
     signs = itertools.product((1, -1), repeat=arm.joints)

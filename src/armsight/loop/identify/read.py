@@ -246,7 +246,7 @@ def _rotation_columns(table: Columns, convention: str | None) -> tuple[list[str]
             table.require("rx_deg", "ry_deg", "rz_deg")
         return [], ()
     if convention is None:
-        return [], (f"rx{unit}, ry{unit}, rz{unit} are not used: give their convention with --rotation",)
+        return [], (f"rx{unit}, ry{unit}, rz{unit} are not used: say their convention, --columns rotation=xyz ..",)
     return [f"r{axis}{unit}" for axis in "xyz"], ()
 
 

@@ -128,7 +128,7 @@ class Tree:
         """Return the link that is the tool where none is named: the end of the one arm of the tree.
 
         Raises:
-            InputError: there is no arm, or several, or several links end it; the message names links for --tool-link.
+            InputError: there is no arm, or several, or several links end it; the message names them.
         """
         arms = self._arms()
         ends = [tip for arm in arms for tip in self._tips(arm)]
@@ -137,29 +137,29 @@ class Tree:
             raise InputError(f"{self._path}: {self._why_none()}")
         if len(arms) > 1:
             raise InputError(
-                f"{self._path}: holds {len(arms)} arms: give the link that is the tool, --tool-link {links}"
+                f"{self._path}: holds {len(arms)} arms: give the link that is the tool, {self._path}#{links}"
             )
         last = next(joint for joint in reversed(self._chains[arms[0]]) if joint.rotary)
         if last.grips:
             before = ", or ".join(self._tips(last.parent))
             raise InputError(
                 f"{self._path}: joint {last.name!r} is a gripper's by its name, not the arm's: give the link that is the "
-                f"tool, --tool-link {before}, or {links} if it is the arm's"
+                f"tool, {self._path}#{before}, or {links} if it is the arm's"
             )
         if within := self._interrupting(arms[0]):
             raise InputError(
                 f"{self._path}: only arms of {_COUNT} rotary joints are read here; {_named(within)}: give the link that is "
-                f"the tool, --tool-link {links}"
+                f"the tool, {self._path}#{links}"
             )
         if len(ends) == 1:
             return ends[0]
         flanges = [link for link in self._rigid(arms[0]) if link.endswith(_FLANGE)]
         if len(flanges) != 1:
             raise InputError(
-                f"{self._path}: several links end the chain: give the one that is the tool, --tool-link {links}"
+                f"{self._path}: several links end the chain: give the one that is the tool, {self._path}#{links}"
             )
         others = ", ".join(link for link in ends if link not in flanges)
-        _LOG.warning("%s: the tool is %s; --tool-link names another: %s", self._path, flanges[0], others)
+        _LOG.warning("%s: the tool is %s; %s#LINK names another: %s", self._path, flanges[0], self._path, others)
         return flanges[0]
 
     def _why_none(self) -> str:
@@ -168,7 +168,7 @@ class Tree:
         if there := ", or ".join(self._tools()):
             return (
                 f"the {len(rotary)} rotary joints do not follow one another; only serial arms are read here: give the link "
-                f"that is the tool, --tool-link {there}"
+                f"that is the tool, {self._path}#{there}"
             )
         if others := [joint for joint in self._joints if joint.other]:
             return f"only arms of {_COUNT} rotary joints are read here; {_named(others[:_SHOWN])}"

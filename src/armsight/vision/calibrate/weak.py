@@ -222,8 +222,8 @@ def require_order(calibration: Calibration) -> None:
     x, y, _ = calibration.rig.T_left_right[:3, 3]
     if x < 0 and abs(x) > abs(y):
         raise CalibrationError(
-            "left and right are exchanged: the camera given as right stands to the left of the other; exchange --left and "
-            "--right (of a recording or a video: its two sides). If they are right, all images are upside down (mount or "
+            "left and right are exchanged: the camera given as right stands to the left of the other; exchange the two "
+            "globs (of a recording or a video: its two sides). If they are right, all images are upside down (mount or "
             "rotate both cameras alike), or mirrored by the driver, which gives a mirrored world: switch it off"
         )
 

@@ -123,7 +123,7 @@ def open_target(spec: str | Path) -> Target:
     if kind == ".csv":
         raise InputError(
             f"{spec}: a CSV body has points but no description of its markers, so it cannot be found in images; give "
-            "--detections with it, or describe its markers in a TOML body file (docs/howto/targets.md)"
+            "--source detections:D.csv with it, or describe its markers in a TOML body file (docs/howto/targets.md)"
         )
     if kind == "board":
         return open_board(spec)

@@ -49,6 +49,7 @@ def _later(module: str, name: str) -> Callable[[str], Source]:
 #: Kind -> what opens the rest of the text; another kind of source is one line here.
 SOURCES: dict[str, Callable[[str], Source]] = {
     "folder": FolderSource.open,
+    "pairs": PairsSource.of,
     "video": _later("video", "open_video"),
     "url": _later("url", "open_url"),
     "usb": _later("usb", "open_usb"),
@@ -85,9 +86,10 @@ def open_source(spec: str | Path) -> Source:
     """Open a source.
 
     Args:
-        spec: ``folder:DIR`` or the path of a folder, ``video:LEFT,RIGHT`` or ``video:SIDE_BY_SIDE``, ``bag:FILE``,
-            ``lerobot:DIR``, ``url:URL_LEFT,URL_RIGHT``, ``usb:LEFT,RIGHT[@WIDTHxHEIGHT][@FPS][,exposure=5ms]``. Without
-            cameras: ``armsight.sim.example_rig.demo_recording`` writes a small recording with its rig and target.
+        spec: ``folder:DIR`` or the path of a folder, ``pairs:LEFT_GLOB,RIGHT_GLOB``, ``video:LEFT,RIGHT`` or
+            ``video:SIDE_BY_SIDE``, ``bag:FILE``, ``lerobot:DIR``, ``url:URL_LEFT,URL_RIGHT``,
+            ``usb:LEFT,RIGHT[@WIDTHxHEIGHT][@FPS][,exposure=5ms]``. Without cameras:
+            ``armsight.sim.example_rig.demo_recording`` writes a small recording with its rig and target.
 
     Raises:
         InputError: an unknown kind, or what is named is not there or not usable.

@@ -23,6 +23,8 @@ from armsight.errors import InputError
 from armsight.vision.image import read_image
 from armsight.vision.source import Source
 
+#: Endings of video files, in lower case.
+VIDEOS = {".avi", ".mkv", ".mov", ".mp4", ".webm"}
 #: Endings of image files, in lower case.
 IMAGES = {".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp"}
 
@@ -126,7 +128,24 @@ class PairsSource(StoredSource):
         Raises:
             InputError: no files, or files that do not pair up.
         """
-        return PairsSource(match(image_files(left_glob), image_files(right_glob), left_glob, right_glob))
+        pairs = match(image_files(left_glob), image_files(right_glob), left_glob, right_glob)
+        video = next((file for pair in pairs if (file := pair.left) and file.suffix.lower() in VIDEOS), None)
+        if video is not None:
+            raise InputError(f"{video}: is a video: give both as --source video:LEFT,RIGHT")
+        return PairsSource(pairs)
+
+    @staticmethod
+    def of(text: str) -> PairsSource:
+        """Open LEFT,RIGHT; a glob may have commas of its own, as many on either side.
+
+        Raises:
+            InputError: not two globs, no files, or files that do not pair up.
+        """
+        parts = text.split(",")
+        left, right = (",".join(half) for half in (parts[: len(parts) // 2], parts[len(parts) // 2 :]))
+        if len(parts) % 2 or not left or not right:
+            raise InputError(f"pairs:{text}: two globs are needed: --source 'pairs:DIR/left*.png,DIR/right*.png'")
+        return PairsSource.open(left, right)
 
 
 def natural_key(path: Path) -> tuple[tuple[int, str] | tuple[int, int], ...]:

@@ -1,0 +1,57 @@
+"""Options that are retired: what they did is what today's do."""
+
+from dataclasses import replace
+
+import pytest
+
+from armsight.app.main import group
+from armsight.app.retired import RETIRED, in_todays_options
+from cli_runs import assert_rejected
+
+
+@pytest.mark.parametrize(
+    ("before", "now"),
+    [
+        ("measure r.json --left a --target t --right=b", "measure r.json --target t --source pairs:a,b"),
+        ("calibrate --right b --left a,c -o r", "calibrate -o r --source pairs:a,c,b"),
+        ("calibrate --left-intrinsics a --target t", "calibrate --target t --alone a,"),
+        ("measure r --detections bag:f", "measure r --source detections:bag:f"),
+        (
+            "calibrate --detections d --cameras c --body b.csv",
+            "calibrate --cameras c --source detections:d --target b.csv",
+        ),
+        ("arm fk a.urdf --tool-link hand 0 0", "arm fk a.urdf#hand 0 0"),
+        ("arm show six_r --tool-link=hand", "arm show six_r#hand"),
+        ("identify plan --tool-link t --arm a.toml", "identify plan --arm a.toml#t"),
+        ("board monitor --baud 9600 --board serial:p", "board monitor --board serial:p,baud=9600"),
+        ("board monitor --baud 9600", "board monitor --board emulated:unicorn,baud=9600"),
+        ("run --calibration c.json --board feetech:p", "run --board feetech:p,c.json"),
+        ("run --cell a@h:1 --stream igtl:1", "run --stream igtl:1 --stream cell:a@h:1"),
+        ("hub push a b --cell a", "hub push a b --cell a"),
+        ("handeye --units mm --seen-units m", "handeye --columns units=mm --columns seen:units=m"),
+        ("handeye --detect-units --eye to-hand", "handeye --eye to-hand --columns units=detect"),
+        ("identify --rotation zyx --columns x_m=X", "identify --columns x_m=X --columns rotation=zyx"),
+        ("demo --left a", "demo --left a"),
+        ("", ""),
+    ],
+)
+def test_a_command_line_of_before_is_one_of_today(before, now):
+    arguments, notes = in_todays_options(before.split())
+    assert arguments == now.split()
+    assert bool(notes) == (before != now)
+
+
+def test_each_is_said_in_a_line_and_none_is_an_option_any_more(armsight):
+    said = armsight("measure", "none.json", "--target", "chessboard:9x6:25mm", "--left", "a", "--right", "b")
+    first, second, error = said.err.splitlines()
+    assert first == "note: --left is retired: write --source pairs:LEFT,RIGHT"
+    assert second.startswith("note: --right is retired")
+    assert "none.json" in error
+    for each in RETIRED:
+        for name in each.commands:
+            assert each.option not in [o for p in group.get_command(None, name).params for o in p.opts]
+
+
+def test_half_a_pair_is_rejected(armsight):
+    said = armsight("calibrate", "--left", "a", "--target", "chessboard:9x6:25mm", "-o", "r.json")
+    assert_rejected(replace(said, err=said.err.splitlines()[-1] + "\n"), "two globs are needed")
