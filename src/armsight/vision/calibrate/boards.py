@@ -27,17 +27,14 @@ from numpy.typing import NDArray
 
 from armsight.data import Array, Body, Detections, Ids, Missed, Record
 from armsight.errors import CalibrationError
-from armsight.geometry.pose import inverse, transform
-from armsight.geometry.rigid import fit_rigid
+from armsight.geometry.pose import inverse
 from armsight.vision.calibrate import FOLDS, MODELS
+from armsight.vision.calibrate.adjust import ROUGHLY, STEPS, adjusted, concluded, freed
 from armsight.vision.calibrate.heldout import (
     cross_validate,
     require_choice,
-    residual_epipolar_rms,
     rig_of,
-    scaled,
     summary,
-    unfinished,
 )
 from armsight.vision.calibrate.motion import ExposureMotion
 from armsight.vision.calibrate.result import Calibration, HeldOutErrors, PairErrors, RejectedPair
@@ -58,27 +55,22 @@ from armsight.vision.markers.marker import CalibrationBoard
 from armsight.vision.match import join, renamed
 from armsight.vision.pose.bundle import NEAR, BundleModel, BundleSolution, BundleState, Observations, minimise, promised
 from armsight.vision.pose.pnp import body_poses
-from armsight.vision.pose.projection import of_middles, smooth
+from armsight.vision.pose.projection import smooth
 from armsight.vision.pose.shutter import TimedShot, aligned, at_one_time, estimate_shutters
 from armsight.vision.rig import Shutters, StereoRig
 
 #: A later model must lower the held-out error by this share to be preferred; a fisheye, which other programs do not
 #: use for an ordinary lens, by more.
 WORTH = {"brown4": 0.0, "brown5": 0.01, "brown8": 0.03, "fisheye": 0.05}
-#: Convergence and steps of adjustments that only estimate noise or a held-out error: the long valleys of the rational
-#: model are not followed to their ends.
-_ROUGHLY, _STEPS = 1e-6, 25
 #: Motion between the exposures must lower the corners' noise by this share to be accepted: a fifth less is a sigma that
 #: was 1.25 times too large. Synchronised cameras lower it by a hundredth, by chance; what a lens model lacks, by a
 #: tenth.
 MOTION_WORTH = 0.2
 #: Degree of the polynomials in which a printed board may differ from its drawing.
 BOARD_DEGREE = 4
-#: Prior standard deviation of a board from its drawing at first, RMS of one mode, as a share of its diagonal, and the
-#: least, m.
-BOARD_SIGMA_SHARE, BOARD_SIGMA_LEAST_M = 1e-3, 1e-7
-#: Rounds in which noise and tolerances settle; motion, which competes with them, takes longer.
-_NOISE_ROUNDS, _MOTION_ROUNDS = 4, 8
+#: Prior standard deviation of a board from its drawing at first, RMS of one mode, as a share of its diagonal.
+BOARD_SIGMA_SHARE = 1e-3
+_START_PX = 0.1  # sigma of a detection before its residuals show it; half, double: a round more
 #: A start that leaves more than this, px RMS, is no minimum to draw conclusions from: names of a symmetric board may
 #: contradict each other, the lens may be another.
 _MISNAMED_PX = 2.0
@@ -149,11 +141,11 @@ def motion_of(model: BundleModel, screened: Screened, count: int) -> tuple[Expos
     """
     guess = ExposureMotion.guessed(model.points, len(screened.kept))
     still, observations = screened.solution, screened.observations
-    before = noise_px(still, observations, _freed(model, still))
+    before = noise_px(still, observations, freed(model, still))
     moving = replace(model, motion_sigmas=guess.sigmas)
     solution = minimise(moving, still.state, observations, before)
     motion, taken = guess.updated(solution)
-    if noise_px(solution, observations, _freed(model, solution) + taken) > (1 - MOTION_WORTH) * before:
+    if noise_px(solution, observations, freed(model, solution) + taken) > (1 - MOTION_WORTH) * before:
         return None
     furthest = int(np.argmin(motion.weights))
     way = solution.state.motions[furthest]
@@ -162,13 +154,6 @@ def motion_of(model: BundleModel, screened: Screened, count: int) -> tuple[Expos
         "degrees apart, as in no other pair: wrong corners, or a board that moved between the two images"
     )
     return replace(motion, weights=np.ones(count)), {int(screened.kept[furthest]): why}
-
-
-def _freed(model: BundleModel, solution: BundleSolution) -> float:
-    """Count the shared parameters that the detections determined; a shape that its prior holds counts in part."""
-    variance, modes = np.diag(solution.cov_shared), len(model.modes)
-    freed = float((variance > 0).sum() - modes)
-    return freed + float(modes - variance[len(variance) - modes :].sum() / model.shape_sigma_m**2)
 
 
 def _padded(cameras: tuple[Camera, Camera], distortion: str) -> tuple[Camera, Camera]:
@@ -293,7 +278,9 @@ class LensModelSearch(Record):
     def trial(self, distortion: str) -> Trial | None:
         """Adjust and cross-validate one distortion model; None where its adjustment fails."""
         try:
-            model, motion, solution = self._adjusted(self._converted(distortion))
+            model, motion, solution = adjusted(
+                self.model, self._converted(distortion), self.screened.observations, _START_PX, self.motion
+            )
             errors = cross_validate(
                 lambda rows: self._fold(model, motion, solution, rows),
                 model.points,
@@ -319,27 +306,6 @@ class LensModelSearch(Record):
             return replace(start_board(self.model.points, self.sizes, seen, distortion).state, shape=state.shape)
         return replace(state, cameras=_padded(state.cameras, distortion))
 
-    def _adjusted(self, state: BundleState) -> tuple[BundleModel, ExposureMotion | None, BundleSolution]:
-        """Adjust with the noise of the residuals and the estimated tolerances of the board and of its motion."""
-        model, motion, sigma, modes = self.model, self.motion, 0.1, len(self.model.modes)
-        observations = self.screened.observations
-        roughly: dict[str, Any] = {"max_steps": _STEPS, "least_decrease": _ROUGHLY}
-        for _ in range(_NOISE_ROUNDS if motion is None else _MOTION_ROUNDS):
-            if motion is not None:
-                model = replace(model, motion_sigmas=motion.sigmas)
-            solution = minimise(model, state, observations, sigma, **roughly)
-            roughly["damping"] = NEAR
-            state, freed = solution.state, _freed(model, solution)
-            if modes:
-                posterior = np.diag(solution.cov_shared)[-modes:]
-                tolerance = float(np.sqrt(np.mean(state.shape**2 + posterior)))
-                model = replace(model, shape_sigma_m=max(tolerance, BOARD_SIGMA_LEAST_M))
-            if motion is not None:
-                motion, taken = motion.updated(solution)
-                freed += taken
-            sigma = noise_px(solution, observations, freed)
-        return model, motion, minimise(model, state, observations, sigma, damping=NEAR)
-
     def _fold(
         self, model: BundleModel, motion: ExposureMotion | None, full: BundleSolution, rows: NDArray[np.intp]
     ) -> tuple[StereoRig, Array, ExposureMotion | None]:
@@ -349,7 +315,7 @@ class LensModelSearch(Record):
             motion = motion.shots(rows)
             model, state = replace(model, motion_sigmas=motion.sigmas), replace(state, motions=state.motions[rows])
         seen = self.screened.observations.shots(rows)
-        solution = minimise(model, state, seen, full.sigma_px, max_steps=_STEPS, least_decrease=_ROUGHLY, damping=NEAR)
+        solution = minimise(model, state, seen, full.sigma_px, max_steps=STEPS, least_decrease=ROUGHLY, damping=NEAR)
         if motion is not None:
             motion = motion.updated(solution)[0]
         return rig_of(solution), model.body(solution.state.shape), motion
@@ -438,30 +404,23 @@ def calibrate_boards(
                 tried = {**tried, lens: trial.heldout}
     rejected += screened.rejected
     names = tuple(usable[j].name for j in screened.kept if j < pair_count)
-    rig = scaled(rig_of(trial.solution), trial.heldout)
-    state = trial.solution.state
-    _apart(rig, state)
-    found = trial.model.body(state.shape)[: len(points)]
-    found = transform(fit_rigid(found, points), found)
-    calibration = Calibration(
-        rig,
-        replace(board.body, points=found),
-        float(np.sqrt(((found - points) ** 2).sum(axis=1).mean())),
-        names,
-        len(pairs),
-        screened.observations,
+    calibration = concluded(
+        board.body,
+        trial.model,
         trial.solution,
-        residual_epipolar_rms(rig, of_middles(trial.model, state, screened.observations)),
-        trial.heldout,
-        trial.errors,
-        tried,
-        tuple(rejected),
-        (*notes, *screened.notes, *unfinished(trial.solution), *unseen_row(board, _shown(pairs))),
-        (),
-        None if trial.motion is None else trial.motion.scaled(trial.heldout.normalised_rms),
-        radius_m,
+        screened.observations,
+        errors=trial.errors,
+        heldout=trial.heldout,
+        models=tried,
+        pairs=names,
+        pairs_found=len(pairs),
+        rejected=tuple(rejected),
+        notes=(*notes, *screened.notes, *unseen_row(board, _shown(pairs))),
+        motion=None if trial.motion is None else trial.motion.scaled(trial.heldout.normalised_rms),
+        disc_radius_m=radius_m,
     )
-    return replace(calibration, weaknesses=weaknesses(calibration))
+    _apart(calibration.rig, trial.solution.state)
+    return calibration
 
 
 def _apart(rig: StereoRig, state: BundleState) -> None:
@@ -503,7 +462,7 @@ def _disc_radius(
             radii.append(apparent_radii(camera, T, points[found.ids], found.shape, about_m))
         about_m = float(np.nanmedian(np.concatenate(radii)))
         model = replace(rigid_board(points), disc_radius_m=about_m)
-        first = minimise(model, first.state, observations, 1.0, max_steps=_STEPS, least_decrease=_ROUGHLY)
+        first = minimise(model, first.state, observations, 1.0, max_steps=STEPS, least_decrease=ROUGHLY)
     given_m = board.disc_radius_m
     if given_m is not None and not 1 / _RADIUS_RATIO < given_m / about_m < _RADIUS_RATIO:
         raise CalibrationError(
@@ -823,7 +782,7 @@ class _Recording(Record):
         radius_m = self.first.disc_radius_m or 0.0
         model = replace(rigid_board(self.body.points), disc_radius_m=radius_m, free_cameras=free_cameras)
         state = BundleState(rig.cameras, rig.T_left_right, np.array([T for _, T in chosen]), np.zeros(0))
-        state = minimise(model, state, observations, rig.sigma_px, max_steps=_STEPS, least_decrease=_ROUGHLY).state
+        state = minimise(model, state, observations, rig.sigma_px, max_steps=STEPS, least_decrease=ROUGHLY).state
         return replace(rig, left=state.cameras[0], right=state.cameras[1], T_left_right=state.T_left_right)
 
     def moved(self, rig: StereoRig, shots: dict[int, TimedShot], later: int, shutters: Shutters) -> list[Pair]:

@@ -1,9 +1,9 @@
 """A known body moving in view of two cameras of known intrinsics: their relative pose, and a refined body.
 
 Per shot, every pose that one camera alone allows, mirror solutions included; the relative pose that most shots agree
-on; then the joint adjustment of relative pose, poses and (on request) the body's shape under a prior. The prior's sigma
-is given and is evaluated on left-out shots: a looser body must lower the error of shots it was not fitted to. Rigid
-motion and size of the body are held: they are not observable, for poses and baseline have the same effect.
+on; then the joint adjustment of relative pose, poses and (on request) the body's shape, within a tolerance that the shots
+show themselves. Rigid motion and size of the body are held: they are not observable, for poses and baseline have the
+same effect.
 """
 
 from __future__ import annotations
@@ -16,35 +16,27 @@ from numpy.typing import NDArray
 
 from armsight.data import Array, Body, Correspondences
 from armsight.errors import CalibrationError
-from armsight.geometry.pose import inverse, log_se3, transform
-from armsight.geometry.rigid import fit_rigid
+from armsight.geometry.pose import inverse, log_se3
 from armsight.vision.calibrate import FOLDS
+from armsight.vision.calibrate.adjust import adjusted, concluded
 from armsight.vision.calibrate.heldout import (
     cross_validate,
-    folds_of,
     require_choice,
-    residual_epipolar_rms,
     rig_of,
-    scaled,
     summary,
-    unfinished,
 )
 from armsight.vision.calibrate.result import Calibration, RejectedPair
-from armsight.vision.calibrate.screen import noise_px
 from armsight.vision.calibrate.start import relative_poses
-from armsight.vision.calibrate.weak import weaknesses
 from armsight.vision.camera import Camera
 from armsight.vision.detections import SeenShot
 from armsight.vision.pose.assign import candidates, instances, plain
-from armsight.vision.pose.bundle import BundleModel, BundleSolution, BundleState, Observations, minimise
+from armsight.vision.pose.bundle import BundleModel, BundleState, Observations, minimise
 from armsight.vision.pose.pnp import Candidate
 from armsight.vision.pose.projection import every_point
 from armsight.vision.rig import StereoRig
 
-#: Tolerances that are tried: prior sigma of each coordinate of the body's points, m; the first is the exact drawing.
-TOLERANCES_M = (0.0, 1e-4, 2e-4, 4e-4, 1e-3, 2e-3)
-#: A looser body must lower the held-out error by this share.
-WORTH = 0.005
+#: Standard deviation of each coordinate of a body's points from its drawing, m, before the shots show it; half, double: the
+#: same.
 _START_TOLERANCE_M = 4e-4
 LEAST_SHOTS = 5
 _START_SIGMA_PX = 2.0
@@ -90,28 +82,40 @@ def calibrate_bodies(
             raise CalibrationError(f"{len(seen)} of {len(shots)} shots are usable, {LEAST_SHOTS} are needed: {why}")
         observations, model = Observations.from_shots(seen), _model(body.points, tolerance)
         state = BundleState(cameras, T_left_right, np.stack(poses), np.zeros(len(model.modes)))
-        state = _adjusted(model, state, observations).state
+        state = adjusted(model, state, observations, _START_SIGMA_PX)[2].state
         T_left_right, points = state.T_left_right, model.body(state.shape)
     names, seen, poses, rejected = _assigned(points, cameras, T_left_right, shots, found)
     observations = Observations.from_shots(seen)
-    state = BundleState(cameras, T_left_right, np.stack(poses), np.zeros(0))
-    trials = {}
-    for tolerance in TOLERANCES_M if refine_body else TOLERANCES_M[:1]:
-        progress(f"evaluating a body within {tolerance * 1e3:g} mm of its drawing on held-out shots")
-        model = _model(body.points, tolerance)
-        start = replace(state, shape=np.zeros(len(model.modes)))
-        solution = _adjusted(model, start, observations)
-        score = _heldout_cost(model, solution, observations, min(folds, len(seen)))
-        trials[tolerance] = (model, solution, score)
-    chosen = min(trials, key=lambda tolerance: trials[tolerance][2])
-    if trials[chosen][2] > trials[0.0][2] * (1 - WORTH):
-        chosen = 0.0
-    model, solution, _ = trials[chosen]
+    model = _model(body.points, _START_TOLERANCE_M if refine_body else 0.0)
+    state = BundleState(cameras, T_left_right, np.stack(poses), np.zeros(len(model.modes)))
+    model, _, solution = adjusted(model, state, observations, _START_SIGMA_PX)
+    progress("evaluating the rig on held-out shots")
+
+    def fit(rows: NDArray[np.intp]) -> tuple[StereoRig, Array, None]:
+        state = replace(solution.state, Ts_left_body=solution.state.Ts_left_body[rows])
+        part = minimise(model, state, observations.shots(rows), solution.sigma_px)
+        return rig_of(part), model.body(part.state.shape), None
+
+    parts = min(folds, len(seen))
+    errors = cross_validate(fit, body.points, observations, parts)
+    heldout = summary(errors, parts)
     notes: tuple[str, ...] = ()
     if refine_body:
-        held = f"with a prior sigma of {chosen * 1e3:g} mm per coordinate" if chosen else "exactly"
-        notes = (f"the body is held to its drawing {held}, chosen by left-out shots",)
-    return _result(body, model, solution, observations, names, len(shots), rejected, min(folds, len(seen)), notes)
+        tolerance_m = model.shape_sigma_m * np.sqrt(len(model.modes) / (3 * len(body.points)))
+        notes = (f"the body differs from its drawing by {1e3 * tolerance_m:.2g} mm per coordinate, as the shots show",)
+    return concluded(
+        body,
+        model,
+        solution,
+        observations,
+        errors=errors,
+        heldout=heldout,
+        models={cameras[0].model: heldout},
+        pairs=tuple(names),
+        pairs_found=len(shots),
+        rejected=tuple(rejected),
+        notes=notes,
+    )
 
 
 def _start(points: Array, cameras: tuple[Camera, Camera], shots: Sequence[SeenShot], found: list[Found]) -> Array:
@@ -187,75 +191,3 @@ def _model(points: Array, tolerance_m: float) -> BundleModel:
     # A mode moves the points by one RMS: K modes of sigma s together give each coordinate a sigma of s sqrt(K / 3).
     modes = every_point(points)
     return BundleModel(points, modes, tolerance_m / np.sqrt(len(modes) / 3), False)
-
-
-def _adjusted(model: BundleModel, state: BundleState, observations: Observations) -> BundleSolution:
-    """Adjust with the noise that the residuals show."""
-    sigma = _START_SIGMA_PX
-    for _ in range(3):
-        solution = minimise(model, state, observations, sigma)
-        freed = 6.0
-        if len(model.modes):
-            posterior = np.diag(solution.cov_shared)[-len(model.modes) :]
-            freed += float(len(model.modes) - posterior.sum() / model.shape_sigma_m**2)
-        state, sigma = solution.state, noise_px(solution, observations, freed)
-    return minimise(model, state, observations, sigma)
-
-
-def _heldout_cost(model: BundleModel, full: BundleSolution, observations: Observations, folds: int) -> float:
-    """Mean squared pixel distance, px^2, of left-out shots from the body and rig that the others give."""
-    total, count = 0.0, 0
-    everyone = np.arange(observations.shot_count)
-    for held in folds_of(observations.shot_count, folds):
-        rest = np.setdiff1d(everyone, held)
-        state = replace(full.state, Ts_left_body=full.state.Ts_left_body[rest])
-        fitted = minimise(model, state, observations.shots(rest), full.sigma_px).state
-        fixed = BundleModel(model.body(fitted.shape), np.zeros((0, len(model.points), 3)), 1.0, False)
-        start = replace(fitted, Ts_left_body=full.state.Ts_left_body[held], shape=np.zeros(0))
-        nothing = np.zeros(sum(camera.parameters.size for camera in fitted.cameras) + 6, bool)
-        solution = minimise(fixed, start, observations.shots(held), full.sigma_px, free=nothing)
-        total += float((solution.residuals_px**2).sum())
-        count += len(solution.residuals_px)
-    return total / count
-
-
-def _result(
-    body: Body,
-    model: BundleModel,
-    solution: BundleSolution,
-    observations: Observations,
-    names: list[str],
-    given: int,
-    rejected: list[RejectedPair],
-    folds: int,
-    notes: tuple[str, ...],
-) -> Calibration:
-    """Cross-validate the choice and put everything together."""
-
-    def fit(rows: NDArray[np.intp]) -> tuple[StereoRig, Array, None]:
-        state = replace(solution.state, Ts_left_body=solution.state.Ts_left_body[rows])
-        part = minimise(model, state, observations.shots(rows), solution.sigma_px)
-        return rig_of(part), model.body(part.state.shape), None
-
-    errors = cross_validate(fit, body.points, observations, folds)
-    heldout = summary(errors, folds)
-    found = model.body(solution.state.shape)
-    found = transform(fit_rigid(found, body.points), found)
-    rig = scaled(rig_of(solution), heldout)
-    calibration = Calibration(
-        rig,
-        replace(body, points=found),
-        float(np.sqrt(((found - body.points) ** 2).sum(axis=1).mean())),
-        tuple(names),
-        given,
-        observations,
-        solution,
-        residual_epipolar_rms(rig, observations),
-        heldout,
-        errors,
-        {rig.left.model: heldout},
-        tuple(rejected),
-        notes + unfinished(solution),
-        (),
-    )
-    return replace(calibration, weaknesses=weaknesses(calibration))
