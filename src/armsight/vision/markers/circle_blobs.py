@@ -12,7 +12,6 @@ from __future__ import annotations
 import threading
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -36,9 +35,8 @@ from armsight.vision.markers.disc.fit import (
 )
 from armsight.vision.markers.disc.fit import workspace as workspace_of_fits
 from armsight.vision.markers.disc.search import Grey, Room, Words64, noise_of, search, workspace
+from armsight.vision.markers.discs import copies, enlarged
 
-#: Copies are made down to this many pixels of the shorter side.
-_LEAST_SIDE_PX = 48
 #: Most candidates examined in one copy.
 _MOST_CANDIDATES = 8192
 #: Directions in which the contrast at a rim is compared, and how many must have this share of the median contrast.
@@ -153,20 +151,10 @@ class Blobs(Record):
 def find_blobs(image: Grey, bright: bool, dark: bool) -> tuple[Blobs, Blobs]:
     """Find outlines of discs of any size in one grey image (H, W): the dark ones, and the bright ones."""
     found: list[tuple[Array, Array, NDArray[np.int64]]] = []
-    level, small = 0, image
-    while True:
-        padded = np.ascontiguousarray(np.pad(small, ((0, 0), (0, -small.shape[1] % 8)), mode="edge"))
-        starts, codes, signs, contrast, room = _room()
-        n = _outlines(padded, padded.view(np.uint64), bright, dark, starts, codes, signs, contrast, room)
-        theta = starts[:n].copy()
-        theta[:, :2] = (theta[:, :2] + 0.5) * 2**level - 0.5
-        theta[:, 2:5] *= 0.25**level
-        theta[:, 5] *= 2**level
-        found.append((theta, contrast[:n].copy(), signs[:n].copy()))
-        if min(small.shape) < 2 * _LEAST_SIDE_PX:
-            break
-        half = (small.shape[1] // 2, small.shape[0] // 2)
-        level, small = level + 1, np.asarray(cv2.resize(small, half, interpolation=cv2.INTER_AREA), np.uint8)
+    starts, codes, signs, contrast, room = _room()
+    for scale, small in copies(image):
+        n = _outlines(small, small.view(np.uint64), bright, dark, starts, codes, signs, contrast, room)
+        found.append((enlarged(starts[:n], scale), contrast[:n].copy(), signs[:n].copy()))
     theta, contrast, signs = (np.concatenate(parts) for parts in zip(*found, strict=True))
     return _without_repeats(theta[signs < 0], contrast[signs < 0]), _without_repeats(
         theta[signs > 0], contrast[signs > 0]
@@ -360,14 +348,11 @@ def like_neighbours(uv: Array, theta: Array) -> Array:
     return out
 
 
-def fit_discs(image: Grey, starts: Array, before: Fits | None = None, which: NDArray[np.bool_] | None = None) -> Fits:
-    """Fit discs in a grey image (H, W) from starts (N, 10); with ``before``, only those ``which`` (N,), the others stay."""
+def fit_discs(image: Grey, starts: Array) -> Fits:
+    """Fit discs in a grey image (H, W) from starts (N, 10)."""
     theta, n = np.array(starts, order="C"), len(starts)
     cov, shape, codes, shared = np.zeros((n, 2, 2)), np.ones((n, 3)), np.zeros(n, np.int64), np.empty(SHARED)
     if not hasattr(_KEPT, "work"):
         _KEPT.work = workspace_of_fits()
     _fit_each(np.ascontiguousarray(image), theta, cov, shape, codes, shared, _KEPT.work)
-    if before is not None and which is not None:
-        for now, then in ((theta, before.theta), (cov, before.cov), (shape, before.shape), (codes, before.codes)):
-            now[~which] = then[~which]
     return Fits(theta, cov, shape, codes, shared[FIELDS:].reshape(2, 3))

@@ -208,12 +208,6 @@ class CircleGrid(Record, CalibrationBoard):
         ids = self._upright(placement.ids[seen], starts[:, :2])
         fits = fit_discs(without_holes(image, starts[hollow]), starts)
         good = fits.kept()
-        if not good.all() and good.sum() >= least:
-            again = ~good
-            starts[again] = like_neighbours(self._predicted(ids, fits.uv, good), fits.theta[good])
-            hollow = again & contrasts(image, starts, sign)[1]
-            fits = fit_discs(without_holes(image, starts[hollow]), starts, fits, again)
-            good = fits.kept()
         good &= ~odd_sized(fits.theta, _ODD_FIT, good)
         if good.sum() < least:
             return f"{len(ids)} of its discs were found, but only {good.sum()} can be measured{fits.why_not()}"
@@ -238,15 +232,6 @@ class CircleGrid(Record, CalibrationBoard):
             (across, _), *_ = np.linalg.lstsq(p - p.mean(axis=0), uv - uv.mean(axis=0), rcond=None)
             rightwards.append(across[0] / np.hypot(*across))
         return orders[int(np.argmax(rightwards))]
-
-    def _predicted(self, ids: Ids, uv: Array, good: NDArray[np.bool_]) -> Array:
-        """Return where the good discs around each of the others put it, (K, 2); where it was where they do not."""
-        known, out = positions(self._layout.cells[ids[good]], uv[good]), uv[~good].copy()
-        for k, (x, y) in enumerate(self._layout.cells[ids[~good]].tolist()):
-            guess = extrapolated((x, y), known)
-            if guess is not None:
-                out[k] = guess[0].real, guess[0].imag
-        return out
 
 
 def unseen_row(target: Target, seen: Sequence[Ids]) -> tuple[str, ...]:

@@ -6,8 +6,9 @@ both cameras and the body's geometry together (:mod:`~armsight.vision.discs.iden
 
 from __future__ import annotations
 
+import itertools
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -115,6 +116,25 @@ def _padded(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.ascontiguousarray(image)
 
 
+def copies(image: NDArray[np.uint8]) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+    """Yield an image and copies of half its size, a quarter, ..: how many times smaller each is, and its padded pixels."""
+    scale = 1
+    yield scale, _padded(image)
+    while min(image.shape) >= 2 * search.REACH:
+        half = (image.shape[1] // 2, image.shape[0] // 2)
+        scale, image = 2 * scale, np.asarray(cv2.resize(image, half, interpolation=cv2.INTER_AREA), np.uint8)
+        yield scale, _padded(image)
+
+
+def enlarged(theta: Array, scale: int) -> Array:
+    """Return outlines (N, 10) of a copy so many times smaller as they are in the image."""
+    theta = theta.copy()
+    theta[:, :2] = (theta[:, :2] + 0.5) * scale - 0.5
+    theta[:, 2:5] /= scale**2
+    theta[:, 5] *= scale
+    return theta
+
+
 def _larger(image: NDArray[np.uint8], bright: bool, dark: bool) -> tuple[Array, NDArray[np.int64]]:
     """Look for discs that are too large for the search, in copies of half the size, a quarter, ...
 
@@ -126,18 +146,10 @@ def _larger(image: NDArray[np.uint8], bright: bool, dark: bool) -> tuple[Array, 
         _KEPT.outlines = np.empty((n, fit.UNKNOWNS)), np.empty(n, np.int64), np.empty(n, np.int64), search.workspace()
     starts, codes, signs, work = _KEPT.outlines
     thetas, kinds = [np.empty((0, fit.UNKNOWNS))], [np.empty(0, np.int64)]
-    scale, small = 1, image
-    while min(small.shape) >= 2 * search.REACH:
-        half = (small.shape[1] // 2, small.shape[0] // 2)
-        scale, small = 2 * scale, np.asarray(cv2.resize(small, half, interpolation=cv2.INTER_AREA), np.uint8)
-        copy = _padded(small)
+    for scale, copy in itertools.islice(copies(image), 1, None):
         n = search.outlines(copy, copy.view(np.uint64), bright, dark, starts, codes, signs, work)
         large = (starts[:n, 2] * starts[:n, 4] - starts[:n, 3] ** 2) ** -0.25 > _LARGE * search.REACH / 2
-        theta = starts[:n][large]
-        theta[:, :2] = (theta[:, :2] + 0.5) * scale - 0.5
-        theta[:, 2:5] /= scale**2
-        theta[:, 5] *= scale
-        thetas.append(theta)
+        thetas.append(enlarged(starts[:n][large], scale))
         kinds.append(signs[:n][large])
     return np.concatenate(thetas), np.concatenate(kinds)
 
