@@ -103,7 +103,7 @@ def test_users_files(files, options, fx, k1, size, T_left_right):
     np.testing.assert_allclose(rig.T_left_right, T_left_right, atol=1e-12)
 
 
-def test_a_fisheye_of_multical_is_told_by_the_shape_of_its_coefficients(tmp_path):
+def test_a_fisheye_of_multical_is_known_by_the_shape_of_its_coefficients(tmp_path):
     """multical 0.4.0 writes the model "standard" for both lenses; cv2.fisheye.calibrate returns a column."""
     document = json.loads(PROGRAMS["multical"][2]["calibration.json"])
     for camera in document["cameras"].values():
