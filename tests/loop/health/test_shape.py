@@ -11,7 +11,7 @@ from armsight.geometry.pose import inverse, log_se3, pose
 from armsight.geometry.rotation import exp_so3
 from armsight.loop.health import HealthMonitor
 from armsight.loop.health.rig import RigWatch
-from armsight.loop.health.shape import ResidualSums, grown
+from armsight.loop.health.shape import ResidualSums, ramped
 from armsight.vision.pose.locate import locate
 from armsight.vision.triangulate import triangulate
 from views import both_pixels
@@ -187,4 +187,4 @@ def test_sums_of_what_grows_are_those_of_its_own_columns():
         tests[-1].take(each, 9.0)
         scaled = each * np.append(np.ones(4), np.full(2, (begin_s - 2.0) / 5.0))
         slow += scaled.T @ scaled
-    np.testing.assert_allclose(grown(tests, 3).M, slow, rtol=1e-12)
+    np.testing.assert_allclose(ramped(tests, 3).M, slow, rtol=1e-12)

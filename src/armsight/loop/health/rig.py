@@ -62,7 +62,7 @@ from armsight.loop.health.passing import (
     noisier,
     velocity,
 )
-from armsight.loop.health.shape import FURTHEST_M, SMOOTH, STEPS, ResidualSums, ShapeWatch, eliminated, grown, total
+from armsight.loop.health.shape import FURTHEST_M, SMOOTH, STEPS, ResidualSums, ShapeWatch, eliminated, ramped, total
 from armsight.vision.camera import pair_arguments
 from armsight.vision.pose.posefit import differentiate
 from armsight.vision.rig import StereoRig
@@ -909,7 +909,7 @@ class RigWatch:
             if k:
                 mixed.add(tests[k - 1], 1.0)
             without = sum(self._gained(every.less(after).less(mixed))) + mixed.freedom
-            shapes = (after, grown(tests[k:], self._size)) if len(tests) - k > STEPS else (after,)
+            shapes = (after, ramped(tests[k:], self._size)) if len(tests) - k > STEPS else (after,)
             lefts = [self._gained(each)[1] + without for each in shapes]
             best = int(np.argmin(lefts))
             return lefts[best], k, best > 0, shapes[best]

@@ -436,7 +436,7 @@ class ShapeWatch:
         before = self._all[usual].less(after)
         if begin:
             before.add(tests[begin - 1], -1.0)
-        return (grown(tests[begin:], self._size) if slow else after).besides(before, self._size)
+        return (ramped(tests[begin:], self._size) if slow else after).besides(before, self._size)
 
     def _doubted(self, *, every: bool) -> tuple[float, Array | None]:
         """Return since when something may have changed, s, and its second moment (7 + C, 7 + C).
@@ -812,7 +812,7 @@ def total(tests: Sequence[ResidualSums]) -> ResidualSums:
     return found
 
 
-def grown(tests: Sequence[ResidualSums], size: int) -> ResidualSums:
+def ramped(tests: Sequence[ResidualSums], size: int) -> ResidualSums:
     """Return the sums of tests in which all but the first parameters grow with time, from zero to what they are now."""
     begin_s, last_s = tests[0].begin_s, tests[-1].begin_s
     found = ResidualSums(len(tests[0].b), begin_s)
