@@ -204,7 +204,7 @@ def _multical_recognises(documents: Sequence[Document]) -> bool:
 
 
 def _multical_entry(entry: Foreign) -> Foreign:
-    """Return a camera's entry, with the lens that the shape of its coefficients tells."""
+    """Return a camera's entry, with the lens that its coefficients have the shape of."""
     fisheye = isinstance(entry, Mapping) and np.shape(np.asarray(entry.get("dist"), object)) == (4, 1)
     return {**entry, "model": "fisheye"} if fisheye else entry
 
