@@ -329,7 +329,7 @@ def batch(count: int = 100) -> None:
         for workers in (1, 2, 4):
             out = here / f"out{workers}"
             began = time.monotonic()
-            run_batch(Batch([str(here / "archive" / "take*")], out, options, workers), lambda line: None)
+            run_batch(Batch([str(here / "archive" / "take*")], out, options, str(workers)), lambda line: None)
             seconds[workers] = time.monotonic() - began
             tables[workers] = [parquet.read_table(out / n) for n in ("recordings.parquet", "shots.parquet")]
             print(

@@ -71,7 +71,7 @@ _ALSO = {
     "--images": ("--source",),
     "--cameras": ("--source",),
     "--folder": ("--source",),
-    "--port": ("--board", "--source"),
+    "--port": ("--board", "--source", "--http"),
 }
 
 

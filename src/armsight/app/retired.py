@@ -42,17 +42,18 @@ def _behind(option: str, form: str, default: str) -> Rule:
     return rule
 
 
-def _side(option: str, form: str, side: int) -> Rule:
-    """Return the rule of the left (0) or the right (1) one of a pair, LEFT,RIGHT behind one option."""
+def _part(option: str, k: int, default: str, *, before: str = "", mark: str = ",") -> Rule:
+    """Return the rule of the first (0) or the second (1) one of two values behind one option, with a mark between."""
 
     def rule(arguments: list[str], value: str) -> None:
-        sides = ["", ""]
+        both = default
         if option in arguments[:-1]:
             at = arguments.index(option)
-            sides = arguments[at + 1].removeprefix(form).rsplit(",", 1)
+            both = arguments[at + 1].removeprefix(before)
             del arguments[at : at + 2]
-        sides[side] = value
-        arguments += [option, form + ",".join(sides)]
+        parts = both.rsplit(mark, 1)
+        parts[k] = value
+        arguments += [option, before + mark.join(parts)]
 
     return rule
 
@@ -77,11 +78,11 @@ RETIRED = (
     Retired(
         "--cell", ("measure", "run", "live", "record", "replay"), "--stream cell:NAME", _into("--stream", "cell:{}")
     ),
-    Retired("--left", _SEEN_BY_TWO, _PAIRS, _side("--source", "pairs:", 0)),
-    Retired("--right", _SEEN_BY_TWO, _PAIRS, _side("--source", "pairs:", 1)),
+    Retired("--left", _SEEN_BY_TWO, _PAIRS, _part("--source", 0, ",", before="pairs:")),
+    Retired("--right", _SEEN_BY_TWO, _PAIRS, _part("--source", 1, ",", before="pairs:")),
     Retired("--images", ("handeye",), "--source GLOB", _into("--source")),
-    Retired("--left-intrinsics", ("calibrate",), "--alone LEFT,RIGHT", _side("--alone", "", 0)),
-    Retired("--right-intrinsics", ("calibrate",), "--alone LEFT,RIGHT", _side("--alone", "", 1)),
+    Retired("--left-intrinsics", ("calibrate",), "--alone LEFT,RIGHT", _part("--alone", 0, ",")),
+    Retired("--right-intrinsics", ("calibrate",), "--alone LEFT,RIGHT", _part("--alone", 1, ",")),
     Retired("--detections", ("calibrate", "measure"), "--source detections:FILE", _into("--source", "detections:{}")),
     Retired("--body", ("calibrate",), "--target BODY.csv", _into("--target")),
     Retired("--units", ("handeye",), "--columns units=mm", _into("--columns", "units={}")),
@@ -90,6 +91,14 @@ RETIRED = (
     Retired("--rotation", ("handeye", "identify"), "--columns rotation=xyz", _into("--columns", "rotation={}")),
     Retired("--seen-rotation", ("handeye",), "--columns seen:rotation=xyz", _into("--columns", "seen:rotation={}")),
     Retired("--frames", ("handeye",), "--columns frames=BASE:FLANGE", _into("--columns", "frames={}")),
+    Retired("--scheduler", ("batch",), "--workers tcp://HOST:PORT", _into("--workers")),
+    Retired("--run", ("budget",), "--rig RUN", _into("--rig")),
+    Retired("--ar4-offsets", ("board",), "--board ar4:FILE.yaml", _into("--board", "ar4:{}")),
+    Retired("--follow-rig", ("demo",), "it for run: in the demo no rig moves", lambda *_: None, is_flag=True),
+    Retired("--host", ("live",), "--http HOST:PORT", _part("--http", 0, "127.0.0.1:8722", mark=":")),
+    Retired("--host", ("hub",), "--hub HOST:PORT", _part("--hub", 0, "127.0.0.1:7447", mark=":")),
+    Retired("--port", ("live",), "--http HOST:PORT", _part("--http", 1, "127.0.0.1:8722", mark=":")),
+    Retired("--port", ("hub",), "--hub HOST:PORT", _part("--hub", 1, "127.0.0.1:7447", mark=":")),
 )
 
 

@@ -62,7 +62,7 @@ def test_one_and_two_workers_give_the_same_tables_and_it_goes_on(archive, render
     options = BatchOptions("measure", str(rendered.rig), str(rendered.plate))
     one, two = clusters
     said = []
-    done = run_batch(Batch([str(archive / "take*")], tmp_path / "one", options, scheduler=one), said.append)
+    done = run_batch(Batch([str(archive / "take*")], tmp_path / "one", options, workers=one), said.append)
     assert (done.recordings, done.ok, done.failed, done.before, done.shots) == (4, 3, 1, 0, 6)
     recordings, shots = tables(tmp_path / "one")
     assert [row["status"] for row in recordings] == ["ok", "ok", "ok", "failed"]
@@ -70,13 +70,13 @@ def test_one_and_two_workers_give_the_same_tables_and_it_goes_on(archive, render
     assert [row["recording"] for row in recordings] == [str(archive / f"take{k}") for k in range(4)]
     assert all(row["status"] == "ok" and row["x_m"] is not None for row in shots)
     assert json.loads((tmp_path / "one" / "batch.json").read_text())["options"]["operation"] == "measure"
-    again = run_batch(Batch([str(archive / "take*")], tmp_path / "two", options, scheduler=two), said.append)
+    again = run_batch(Batch([str(archive / "take*")], tmp_path / "two", options, workers=two), said.append)
     assert again.before == 0
     assert tables(tmp_path / "two") == [recordings, shots]
     # started again, after one part was lost
     next((tmp_path / "two" / "parts").iterdir()).unlink()
     parts = {path.name: path.stat().st_mtime_ns for path in (tmp_path / "two" / "parts").iterdir()}
-    last = run_batch(Batch([str(archive / "take*")], tmp_path / "two", options, scheduler=one), said.append)
+    last = run_batch(Batch([str(archive / "take*")], tmp_path / "two", options, workers=one), said.append)
     assert last.before == 2  # one failed before
     assert tables(tmp_path / "two") == [recordings, shots]
     assert all((tmp_path / "two" / "parts" / name).stat().st_mtime_ns == time for name, time in parts.items())
@@ -192,5 +192,5 @@ def test_mistakes_are_one_line(armsight, tmp_path):
     bad = ("batch", "measure", tmp_path / "*.bag", "-o", tmp_path / "out", "--target", "chessboard:9x6:25mm")
     assert_rejected(armsight(*bad), "no such recording")
     assert_rejected(armsight("batch", "identify", "*.csv", "-o", tmp_path / "out"), "needs the nominal arm: give --arm")
-    assert_rejected(armsight(*bad, "--workers", 2, "--scheduler", "tcp://127.0.0.1:1"), "give one of the two")
+    assert_rejected(armsight(*bad, "--workers", "many"), "a number of processes, or the address")
     assert list(tmp_path.iterdir()) == []

@@ -221,7 +221,7 @@ joint_6: -180.0
 def test_the_ar4_drivers_offsets_are_corrected_in_their_file_and_the_old_file_is_kept(armsight, tmp_path):
     file, keep = tmp_path / "mk3.yaml", tmp_path / "old.yaml"
     file.write_text(AR4)
-    options = ("board", "offsets", "--ar4-offsets", file, "--keep", keep, "--yes")
+    options = ("board", "offsets", "--board", f"ar4:{file}", "--keep", keep, "--yes")
     assert json.loads(armsight(*options[:4], "--json").out)["joints"][0] == {
         "name": "joint_1",
         "old_deg": 170.0,

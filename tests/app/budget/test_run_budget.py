@@ -55,7 +55,7 @@ def run(tmp_path_factory):
 def test_the_cause_that_does_not_fit_is_named(armsight, run, monkeypatch):
     monkeypatch.setattr(result, "CHANGES", {})
     write_text(run / "plan.toml", 'camera = "global-shutter-1mp"\nskew_ms = 2.0\n')
-    said = armsight("budget", run / "plan.toml", "--run", run, "--json")
+    said = armsight("budget", run / "plan.toml", "--rig", run, "--json")
     found = {row["errors"]: row for row in json.loads(said.out)["run"]}
     motion = found["in motion"]
     assert not motion["fits"]
@@ -66,13 +66,13 @@ def test_the_cause_that_does_not_fit_is_named(armsight, run, monkeypatch):
 def test_causes_that_are_not_there_are_named_and_unknown_cameras_are_said(armsight, run, monkeypatch):
     monkeypatch.setattr(result, "CHANGES", {})
     write_text(run / "plan.toml", "skew_ms = 100.0\nstart_ms = 80.0\n")
-    said = armsight("budget", run / "plan.toml", "--run", run, "--json")
+    said = armsight("budget", run / "plan.toml", "--rig", run, "--json")
     motion = next(row for row in json.loads(said.out)["run"] if row["errors"] == "in motion")
     # Neither alone: the other predicts more than ten times what was measured.
     assert {"skew", "start of exposures"} <= motion["factors"].keys()
     assert all(motion["factors"][cause] <= 0.5 for cause in ("skew", "start of exposures"))
     assert "the run's cameras are not known: give --camera" in said.err
-    given = armsight("budget", run / "plan.toml", "--run", run, "--camera", "global-shutter-1mp")
+    given = armsight("budget", run / "plan.toml", "--rig", run, "--camera", "global-shutter-1mp")
     assert "not known" not in given.err
 
 
@@ -90,5 +90,5 @@ def test_blur_is_of_the_speed_of_each_shot(run, monkeypatch):
 
 
 def test_no_run_is_one_line(armsight, tmp_path):
-    assert_rejected(armsight("budget", "--run", tmp_path), "vision.csv")
-    assert_rejected(armsight("budget", "--run", tmp_path, "--best"), "neither --rig nor --best")
+    assert_rejected(armsight("budget", "--rig", tmp_path), "vision.csv")
+    assert_rejected(armsight("budget", "--rig", tmp_path, "--best"), "leave out --best")

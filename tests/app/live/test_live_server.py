@@ -246,7 +246,7 @@ def test_malformed_messages_are_answered_and_many_of_them_end_the_connection(ser
 def test_a_port_in_use_is_one_line(serving):
     _, server = serving()
     other = LiveServer(FakeSession(), port=server.port)
-    with pytest.raises(InputError, match=f"port {server.port} is in use.*--port"):
+    with pytest.raises(InputError, match=f"port {server.port} is in use.*--http"):
         other.start()
 
 

@@ -22,8 +22,11 @@ _REASONS = 3  # why recordings failed, on the terminal; half: a second mistake i
 @click.option("--target", metavar="SPEC|BODY", help="The board or body that is measured.")
 @click.option("--arm", metavar="ARM", help="The arm model.")
 @click.option("--estimator", type=click.Choice(["kalman", "latest"]), default="kalman", show_default=True)
-@click.option("--workers", type=click.IntRange(min=1), help="Processes; by default as many as this machine has cores.")
-@click.option("--scheduler", metavar="tcp://HOST:PORT", help="A Dask cluster that exists, instead.")
+@click.option(
+    "--workers",
+    metavar="N|tcp://HOST:PORT",
+    help="Processes, by default as many as this machine has cores; or a Dask cluster that exists.",
+)
 @click.option("--json", "as_json", is_flag=True, help="Print the result as one JSON object.")
 def command(
     operation: str,
@@ -33,8 +36,7 @@ def command(
     target: str | None,
     arm: str | None,
     estimator: str,
-    workers: int | None,
-    scheduler: str | None,
+    workers: str | None,
     as_json: bool,
 ) -> None:
     """Measure many recordings, on all cores or on a cluster; started again it goes on where it was.
@@ -55,12 +57,12 @@ def command(
         return
     if output is None:
         raise InputError("the results need a folder: give -o DIR")
-    if workers is not None and scheduler is not None:
-        raise InputError("--workers and --scheduler: a cluster has its own workers; give one of the two")
+    if workers is not None and "://" not in workers and not (workers.isdecimal() and int(workers) > 0):
+        raise InputError(f"--workers {workers}: expected a number of processes, or the address of a Dask cluster")
     if operation == "identify" and arm is None:
         raise InputError("batch identify needs the nominal arm: give --arm, a name, .toml or .urdf")
     options = BatchOptions(operation, _absolute(rig), _absolute(target), _absolute(arm), estimator)
-    batch = Batch(recordings, output.expanduser(), options, workers, scheduler)
+    batch = Batch(recordings, output.expanduser(), options, workers)
     done = run_batch(batch, lambda line: click.echo(line, err=True))
     if as_json:
         click.echo(json.dumps(done.to_json()))

@@ -44,15 +44,13 @@ class Batch:
         recordings: paths with wildcards.
         output: folder of the results.
         options: what is done with each.
-        workers: processes; None is one a core.
-        scheduler: address of a cluster; None is this machine.
+        workers: how many processes, or the address of a cluster; None is one process a core.
     """
 
     recordings: Sequence[str]
     output: Path
     options: BatchOptions
-    workers: int | None = None
-    scheduler: str | None = None
+    workers: str | None = None
 
 
 @dataclass(frozen=True)
@@ -188,13 +186,13 @@ def _client(batch: Batch, count: int, say: Callable[[str], None]) -> Iterator[tu
 
     logging.getLogger("distributed").setLevel(logging.ERROR)
     with contextlib.ExitStack() as stack:
-        if batch.scheduler is not None:
+        if "://" in (batch.workers or ""):
             try:
-                client = stack.enter_context(Client(batch.scheduler, timeout=10))
+                client = stack.enter_context(Client(batch.workers, timeout=10))
             except (OSError, ValueError, TimeoutError) as error:
-                raise InputError(f"--scheduler {batch.scheduler}: no cluster answers there: {error}") from None
+                raise InputError(f"--workers {batch.workers}: no cluster answers there: {error}") from None
         else:
-            workers = min(batch.workers or len(os.sched_getaffinity(0)), count)
+            workers = min(int(batch.workers or len(os.sched_getaffinity(0))), count)
             cluster = LocalCluster(
                 n_workers=workers, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0"
             )

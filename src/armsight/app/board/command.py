@@ -408,7 +408,6 @@ def release(name: str, as_json: bool) -> None:
     "--further", metavar="DEG,...", help="Correct by these: true angle less reported one of each joint, degrees."
 )
 @_path("--restore", help="Write back what --keep has kept.")
-@_path("--ar4-offsets", help="Correct the joint_offsets file of ar4_ros_driver, such as mk3.yaml; no board is opened.")
 @_path("--keep", default="old_offsets.json", help="New file for the offsets as they were.")
 @_yes
 @_JSON
@@ -418,7 +417,6 @@ def offsets(
     nominal: str | None,
     further: str | None,
     restore: Path | None,
-    ar4_offsets: Path | None,
     keep: Path,
     yes: bool,
     as_json: bool,
@@ -426,9 +424,10 @@ def offsets(
     """Print the zeros where an arm keeps them, or correct them, after asking; the old ones are kept in a file first.
 
     feetech:PORT: the homing offsets of the servos (register 31); LeRobot's calibration, where given, gets the same. A board
-    with armsight's firmware: the tables of its potentiometers. --ar4-offsets: a file of ar4_ros_driver. The drives must be
-    off: it asks before it switches them off. A servo's offset is -2047 to 2047 counts; what looks like a mistake, such as
-    more than a tooth of the horn (14.4 degrees), is not written with --yes.
+    with armsight's firmware: the tables of its potentiometers. ar4:FILE.yaml: the joint_offsets file of ar4_ros_driver,
+    such as mk3.yaml; no board is opened. The drives must be off: it asks before it switches them off. A servo's offset is
+    -2047 to 2047 counts; what looks like a mistake, such as more than a tooth of the horn (14.4 degrees), is not written
+    with --yes.
     """
     from armsight.app.board import offsets as kept
     from armsight.robot.arm_file import open_arm
@@ -455,10 +454,12 @@ def offsets(
         if given:
             click.echo(f"written; the old offsets are in {keep}", err=True)
 
-    if ar4_offsets is not None:
-        offer(kept.ar4_zeros(ar4_offsets, angles, restore, keep))
-    elif name.startswith("ar4:"):
-        raise InputError(f"{name}: an AR4 keeps no zeros; its driver's joint_offsets file does: --ar4-offsets mk3.yaml")
+    if name.startswith("ar4:"):
+        if not (file := name.removeprefix("ar4:")).endswith((".yaml", ".yml")):
+            raise InputError(
+                f"{name}: an AR4 keeps no zeros; its driver's joint_offsets file does: --board ar4:mk3.yaml"
+            )
+        offer(kept.ar4_zeros(Path(file), angles, restore, keep))
     elif name.startswith("feetech:"):
         with _open_any(name) as board:
             assert isinstance(board, FeetechBoard)

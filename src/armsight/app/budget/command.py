@@ -17,15 +17,18 @@ from armsight.errors import InputError
 @click.option("--want", metavar="ERROR", help="What 95 % of the errors are to be within: 0.1mm, or 0.1mm,0.05deg.")
 @click.option("--camera", metavar="CLASS", help="A class of the catalogue, such as webcam-720p.")
 @click.option("--baseline", metavar="LENGTH", help="Between the cameras: 200mm.")
-@click.option("--rig", metavar="RIG.json", help="The budget of a rig that there is.")
-@click.option("--run", "run", metavar="FOLDER", help="The budget of a run's rig, beside what the run measured.")
+@click.option(
+    "--rig",
+    metavar="RIG.json|RUN",
+    help="The budget of a rig that there is, or of a run's, beside what the run measured.",
+)
 @click.option("--arm", metavar="ARM", help="For the closed loop: a model's name or a file.")
 @click.option(
     "--best", "optimise", is_flag=True, help="Choose what is left out so that it measures best, for each class."
 )
 @click.option("-o", "--output", metavar="DIR", help="Write report.html, budget.json, the rig and the body to print.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
-def command(path: str, run: str | None, optimise: bool, output: str | None, as_json: bool, **given: str | None) -> int:
+def command(path: str, optimise: bool, output: str | None, as_json: bool, **given: str | None) -> int:
     """Say before a rig is bought what it will measure, what limits it, and what would make it better.
 
     What is left out is chosen, and said. PLAN.toml has the same keys and more: docs/howto/budget.md.
@@ -42,8 +45,9 @@ def command(path: str, run: str | None, optimise: bool, output: str | None, as_j
         check_folder(
             output, holding=REPORT_FILES, apart_from=(path, *(given[key] for key in ("rig", "arm") if given[key]))
         )
-    if run is not None and (optimise or given["rig"]):
-        raise InputError("--run has a rig of its own: give neither --rig nor --best beside it")
+    run = given.pop("rig") if Path(given["rig"] or "rig.json").is_dir() else None
+    if run is not None and optimise:
+        raise InputError(f"--rig {run}: a run's rig is chosen already: leave out --best")
     if (motion := given["volume"] or "").endswith(".toml"):
         if not given["arm"]:
             raise InputError(f"volume {motion}: the arm that moves so is needed, too: --arm ar4")

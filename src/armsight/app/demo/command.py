@@ -57,7 +57,6 @@ from armsight.app.show.messages import require
     metavar="FILE",
     help="The arm model to compute with, such as corrected.toml of armsight identify; by default the nominal table.",
 )
-@click.option("--follow-rig", is_flag=True, help="Put the rig right during the run where it moved: here it never does.")
 @click.option("--sync-led", is_flag=True, help="Put an LED on the board's clock in view: it gives delay and skew.")
 @click.option("--quick", is_flag=True, help="Fewer calibration shots and motions, no studies.")
 @click.option("--json", "as_json", is_flag=True, help="Print the summary as one JSON object.")
@@ -70,7 +69,6 @@ def command(
     board: str,
     layout: str,
     nominal_arm: str | None,
-    follow_rig: bool,
     sync_led: bool,
     quick: bool,
     as_json: bool,
@@ -95,7 +93,7 @@ def command(
 
     gc.freeze()  # what was imported stays: no collection has to look at it
     nominal = None if nominal_arm is None else open_arm(nominal_arm)
-    demo = Demo(output, arm, cameras, seed, emulator, layout, model, quick, nominal, nominal_arm, follow_rig, sync_led)
+    demo = Demo(output, arm, cameras, seed, emulator, layout, model, quick, nominal, nominal_arm, sync_led)
     try:
         with steps() as progress:
             report = run_demo(demo, progress=progress)

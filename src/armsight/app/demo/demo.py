@@ -69,7 +69,6 @@ class Demo:
     #: the arm model that the estimators and the controller have; by default the table the arm was built to.
     nominal_arm: Arm | None = None
     nominal_arm_name: str | None = None  #: its name in the summary; by default the arm's own
-    follow_rig: bool = False  #: whether a rig that moved is put right
     sync_led: bool = False  #: whether an LED on the board's clock is in view
 
 
@@ -114,7 +113,6 @@ def run_demo(demo: Demo, *, progress: Progress = lambda line: None) -> Report:
                 progress=progress,
                 cover=workcell.cover,
                 publisher=file,
-                follow_rig=demo.follow_rig,
             )
         workcell.source.close()  # its processes hold 300 MB
         studies: list[Study] = []

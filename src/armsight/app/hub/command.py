@@ -13,6 +13,14 @@ _JSON = click.option("--json", "as_json", is_flag=True, help="Print the result a
 _KEYS_OPTION = click.option(
     "--keys", default=_KEYS, show_default=True, metavar="DIR", type=_PATH, help="Folder of the site's keys."
 )
+_HUB = click.option(
+    "--hub",
+    "address",
+    default="127.0.0.1:7447",
+    show_default=True,
+    metavar="HOST[:PORT]",
+    help="Where cells find the hub; port 7447 where none is given.",
+)
 
 
 @click.group("hub", invoke_without_command=True)
@@ -65,18 +73,19 @@ def command(ctx: click.Context, listen: str, http: str, keys: Path | None, outpu
 @click.argument("site")
 @click.argument("cells", nargs=-1, metavar="CELL...")
 @click.option("-o", "--output", default=_KEYS, show_default=True, metavar="DIR", type=_PATH, help="Folder of the keys.")
-@click.option("--host", default="127.0.0.1", show_default=True, help="Name or address under which cells find the hub.")
-@click.option("--port", type=click.IntRange(1, 65535), default=7447, show_default=True, help="Port of the hub.")
+@_HUB
 @_JSON
-def keys_command(site: str, cells: tuple[str, ...], output: Path, host: str, port: int, as_json: bool) -> None:
+def keys_command(site: str, cells: tuple[str, ...], output: Path, address: str, as_json: bool) -> None:
     """Make the keys of SITE: for the hub, and a folder a CELL with the cell.toml that goes to its computer.
 
     Typed again it adds cells and renews what ends within 30 days. Start the hub again after it. DIR/ca.key must stay
     secret: who has it can make cells, and ask cells to hold.
     """
     from armsight.app.hub.keys import make_keys
+    from armsight.app.show.http import host_and_port
     from armsight.files import check_folder
 
+    host, port = host_and_port(address if ":" in address else f"{address}:7447", "--hub")
     made = make_keys(check_folder(output, problem="no keys can be made here"), site, cells, host, port)
     if as_json:
         click.echo(json.dumps({"directory": str(output), "cells": [str(each) for each in made]}))
@@ -92,9 +101,7 @@ def keys_command(site: str, cells: tuple[str, ...], output: Path, host: str, por
 @click.argument("cell")
 @click.argument("reason")
 @_KEYS_OPTION
-@click.option(
-    "--hub", "address", default="127.0.0.1:7447", show_default=True, metavar="HOST:PORT", help="Where cells connect."
-)
+@_HUB
 @_JSON
 def hold_command(cell: str, reason: str, keys: Path, address: str, as_json: bool) -> None:
     """Ask CELL to bring its arm to rest and hold it. This is no emergency stop, which is at the cell.

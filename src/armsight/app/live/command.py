@@ -59,9 +59,12 @@ _HERE = ("127.0.0.1", "localhost", "::1")
     type=click.Path(path_type=Path),
     help="Folder of the session.",
 )
-@click.option("--host", default="127.0.0.1", show_default=True, help="Address to listen on, such as 0.0.0.0.")
 @click.option(
-    "--port", type=click.IntRange(0, 65535), default=8722, show_default=True, help="Port; 0 takes a free one."
+    "--http",
+    default="127.0.0.1:8722",
+    show_default=True,
+    metavar="HOST:PORT",
+    help="Where the page is; 0.0.0.0:8722 for other computers, too; port 0 takes a free one.",
 )
 @click.option(
     "--follow-rig",
@@ -71,25 +74,27 @@ _HERE = ("127.0.0.1", "localhost", "::1")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of the simulated workcell.")
 @stream_option("streams")
 @click.option("--json", "as_json", is_flag=True, help="Print the address as one JSON object.")
-def command(host: str, port: int, sync_ms: float, as_json: bool, **given: Any) -> None:  # noqa: ANN401 - options' fields
+def command(http: str, sync_ms: float, as_json: bool, **given: Any) -> None:  # noqa: ANN401 - options' fields
     """Open a page in the browser that leads from two uncalibrated cameras to a closed loop, step by step.
 
     The steps: cameras, board, calibration, body, measuring, arm, recorded, health; each shows its command line.
 
-    The page is for this computer alone. With --host it is opened from another one, by the address with the token that is
-    printed. The button on the page and the space key stop the arm; the wired stop is the safety device.
+    The page is for this computer alone. With --http 0.0.0.0:8722 it is opened from another one, by the address with the
+    token that is printed. The button on the page and the space key stop the arm; the wired stop is the safety device.
     """
     require("the page", "live", "websockets")
 
     from armsight.app.live.server import LiveServer
     from armsight.app.live.session import LiveSession
     from armsight.app.live.step import SessionOptions
+    from armsight.app.show.http import host_and_port
     from armsight.app.source_kinds import SIM
     from armsight.app.stream.datum import Published
     from armsight.app.stream.streams import open_streams
     from armsight.vision.sources import check_source
     from armsight.vision.sources.usb import is_one, parsed_usb
 
+    host, port = host_and_port(http, "--http")
     options = SessionOptions(**given, sync_s=1e-3 * sync_ms)
     source = options.source or ""
     if options.source is not None and not source.startswith(SIM):

@@ -417,7 +417,9 @@ def _answer(connection: ServerConnection, body: bytes, headers: dict[str, str]) 
 def _bind_error(error: OSError, host: str, port: int) -> ArmsightError:
     """Return why an address cannot be bound, and what to do."""
     if error.errno == errno.EADDRINUSE:
-        return InputError(f"port {port} is in use, perhaps by another armsight live: give another one with --port")
+        return InputError(
+            f"port {port} is in use, perhaps by another armsight live: give another one, --http {host}:PORT"
+        )
     if error.errno == errno.EACCES:
-        return InputError(f"port {port} needs rights that you do not have: give one above 1023 with --port")
+        return InputError(f"port {port} needs rights that you do not have: give one above 1023, --http {host}:PORT")
     return DeviceError(f"{host}:{port} cannot be bound: {error.strerror or error}; is it an address of this computer?")

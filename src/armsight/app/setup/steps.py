@@ -113,7 +113,7 @@ _AR4 = _by_loop(
     SetupStep("All joints move to their ends.", f"board home --board ar4:{PORT} --at-once 1", simulated="--yes"),
     SetupStep(
         "The zeros in the driver's own file; then home again.",
-        f"board offsets --ar4-offsets {_YAML} --identified corrected/corrected.toml --arm ar4 --keep old.yaml",
+        f"board offsets --board ar4:{_YAML} --identified corrected/corrected.toml --arm ar4 --keep old.yaml",
         given=_YAML,
     ),
 )

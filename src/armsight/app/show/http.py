@@ -33,6 +33,18 @@ _HEADERS = {
 }
 
 
+def host_and_port(address: str, what: str) -> tuple[str, int]:
+    """Return the two parts of HOST:PORT; ``what`` names the option or key it is given by.
+
+    Raises:
+        InputError: it is no address.
+    """
+    host, _, port = address.rpartition(":")
+    if not host or not port.isdecimal() or int(port) > 65535:
+        raise InputError(f"{what} is {address!r}: expected HOST:PORT, such as 127.0.0.1:9110")
+    return host, int(port)
+
+
 class Pages:
     """Serves pages until it is closed.
 
@@ -47,9 +59,7 @@ class Pages:
     """
 
     def __init__(self, address: str, routes: Routes, what: str, *, open_to: bool = False) -> None:
-        host, _, port = address.rpartition(":")
-        if not host or not port.isdecimal() or int(port) > 65535:
-            raise InputError(f"{what} is {address!r}: expected HOST:PORT, such as 127.0.0.1:9110")
+        host, port = host_and_port(address, what)
         here = host in HERE
         self._token = None if here or open_to else secrets.token_urlsafe(18)
         pages = self
@@ -89,7 +99,7 @@ class Pages:
             address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
 
         try:
-            self._server = Server((host.strip("[]"), int(port)), Handler)
+            self._server = Server((host.strip("[]"), port), Handler)
         except OSError as error:
             raise InputError(
                 f"{what} {address}: cannot listen there ({error.strerror}): does another one run?"
