@@ -47,8 +47,6 @@ LAYOUTS = {
     "tagCustom48h12": FamilyLayout(6, 10, 12, "0:0-8 3:3-5"),
 }
 _PRIME = np.uint64(982451653)
-#: Most cells that are read wrong: one of every four in which two codes differ, this at most.
-_WRONG = 2  # half: blurred tags are missed; double: of the larger families clutter is read as a tag now and then
 #: The bright ring exceeds the dark one by this many grey levels at least.
 _STEP = 10.0  # half: noise is read; double: tags in the dark are missed
 _SAMPLES = 4  # along a cell; half: noisy cells; double: four times the time
@@ -124,7 +122,7 @@ def read_tag(image: NDArray[np.uint8], quad: Array, family: str) -> tuple[int, A
     bits = seen > 0.5 * (float(seen[dark].mean()) + float(seen[bright].mean()))
     at, known = data_cells(family), codes(family)
     weights = np.uint64(1) << np.arange(len(at) - 1, -1, -1, dtype=np.uint64)
-    allowed = min(_WRONG, (layout.distance - 1) // 4)
+    allowed = layout.distance // 6  # cells that are read wrong, of those in which two codes differ
     for rotation in range(4):
         rotated = np.rot90(bits, rotation)
         code = weights[rotated[at[:, 0], at[:, 1]]].sum(dtype=np.uint64)

@@ -157,31 +157,26 @@ def _full_range(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
 _CODE_CELLS = 6
 #: A contour's corners are off by so much: factors of its size that are tried.
 _SCALES = (0.95, 1.0, 1.05, 1.1)
-#: Blurs of the codes, sigma in cells.
-_CODE_BLURS = (0.3, 0.5)
+_CODE_BLUR = 0.5  # cells; sigma of the codes' blur; half, double: small markers are not read
 #: A code's correlation with the image is at least this, and what it leaves unexplained at most this share of what the next
 #: code leaves.
 _CODE_FIT, _CODE_LEAD = 0.85, 0.5
-#: The white ring around a marker exceeds its dark border by this many grey levels at least, and by this many times the
-#: border's own deviation.
-_RING_STEP, _RING_CLEAR = 10.0, 2.0
+#: The white ring around a marker exceeds its dark border by this many times the border's own deviation.
+_RING_CLEAR = 2.0
 #: The cells of the code vary by this share of that step at least, RMS; half of it where there is no blur.
 _CODE_DEPTH = 0.25
 
 
 @lru_cache(maxsize=16)
-def _blurred_codes(family: str, border: int) -> tuple[NDArray[np.float32], ...]:
-    """Return a family's codes (4 M, cells) for each blur, each in its four rotations, without mean and of length one."""
+def _blurred_codes(family: str, border: int) -> NDArray[np.float32]:
+    """Return a family's codes (4 M, cells), blurred, each in its four rotations, without mean and of length one."""
     name = APRILTAGS.get(family, family)
     whole = [cells(name, k, border) for k in range(family_size(family))]
     grids = np.array([np.rot90(np.pad(c, 1, constant_values=1), -r) for c in whole for r in range(4)], np.float32)
-    blurred = []
-    for sigma in _CODE_BLURS:
-        soft = np.array([cv2.GaussianBlur(grid, (5, 5), sigma, borderType=cv2.BORDER_REPLICATE) for grid in grids])
-        inner = soft[:, border + 1 : -border - 1, border + 1 : -border - 1].reshape(len(grids), -1)
-        inner = inner - inner.mean(axis=1, keepdims=True)
-        blurred.append(inner / np.maximum(np.linalg.norm(inner, axis=1, keepdims=True), 1e-9))
-    return tuple(blurred)
+    soft = np.array([cv2.GaussianBlur(grid, (5, 5), _CODE_BLUR, borderType=cv2.BORDER_REPLICATE) for grid in grids])
+    inner = soft[:, border + 1 : -border - 1, border + 1 : -border - 1].reshape(len(grids), -1)
+    inner = inner - inner.mean(axis=1, keepdims=True)
+    return np.asarray(inner / np.maximum(np.linalg.norm(inner, axis=1, keepdims=True), 1e-9))
 
 
 def _nearest_code(image: NDArray[np.uint8], quad: Array, family: str, border: int) -> tuple[int, Array] | None:
@@ -195,20 +190,19 @@ def _nearest_code(image: NDArray[np.uint8], quad: Array, family: str, border: in
         rim[1:-1, 1:-1], dark[1:-1, 1:-1] = False, True
         dark[border + 1 : -border - 1, border + 1 : -border - 1] = False
         step = float(np.median(seen[rim]) - seen[dark].mean())
-        if step < max(_RING_STEP, _RING_CLEAR * float(seen[dark].std())):
+        if step <= _RING_CLEAR * float(seen[dark].std()):
             continue
         inner = seen[border + 1 : -border - 1, border + 1 : -border - 1].ravel()
         inner = inner - inner.mean()
         if inner.std() < _CODE_DEPTH * step:
             continue
         inner /= np.linalg.norm(inner)
-        for blurred in _blurred_codes(family, border):
-            correlation = blurred @ inner
-            row = int(correlation.argmax())
-            first = float(correlation[row])
-            correlation[row - row % 4 : row - row % 4 + 4] = 0.0  # the same marker, rotated
-            if first > best[0] and 1 - first**2 < _CODE_LEAD * (1 - float(correlation.max()) ** 2):
-                best = (first, row // 4, row % 4, about)
+        correlation = _blurred_codes(family, border) @ inner
+        row = int(correlation.argmax())
+        first = float(correlation[row])
+        correlation[row - row % 4 : row - row % 4 + 4] = 0.0  # the same marker, rotated
+        if first > best[0] and 1 - first**2 < _CODE_LEAD * (1 - float(correlation.max()) ** 2):
+            best = (first, row // 4, row % 4, about)
     return None if best[1] < 0 else (best[1], np.roll(best[3], -best[2], axis=0))
 
 

@@ -30,17 +30,13 @@ from armsight.vision.markers.spec import Fields, first_id
 _NEIGHBOURS, _REACH, _FITS = 5, 2.1, 3
 #: Markers that are off their layout by more than this share of a square have another one.
 _OFF = 0.2
-#: First ids that are tried where the given one does not fit.
-_SHIFTS = 100  # half: only boards that are seen nearly whole are named; double: a miss takes twice as long
 #: OpenCV's outline of a marker runs through the middles of its outermost pixels: it is this much smaller, px.
 _OUTLINE_PX = 1.0
 #: A given side of the markers that differs from the image's by more than this share, and by more than so many pixels
-#: (blur and tone curves shift the edges), is a mistake; so where it is more than so many times by how much the markers
-#: are off their layout, squares: perspective and distortion bend the fit.
-_SIDE_SHARE, _SIDE_PX, _SIDE_OFF = 0.08, 1.5, 2.0
-#: So far outside and inside of its outline, share of its side and px, a marker's grey differs by more than this share of
-#: the range within it.
-_GAP_SHARE, _GAP_PX, _STEP = 0.04, 1.5, 0.4
+#: (blur and tone curves shift the edges), is a mistake.
+_SIDE_SHARE, _SIDE_PX = 0.08, 1.5
+#: So far outside and inside of its outline, px, a marker's grey differs by more than this share of the range within it.
+_GAP_PX, _STEP = 1.5, 0.4
 #: Families of unknown boards, by their markers' cells, each with the sizes of its dictionaries, which begin alike.
 _USUAL = {f"DICT_{cells}_": (50, 100, 250, 1000) for cells in ("4X4", "5X5", "6X6", "7X7")}
 _TO_M = 5e-4  # m; sides of unknown markers are given to this; half: digits that mean nothing, double: too coarse
@@ -194,7 +190,7 @@ class Charuco(Record, CalibrationBoard):
                 f"{len(markers)} markers of {self.family} are in view, but not where {self.body.name} has them: check its "
                 "counts of squares (columns x rows)"
             )
-        if not abs(seen_m - self.marker_m) > max(_SIDE_SHARE * seen_m, _SIDE_PX / px, _SIDE_OFF * off * seen_m):
+        if not abs(seen_m - self.marker_m) > max(_SIDE_SHARE * seen_m, _SIDE_PX / px):
             return None
         return (
             f"{self.body.name}: the image shows markers of {seen_m * 1e3:.3g} mm in squares of {self.square_m * 1e3:g} mm, "
@@ -207,7 +203,7 @@ class Charuco(Record, CalibrationBoard):
         if len(ids) < _NEIGHBOURS:
             return None
         low, high = max(0, int(ids.max()) - count + 1), min(int(ids.min()), family_size(self.family) - count)
-        for first in range(high, max(low, high - _SHIFTS) - 1, -1):
+        for first in range(high, low - 1, -1):
             shifted = (identities + self.first) - first
             if min(self._sides(corners, outlined, shifted, legacy)[0] for legacy in (False, True)) <= _OFF:
                 return first
@@ -264,7 +260,7 @@ def _outlined(image: NDArray[np.uint8], corners: Array) -> NDArray[np.bool_]:
     across = corners[:, [0]] + share * (corners[:, [1]] - corners[:, [0]])
     down = corners[:, [3]] + share * (corners[:, [2]] - corners[:, [3]])
     cells = (across[:, :, None] + share * (down - across)[:, :, None]).reshape(len(corners), -1, 2)
-    gap = np.maximum(_GAP_SHARE, _GAP_PX / np.linalg.norm(following - corners, axis=2).mean(axis=1))[:, None, None]
+    gap = (_GAP_PX / np.linalg.norm(following - corners, axis=2).mean(axis=1))[:, None, None]
 
     def grey(uv: Array) -> Array:
         uv = uv.astype(np.float32)

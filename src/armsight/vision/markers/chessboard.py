@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array, Body, Detections, Ids, Record
-from armsight.vision.markers.corner import OUTCOMES, CornerFits, crossing_signs, refine_corners
+from armsight.vision.markers.corner import OUTCOMES, WINDOW_MAX_PX, CornerFits, crossing_signs, refine_corners
 from armsight.vision.markers.grid import grid_points, local_squares, rotations
 from armsight.vision.markers.marker import CalibrationBoard
 from armsight.vision.markers.spec import Fields
@@ -37,8 +37,7 @@ MORE_SHARE = 0.7
 #: A residual this many times the median residual of the board's corners, both relative to the contrast, marks a
 #: disturbed corner: a glint, a finger, a staple. Never below the floor, for a clean image has a tiny median.
 MISFIT_RATIO, MISFIT_FLOOR = 4.0, 0.08
-#: Blur in a smaller copy, px, and the least side of its squares.
-COPY_BLUR_PX, SMALLEST_SIDE_PX = 0.75, 12.0
+COPY_BLUR_PX = 0.75  # in a smaller copy; half: few images are reduced, double: sharp ones are
 #: The four outermost lines of a grid (rows, columns), each with the one next to it.
 _ENDS = ((np.s_[0], np.s_[1]), (np.s_[-1], np.s_[-2]), (np.s_[:, 0], np.s_[:, 1]), (np.s_[:, -1], np.s_[:, -2]))
 
@@ -209,7 +208,7 @@ def _in_smaller_copy(image: NDArray[np.uint8], fits: CornerFits, squares: Array,
         return fits
     blur_px = float(median(np.sqrt(fits.models[fits.kept, 4:6]).flat))
     side_px = float(median(np.linalg.norm(squares[fits.kept], axis=2).flat))
-    factor = int(min(blur_px / COPY_BLUR_PX, side_px / SMALLEST_SIDE_PX))
+    factor = int(min(blur_px / COPY_BLUR_PX, side_px / WINDOW_MAX_PX))
     if factor < 2:
         return fits
     height, width = (side // factor for side in image.shape)

@@ -19,6 +19,7 @@ from armsight.data import Array, Record
 from armsight.kernels import kernel
 from armsight.vision.markers.disc.common import FIELDS, SHARED, common, correct
 from armsight.vision.markers.disc.fit import (
+    MOST_DISCS,
     NOT_UNIFORM,
     PARAMETERS,
     REASONS,
@@ -37,8 +38,6 @@ from armsight.vision.markers.disc.fit import workspace as workspace_of_fits
 from armsight.vision.markers.disc.search import Grey, Room, Words64, noise_of, search, workspace
 from armsight.vision.markers.discs import copies, enlarged
 
-#: Most candidates examined in one copy.
-_MOST_CANDIDATES = 8192
 #: Directions in which the contrast at a rim is compared, and how many must have this share of the median contrast.
 _RAYS, _RAYS_GOOD, _RAY_SHARE = 12, 10, 0.35
 
@@ -164,7 +163,7 @@ def find_blobs(image: Grey, bright: bool, dark: bool) -> tuple[Blobs, Blobs]:
 def _room() -> tuple[Array, NDArray[np.int64], NDArray[np.int64], Array, Room]:
     """Return this thread's buffers."""
     if not hasattr(_KEPT, "room"):
-        n = _MOST_CANDIDATES
+        n = MOST_DISCS
         _KEPT.room = np.empty((n, UNKNOWNS)), np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n), workspace()
     room: tuple[Array, NDArray[np.int64], NDArray[np.int64], Array, Room] = _KEPT.room
     return room

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from armsight.data import Array, Ids, Record
 from armsight.vision.markers.circle_blobs import Blobs
 
-#: Neighbours of a disc have up to this many times its area or contrast, and are 2 to this many radii away.
-_ALIKE, _FURTHEST = 3.0, 16.0
+#: Neighbours of a disc have up to this many times its area or contrast.
+_ALIKE = 3.0
 #: Neighbours examined, and seeds from which grids grow.
 _NEIGHBOURS, _SEEDS = 12, 60
 #: A disc of the grid is this near to where its neighbours put it, as a share of the step.
@@ -107,10 +107,9 @@ def _neighbours(blobs: Blobs) -> list[Ids]:
         pool = np.flatnonzero((size >= band - span) & (size < band + 2 * span))
         if not len(mine) or len(pool) < 2:
             continue
-        distance, rows = KDTree(uv[pool]).query(uv[mine], k=min(_NEIGHBOURS + 1, len(pool)))
-        for i, far, js in zip(mine.tolist(), np.asarray(distance), pool[rows], strict=True):
-            alike = (js != i) & (far < _FURTHEST * blobs.radius_px[i]) & _alike(blobs, i, js)
-            out[i] = js[alike]
+        _, rows = KDTree(uv[pool]).query(uv[mine], k=min(_NEIGHBOURS + 1, len(pool)))
+        for i, js in zip(mine.tolist(), pool[rows], strict=True):
+            out[i] = js[(js != i) & _alike(blobs, i, js)]
     return out
 
 
