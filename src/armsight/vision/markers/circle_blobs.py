@@ -299,16 +299,15 @@ class Fits(Record):
         return f", mostly: {REASONS[int(np.bincount(bad).argmax())]}" if len(bad) else ""
 
 
-def odd_sized(theta: Array, factor: float, good: NDArray[np.bool_] | None = None) -> NDArray[np.bool_]:
+def odd_sized(theta: Array, factor: float) -> NDArray[np.bool_]:
     """(N,) whether a disc's area is far from what the others' areas, linear over the image, let expect.
 
     Args:
         theta: (N, 10) discs of one grid.
         factor: by which an area may be larger or smaller, beyond what is usual among them.
-        good: (N,) which of them count; all by default.
     """
     area, uv = -0.5 * np.log(np.maximum(theta[:, 2] * theta[:, 4] - theta[:, 3] ** 2, 1e-300)), theta[:, :2]
-    keep = np.ones(len(area), bool) if good is None else good.copy()
+    keep = np.ones(len(area), bool)
     basis = np.column_stack([np.ones(len(area)), (uv - uv.mean(axis=0)) / max(float(np.ptp(uv)), 1.0)])
     odd = np.zeros(len(area), bool)
     for _ in range(3 if keep.any() else 0):

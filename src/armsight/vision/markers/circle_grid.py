@@ -255,13 +255,11 @@ def _continued(a: complex, b: complex, c: complex | None) -> complex:
     return a + step * (k + 1.0) / (3.0 * k - 1.0)
 
 
-#: A disc must be this many pixels inside the image to count as missing.
-_MARGIN_PX = 3.0
 #: How far, in cells, missing discs are predicted from the ones that are seen.
 _PREDICTED_CELLS = 3
-#: Largest share of the discs in view that may be missing or too many; how much worse the next best placement must be, and
-#: what a ring in the wrong position counts.
-_MOST_WRONG, _WORSE, _RING_COST = 0.25, 2, 3
+#: Largest share of the discs in view that may be missing or too many; how much worse the next best placement must be, as
+#: a ring in the wrong position makes it.
+_MOST_WRONG, _WORSE = 0.25, 2
 #: A grid of a size is shown where at least this share of its discs was found, and of each outer line's.
 _FILLED = 0.9
 #: A step across a missing line is twice as long as others; from this on it is one.
@@ -335,7 +333,7 @@ def number_cells(
             ids, lost = at(rotated + shift), int((at(predicted @ rotation + shift) >= 0).sum())
             matched = ids >= 0
             ring_errors = int((hollow[matched] != layout.rings[ids[matched]]).sum()) if layout.rings.any() else 0
-            wrong = int((~matched).sum()) + lost + _RING_COST * ring_errors
+            wrong = int((~matched).sum()) + lost + _WORSE * ring_errors
             placements.append(Placement(ids, lost, wrong, ring_errors))
         rotation = rotation @ np.array([[0, 1], [-1, 0]])
     return _unambiguous(placements, layout)
@@ -345,7 +343,7 @@ def _unambiguous(placements: list[Placement], layout: GridLayout) -> Placement |
     """Return the placement with the least wrong, or the reason why it is none."""
     best = min(placements, key=lambda p: (p.wrong, -int((p.ids >= 0).sum())))
     matched = int((best.ids >= 0).sum())
-    if best.wrong - _RING_COST * best.rings_wrong > _MOST_WRONG * (matched + best.lost):
+    if best.wrong - _WORSE * best.rings_wrong > _MOST_WRONG * (matched + best.lost):
         return f"{len(best.ids)} discs in a grid were found, which do not make the board"
     if best.rings_wrong > 1:
         return "its discs were found, but the rings among them are not where the board has them"
@@ -435,14 +433,14 @@ def expected(cells: Ids, theta: Array, size_px: tuple[int, int]) -> tuple[Ids, A
     """
     seen = positions(cells, theta[:, :2])
     radius_px = float(np.median(theta[:, 2] * theta[:, 4] - theta[:, 3] ** 2) ** -0.25)
-    known, front, margin = dict(seen), set(seen), _MARGIN_PX + radius_px
+    known, front = dict(seen), set(seen)
     for _ in range(_PREDICTED_CELLS):
         fresh: dict[Cell, complex] = {}
         for cell in sorted({n for c in front for n in _beside(c)} - known.keys()):
             guess = extrapolated(cell, known)
             if guess is not None:
                 u, v = guess[0].real, guess[0].imag
-                if margin < u < size_px[0] - 1 - margin and margin < v < size_px[1] - 1 - margin:
+                if radius_px < min(u, v, size_px[0] - 1 - u, size_px[1] - 1 - v):
                     fresh[cell] = guess[0]
         known.update(fresh)
         front = set(fresh)

@@ -50,11 +50,10 @@ from armsight.vision.markers.spec import Fields
 _KEPT_SHARE, _KEPT_WITH_RINGS = 0.5, 0.2
 #: Grids in one image that may be the board, the best first.
 _GRIDS = 4
-#: A disc that the search missed is there if its contrast is at least this share of the others'; rounds in which such are
-#: added.
-_LOST_CONTRAST, _COMPLETED = 0.4, 2
-#: An outline, and a fit, may have so many times the area that the others let expect.
-_ODD_OUTLINE, _ODD_FIT = 1.3, 1.7
+#: A disc that the search missed is there if its contrast is at least this share of the others'.
+_LOST_CONTRAST = 0.4
+#: An outline may have so many times the area that the others let expect.
+_ODD_OUTLINE = 1.3
 #: How far an outline may be from where its neighbours put it, in radii.
 _DISPLACED = 0.35
 #: Halfway to the next disc a grid's grey differs from that between four by less than this share of a disc's contrast, at a
@@ -208,7 +207,6 @@ class CircleGrid(Record, CalibrationBoard):
         ids = self._upright(placement.ids[seen], starts[:, :2])
         fits = fit_discs(without_holes(image, starts[hollow]), starts)
         good = fits.kept()
-        good &= ~odd_sized(fits.theta, _ODD_FIT, good)
         if good.sum() < least:
             return f"{len(ids)} of its discs were found, but only {good.sum()} can be measured{fits.why_not()}"
         rows = np.flatnonzero(good)[np.argsort(ids[good])]
@@ -271,7 +269,7 @@ def _completed(
         kept &= ~_displaced(cells, theta)
     cells, theta = cells[kept], theta[kept]
     contrast, hollow = contrasts(image, theta, sign)
-    for _ in range(_COMPLETED if len(cells) else 0):
+    while len(cells):
         more, uv = expected(cells, theta, size_px)
         like = like_neighbours(uv, theta)
         there, ring = contrasts(image, like, sign)
