@@ -1,6 +1,7 @@
 """Many cells and one hub, on this computer: latency, cost, losses, drifts, false alarms.
 
-    python cells.py 50 --seconds 60    latency and cost of states; then kill -9 of half, a frozen cell, a killed hub
+    python cells.py 50 --seconds 60    latency and cost of states; then kill -9 of half, a frozen cell, a cut
+                                       cable, a killed hub
     python cells.py 50 --drift 5       three of them drift: where they stand in the list after 5 minutes
     python cells.py --alarms 7         false alarms of healthy cells in so many days, without any process
 
@@ -17,6 +18,7 @@ import socket
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 import urllib.request
 from pathlib import Path
@@ -132,12 +134,43 @@ def free_port():
         return found.getsockname()[1]
 
 
-def started(count, port, seed, drifting):
-    """Start cells, a few at a time."""
+class Cable:
+    """A connection that can be cut: nothing is closed, and nothing comes through."""
+
+    def __init__(self, port, to):
+        self.whole, self._to = threading.Event(), to
+        self.whole.set()
+        self._listening = socket.create_server(("127.0.0.1", port))
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    def _accept(self):
+        while True:
+            near = self._listening.accept()[0]
+            try:
+                ends = near, socket.create_connection(("127.0.0.1", self._to))
+            except OSError:  # the hub is gone
+                near.close()
+                continue
+            for one, other in (ends, ends[::-1]):
+                threading.Thread(target=self._carry, args=(one, other), daemon=True).start()
+
+    def _carry(self, one, other):
+        try:
+            while data := one.recv(1 << 16):
+                self.whole.wait()
+                other.sendall(data)
+        except OSError:
+            pass
+        one.close()
+        other.close()
+
+
+def started(count, port, seed, drifting, cable):
+    """Start cells, a few at a time; the last one behind a cable."""
     context = multiprocessing.get_context("fork")
     cells = []
     for number in range(count):
-        spec = f"c{number:03d}@127.0.0.1:{port}"
+        spec = f"c{number:03d}@127.0.0.1:{port if number < count - 1 else cable}"
         cells.append(context.Process(target=cell, args=(number, spec, seed, number in drifting), daemon=True))
         cells[-1].start()
         time.sleep(0.1)
@@ -162,8 +195,8 @@ def latencies(http, seconds):
     return np.array(found)
 
 
-def losses(cells, http, folder, port, process):
-    """Kill half of the cells, freeze one, kill the hub three times; print what followed."""
+def losses(cells, http, folder, port, process, cable):
+    """Kill half of the cells, freeze one, cut a cable, kill the hub three times; print what followed."""
     names = [f"c{number:03d}" for number in range(len(cells))]
     half = len(cells) // 2
     for each in cells[:half]:
@@ -174,6 +207,12 @@ def losses(cells, http, folder, port, process):
     took = until(lambda: levels(http).get(names[half]) == 4, 20)
     os.kill(cells[half].pid, signal.SIGCONT)
     print(f"frozen: red after {took:.2f} s (5 asked)")
+    cable.whole.clear()
+    took = until(lambda: levels(http).get(names[-1]) == 4, 20)
+    time.sleep(10.0)
+    cable.whole.set()
+    back = until(lambda: 0 <= levels(http).get(names[-1], 4) < 4, 30)
+    print(f"cut cable: red after {took:.2f} s (5 asked), back {back:.2f} s after it was mended")
     alive = names[half:]
     for _ in range(3):
         process.kill()
@@ -228,7 +267,9 @@ def main():
     port, http, count = free_port(), free_port(), ARGUMENTS.cells
     drifting = set(np.random.default_rng(ARGUMENTS.seed).choice(count, 3, replace=False)) if ARGUMENTS.drift else set()
     process = hub(folder / "hub", port, http)
-    cells = started(count, port, ARGUMENTS.seed, drifting)
+    cut = free_port()
+    cells = started(count, port, ARGUMENTS.seed, drifting, cut)
+    cable = Cable(cut, port)  # after the processes: a fork copies no threads
     took = until(lambda: len([n for n in levels(http).values() if n >= 0]) == count, 120)
     print(f"{count} cells on the page {took:.1f} s after the last was started")
     if ARGUMENTS.drift:
@@ -251,7 +292,7 @@ def main():
             f"hub with a page that asks twice a second: {100 * used:.1f} % of a core, {memory:.0f} MB (25 %, 300 MB asked)"
         )
         if count <= 60:
-            process = losses(cells, http, folder / "hub", port, process)
+            process = losses(cells, http, folder / "hub", port, process, cable)
             time.sleep(8.0)
     for each in cells:
         each.terminate()
