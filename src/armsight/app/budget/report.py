@@ -126,11 +126,11 @@ def _answer(found: RigBudget) -> tuple[Grade, str]:
     if requested is None:
         return "fair", f"{said}.{costs}."
     asked = f"{1e3 * requested[0]:g} mm" + (f", {math.degrees(requested[1]):g} deg" if requested[1] else "")
-
     grade: Grade = "good" if found.reached(move) else "fair" if found.reached(rest) else "poor"
     body_m = found.worst_m("print of the body")
     floor = f" The print of the body alone costs {1e3 * body_m:.2g} mm: no camera reaches it."
-    return grade, f"{said}; requested {asked}.{costs}.{floor if body_m > requested[0] else ''}"
+    reached = {"good": "reached", "fair": "reached at rest only", "poor": "not reached"}[grade]
+    return grade, f"{asked} requested: {reached}. {said}.{costs}.{floor if body_m > requested[0] else ''}"
 
 
 def _chosen(plan: RigPlan) -> str:
