@@ -93,9 +93,14 @@ def calibrated_with(lens, rng):
 
 
 def strained(matrix, bent=0.0):
-    """Displacements of the body's points, m: by a matrix (3, 3) of strains, and bent by so much, 1/m, about y."""
+    """Displacements of the body's points, m: by a matrix (3, 3) of strains, and bent by so much, 1/m, about y.
+
+    A shear is taken with half of it across either axis: the rest is a rotation of the body's axes, which are its points'.
+    """
     from_middle = BODY.points - BODY.points.mean(axis=0)
-    return from_middle @ np.transpose(matrix) + 0.5 * bent * np.outer(from_middle[:, 0] ** 2, [0.0, 0.0, 1.0])
+    return from_middle @ (0.5 * (matrix + np.transpose(matrix))) + 0.5 * bent * np.outer(
+        from_middle[:, 0] ** 2, [0.0, 0.0, 1.0]
+    )
 
 
 def watched_body(

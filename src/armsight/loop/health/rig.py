@@ -259,7 +259,15 @@ class RigWatch:
         points = np.asarray(body.points, float)[self._points]
         self._focal = _focal_changes(rig, self._size)
         self._shape = ShapeWatch(
-            self._size, self._focal, count + 1, points, names, TEST_S, rigid=printed or many, strained=not printed
+            self._size,
+            self._focal,
+            count + 1,
+            points,
+            names,
+            SHAPE_M,
+            TEST_S,
+            rigid=printed or many,
+            strained=not printed,
         )
         # (K, K + 7 + C) what the parameters, the seven numbers and the candidates of the shape change of the parameters, in
         # units of their priors: a test has sums of these.

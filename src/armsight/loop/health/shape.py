@@ -40,6 +40,7 @@ import numpy as np
 
 from armsight.data import Array, Ids, Record
 from armsight.estimate.chance import chi_square_limit
+from armsight.geometry.rotation import skew
 from armsight.loop.finding import HealthFinding, alarm_limit
 
 #: A displacement may be so large, m: what is further off is another thing. So much may a focal length change, as a share.
@@ -279,6 +280,7 @@ class ShapeWatch:
         first: row of the first parameter of the points.
         points: (N, 3) those that have parameters, m.
         names: of them.
+        tolerance_m: standard deviation of each of their coordinates, m.
         test_s: how often it is tested, s.
         rigid: whether single points are not tested.
         strained: whether the body may be elongated, sheared or bent: not a print whose shape a calibration found.
@@ -286,7 +288,8 @@ class ShapeWatch:
     Attributes:
         by_wide: (K, C) what the standard deviations of the candidates' priors change of the parameters.
         doubt: (7 + C, 7 + C) second moment of the seven numbers and the candidates, in units of their priors, by all that
-            may have changed; None where that is improbable, or known.
+            may have changed; None where that is improbable, or known: then by what the body is off within its tolerance,
+            where that displaces poses by more than their sigma.
         found: what the newest test found for certain.
         said: what was found last.
     """
@@ -298,6 +301,7 @@ class ShapeWatch:
         first: int,
         points: Array,
         names: tuple[str, ...],
+        tolerance_m: float,
         test_s: float,
         *,
         rigid: bool,
@@ -315,6 +319,9 @@ class ShapeWatch:
         self._candidates = () if rigid else tuple(range(n))
         # What smooth deformations add to sums of the residual, the seven numbers and the candidates; in m of the latter.
         self._smooth = _smooth(points)
+        # (3 N, 3 N) what takes motions of all points out of their displacements; standard deviation of their priors, m.
+        motions = np.linalg.qr(np.hstack([np.tile(np.eye(3), (n, 1)), -skew(points).reshape(3 * n, 3)]))[0]
+        self._apart, self._tolerance = np.eye(3 * n) - motions @ motions.T, tolerance_m
         self._with_smooth = np.hstack([np.eye(10 + 3 * n), np.vstack([np.zeros((10, 27)), self._smooth / FURTHEST_M])])
         self._hypotheses = _hypotheses(len(self._candidates), 3 * n, strained=strained)
         self._limit_focal, self._limit = (alarm_limit(size, 1.0 / test_s, 2 * (n + 1)) for size in (1, 3))
@@ -380,6 +387,7 @@ class ShapeWatch:
             self._changed_s = self.found.begin_s
         elif self.doubt is None:
             self._changed_s = None
+            self.doubt = self._tolerated()
         elif self._changed_s is None:
             self._changed_s = doubted_s
 
@@ -456,6 +464,22 @@ class ShapeWatch:
         later = sum(each.usual.begin_s >= self.found.begin_s for each in self._history)
         sums_since = self._since(tests - max(later, 1), self.found.slow, usual=True)
         return self.found.begin_s, self._mixture(sums_since, self._hypotheses[:1])[1]
+
+    def _tolerated(self) -> Array | None:
+        """Return the second moment (7 + C, 7 + C) of the body's shape within its tolerance, where it matters, else None.
+
+        A motion of all points is none of the body's shape: what has its axes is where its points are.
+        """
+        K, points = self._size, slice(self._first, self._first + len(self._smooth))
+        H = self._all[1].H[:K, :K] + np.eye(K)
+        cov = np.linalg.inv(H)
+        of_points = self._tolerance * self._apart
+        d, spread = of_points @ (cov @ self._all[1].b[:K])[points], of_points @ cov[points, points] @ of_points.T
+        if self._displaces(np.append([0.0, 0.0], d)) < 6.0:  # a pose's own squared error, all six numbers together
+            return None
+        moment = np.zeros((9 + len(d), 9 + len(d)))
+        moment[9:, 9:] = (np.outer(d, d) + spread) / FURTHEST_M**2
+        return moment
 
     def evidence(self, sums: ResidualSums, excess: float, skewed: bool) -> float:
         """Return the log-evidence of the best hypothesis of what changed and stays, against none: 0 where none does.
@@ -642,10 +666,14 @@ class ShapeWatch:
 
     def _matters(self, value: Array) -> bool:
         """Return whether a displacement moves a new pose by so many of its sigmas, were it measured with that point."""
+        return self._displaces(value) > _MATTERS**2
+
+    def _displaces(self, value: Array) -> float:
+        """Return by how much a displacement moves one of the newest poses at most, in its sigmas, squared."""
         responses, covs = map(np.array, zip(*self._effects, strict=True))
         shift = responses @ (self._by_candidate @ value)
         squares = np.einsum("ni,ni->n", shift, np.linalg.solve(covs, shift[..., None])[..., 0])
-        return float(np.max(squares)) > _MATTERS**2
+        return float(np.max(squares))
 
     def _dated(self) -> ShapeError | None:
         """Return what is shown from the beginning on that leaves least unexplained, whichever points moved then.
