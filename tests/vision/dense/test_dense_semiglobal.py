@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from dense_scenes import layers
 
-from armsight.vision.dense.cost import COST_MAX
+from armsight.vision.dense.cost import _RAW_MAX
 from armsight.vision.dense.method import Search
 from armsight.vision.dense.semiglobal import _EDGE, _P1, _P2, Semiglobal
 
@@ -89,7 +89,7 @@ def test_semiglobal_totals_are_those_of_the_definition(paths):
 
 
 def test_no_path_cost_leaves_a_byte():
-    assert COST_MAX + _P1 + _P2 <= 255
+    assert 3 * int(_RAW_MAX) + _P1 + _P2 <= 255
 
 
 def test_strips_meet_without_a_seam(monkeypatch):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from dense_scenes import layers
 
-from armsight.vision.dense.block import RAW_MAX, REACH, Block
+from armsight.vision.dense.block import REACH, Block
 from armsight.vision.dense.method import Search
 
 
@@ -66,5 +66,6 @@ def test_totals_winners_and_agreement_are_those_of_the_definition(first):
 def test_no_sum_leaves_its_type():
     checks = np.where(np.indices((60, 80)).sum(axis=0) % 4 < 2, 0, 255).astype(np.uint8)
     found = Block().search(checks, np.roll(checks, 2, axis=1).copy(), Search(0, 2))
-    assert RAW_MAX * (2 * REACH + 1) < 256
-    assert found.least.max() <= RAW_MAX * (2 * REACH + 1) ** 2 < 65536
+    most = 2 * 8 + 20 // 2  # of one match
+    assert most * (2 * REACH + 1) < 256
+    assert found.least.max() <= most * (2 * REACH + 1) ** 2 < 65536

@@ -33,8 +33,8 @@ _VECTOR = 32
 #: Distance of the neighbours in a census word from the middle, px, along rows, columns and diagonals.
 _CENSUS_REACH = 2
 #: Beyond this many grey levels the difference is cut off; cost of a match beyond the right image's edge: about that of
-#: an ambiguous pixel; the largest cost of a match.
-_CUT, _OUTSIDE, RAW_MAX = np.uint8(20), np.uint8(10), 2 * 8 + 20 // 2
+#: an ambiguous pixel.
+_CUT, _OUTSIDE = np.uint8(20), np.uint8(10)
 #: Pixels of a window to either side of its middle; half: noisy; double: breaks are blurred, and sums along a row no longer
 #: fit a byte.
 REACH = 4
@@ -251,7 +251,6 @@ def match_windows(
             _write_row(y, first, count, pad, buffers, found)
 
 
-_STRIP_ROWS = 384
 #: See postprocess.py.
 _SIGMA_MODEL = SigmaModel(0.17, 0.09)
 
@@ -273,5 +272,5 @@ class Block:
             buffers = make_buffers(left.shape[1], pad, search.count)
             match_windows(planes, begin, end, search.first, search.count, pad, buffers, found)
 
-        for_each_strip(left.shape[0], _STRIP_ROWS, work)
+        for_each_strip(left.shape[0], work)
         return found

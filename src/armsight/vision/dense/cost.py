@@ -29,9 +29,8 @@ _CENSUS_REACH = 2
 _BT_CUT = np.uint8(20)
 #: Cost of a match beyond the right image's edge, where nothing can be compared: about that of an undecided pixel.
 _OUTSIDE = np.uint8(13)
-#: The largest raw cost (24 bits and half of the cut), and the largest after smoothing, which adds three rows.
+#: The largest raw cost: 24 bits and half of the cut; smoothing adds three rows.
 _RAW_MAX = np.uint8(34)
-COST_MAX = 3 * 34
 
 
 @kernel_types("u1[:, ::1], u1[:, ::1], u1[:, ::1], u4[:, ::1], u1[:, ::1], u1[:, ::1], u1[:, ::1], u4[:, ::1]")

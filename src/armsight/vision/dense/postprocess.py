@@ -40,7 +40,6 @@ _EDGE_REACH, _NEAR_PX, _EDGE_ALIKE = 8, 6.0, 10.0
 _BREAK, _BESIDE = 1.5, 3
 #: A measured disparity stays if it is so near to the median, px.
 _SAME = np.float32(1.0)
-_EDGE_STRIP_ROWS = 64
 
 
 def _doubtful(disparity: Singles, state: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -126,7 +125,7 @@ def aligned_to_edges(disparity: Singles, state: NDArray[np.uint8], image: Image)
     def work(begin: int, end: int) -> None:
         _weighted_medians(disparity, image, doubtful, alike, near, begin, end, median)
 
-    for_each_strip(disparity.shape[0], _EDGE_STRIP_ROWS, work)
+    for_each_strip(disparity.shape[0], work)
     stays = (state == MEASURED) & (np.abs(median - disparity) <= _SAME)
     moved = (state == MEASURED) & ~stays
     return np.where(stays, disparity, median), np.where(moved, np.uint8(FILLED), state)
@@ -201,7 +200,6 @@ def filled(disparity: Singles) -> tuple[Singles, NDArray[np.uint8]]:
 _SMOOTH_REACH, _SMOOTH_ALIKE = 4, np.float32(8.0)
 #: Difference that counts as the same surface in each round, px: above the sub-pixel error, below a break.
 _ROUNDS = (1.5, 1.0)
-_SMOOTH_STRIP_ROWS = 96
 
 
 @kernel(nogil=True, inline="always")
@@ -276,8 +274,8 @@ def smoothed(disparity: Singles, image: Image) -> tuple[Singles, NDArray[np.floa
         def columns(begin: int, end: int, out: Singles = out, limit: np.float32 = tolerance) -> None:
             _columns(half, image, limit, begin, end, np.empty(image.shape[1], np.float32), out, share)
 
-        for_each_strip(height, _SMOOTH_STRIP_ROWS, rows)
-        for_each_strip(height, _SMOOTH_STRIP_ROWS, columns)
+        for_each_strip(height, rows)
+        for_each_strip(height, columns)
     return out, share
 
 
@@ -287,7 +285,6 @@ _SPECKLE_PX = 50
 _FINE = 16
 #: With less than this share of the image measured, there is no result: chance alone gives some.
 _LEAST_SHARE = 0.005
-_STRIP_ROWS = 192
 
 
 @dataclass(frozen=True)
@@ -329,9 +326,9 @@ def without_speckles(found: Winners) -> Singles:
     """Return the disparities (H, W) that the images agree on, NaN where a patch is too small to be plausible."""
     height, width = found.disparity.shape
     coarse, out = np.empty((height, width), np.int16), np.empty((height, width), np.float32)
-    for_each_strip(height, _STRIP_ROWS, lambda begin, end: _coarse(found, begin, end, coarse))
+    for_each_strip(height, lambda begin, end: _coarse(found, begin, end, coarse))
     cv2.filterSpeckles(coarse, -_FINE, _SPECKLE_PX, _FINE)
-    for_each_strip(height, _STRIP_ROWS, lambda begin, end: _sure(found, coarse, begin, end, out))
+    for_each_strip(height, lambda begin, end: _sure(found, coarse, begin, end, out))
     return out
 
 
@@ -381,7 +378,6 @@ def finished(found: Winners, left: Image, search: Search, sigma_model: SigmaMode
     sigma = np.empty_like(full)
     for_each_strip(
         left.shape[0],
-        _STRIP_ROWS,
         lambda begin, end: _write_sigmas(
             found, state, sigma_model.floor_px, sigma_model.gain, begin, end, sigma, share
         ),

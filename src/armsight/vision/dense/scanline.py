@@ -30,7 +30,6 @@ from armsight.vision.dense.winner import Winners, for_each_strip, make_winners
 Whole = NDArray[np.int16]
 #: How far to either side, px, and the grey level difference that halves a vote.
 _REACH, _ALIKE = 10, 8
-_STRIP_ROWS = 96
 
 
 @kernel("i2[:, ::1], const u1[:, ::1], f4[::1], i8, i8, i8, i8, i8, i2[:, ::1]", nogil=True)
@@ -77,7 +76,7 @@ def vote(whole: Whole, image: Image, count: int) -> Whole:
         def work(begin: int, end: int, source: Whole = source, out: Whole = whole, dy: int = dy, dx: int = dx) -> None:
             _vote(source, image, weights, dy, dx, size, begin, end, out)
 
-        for_each_strip(whole.shape[0], _STRIP_ROWS, work)
+        for_each_strip(whole.shape[0], work)
     return whole
 
 
@@ -280,7 +279,7 @@ class Scanline:
         def work(begin: int, end: int) -> None:
             _strip(pair, begin, end, search.first, search.count, size, whole)
 
-        for_each_strip(left.shape[0], _STRIP_ROWS, work)
+        for_each_strip(left.shape[0], work)
         found = make_winners(*left.shape)
         whole[whole >= search.count] = -1
         voted = vote(whole, left, search.count)

@@ -25,7 +25,7 @@ from armsight.kernels import kernel
 from armsight.vision.dense.cost import BLOCK, ONE, TWO, Bytes, CensusPair, prepare, raw_row, smooth_row
 from armsight.vision.dense.method import Disparity, Search
 from armsight.vision.dense.postprocess import SigmaModel, finished
-from armsight.vision.dense.winner import Counts, Winners, choose_row, for_each_strip, make_winners
+from armsight.vision.dense.winner import STRIP_ROWS, Counts, Winners, choose_row, for_each_strip, make_winners
 
 #: Bytes beyond the disparities in a slot of path costs: one before the first and one after the last are never the
 #: least.
@@ -193,9 +193,8 @@ def leftward(work: PathBuffers, image: Bytes, y: int, size: np.uintp, at: np.uin
         _sum(work.arena, s, work.total, at + o, size, True)
 
 
-#: Rows of a strip where all paths come from above; where they come from below too and a strip's totals are kept, rows
-#: at most and bytes about.
-_STRIP_ROWS, _STRIP_ROWS_KEPT, _STRIP_BYTES = 384, 96, 14e6
+#: Where paths come from below too a strip's totals are kept: rows at most and bytes about.
+_STRIP_ROWS_KEPT, _STRIP_BYTES = 96, 14e6
 #: Rows that the paths run before they count: by then what lies further back is forgotten.
 _RUN_UP = 24
 #: Penalties in thirds of a census bit. P1, of a disparity that changes by one, is four bits: what noise changes in a
@@ -287,5 +286,5 @@ class Semiglobal:
             _strip(pair, begin, end, self.paths, search.first, search.count, np.uintp(size), np.uint8(_P1), p2, found)
 
         kept = int(np.clip(_STRIP_BYTES / (2 * left.shape[1] * size), _RUN_UP, _STRIP_ROWS_KEPT))
-        for_each_strip(left.shape[0], _STRIP_ROWS if self.paths == 5 else kept, work)
+        for_each_strip(left.shape[0], work, STRIP_ROWS if self.paths == 5 else kept)
         return found

@@ -26,13 +26,17 @@ def processors() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def for_each_strip(height: int, rows: int, work: Callable[[int, int], None]) -> None:
+#: Rows of a strip at most; half: what strips share is computed more often; double: fewer strips than processors.
+STRIP_ROWS = 192
+
+
+def for_each_strip(height: int, work: Callable[[int, int], None], rows: int = STRIP_ROWS) -> None:
     """Call ``work(begin, end)`` for strips that cover all rows, on as many threads as the process has processors.
 
     Args:
         height: rows of the image.
-        rows: at most so many a strip; the strips are about equal, and do not depend on the number of threads.
         work: compiled without the interpreter's lock; writes to its own rows only.
+        rows: at most so many a strip; the strips are about equal, and do not depend on the number of threads.
     """
     count = -(-height // rows)
     bounds = [height * k // count for k in range(count + 1)]

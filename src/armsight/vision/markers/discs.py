@@ -26,8 +26,8 @@ from armsight.vision.markers.disc.common import FIELDS, SHARED
 MOST_REPORTED = 100
 #: Most candidates examined in an image; sort key of one that has no closed rim.
 _MOST_CANDIDATES, _NEVER = fit.MOST_DISCS, 99
-#: Most outlines in a smaller copy; one this large, as a share of the longest half chord in the image, is looked at.
-_MOST_LARGER, _LARGE = 512, 0.8
+#: An outline in a smaller copy this large, as a share of the longest half chord in the image, is looked at.
+_LARGE = 0.8
 #: Code -> rank among the reported.
 _ORDER = np.array(
     [fit.LOOK_ALIKES.index(c) if c in fit.LOOK_ALIKES else _NEVER for c in range(1 + max(fit.REASONS))], np.uint8
@@ -142,7 +142,7 @@ def _larger(image: NDArray[np.uint8], bright: bool, dark: bool) -> tuple[Array, 
         (K, 10) starts for the fit in the image itself, (K,) 1 for bright ones, -1 for dark ones.
     """
     if not hasattr(_KEPT, "outlines"):
-        n = _MOST_LARGER
+        n = _MOST_CANDIDATES
         _KEPT.outlines = np.empty((n, fit.UNKNOWNS)), np.empty(n, np.int64), np.empty(n, np.int64), search.workspace()
     starts, codes, signs, work = _KEPT.outlines
     thetas, kinds = [np.empty((0, fit.UNKNOWNS))], [np.empty(0, np.int64)]
