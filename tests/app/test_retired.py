@@ -32,6 +32,7 @@ from cli_runs import assert_rejected
         ("handeye --detect-units --eye to-hand", "handeye --eye to-hand --columns units=detect"),
         ("identify --rotation zyx --columns x_m=X", "identify --columns x_m=X --columns rotation=zyx"),
         ("demo --left a", "demo --left a"),
+        ("run --rate 30 --arm a", "run --arm a"),
         ("live --port 80 --host b", "live --http b:80"),
         ("hub keys s --host b", "hub keys s --hub b:7447"),
         ("board offsets --ar4-offsets m.yaml", "board offsets --board ar4:m.yaml"),

@@ -67,38 +67,49 @@ def _link(arguments: list[str], link: str) -> None:
         arguments[k] += f"#{link}"
 
 
+def _nothing(arguments: list[str], value: str) -> None:
+    """Leave an option out that nothing needs any more."""
+
+
 _EMULATED = "emulated:unicorn"  # the board of commands that are given none
-_FEETECH, _PAIRS = "--board feetech:PORT,FILE.json", "--source pairs:LEFT,RIGHT"
+_FEETECH, _PAIRS = "write --board feetech:PORT,FILE.json", "write --source pairs:LEFT,RIGHT"
 _SEEN_BY_TWO = ("calibrate", "measure", "handeye")
 #: All of them.
 RETIRED = (
-    Retired("--tool-link", (), "ARM.urdf#LINK", _link),
-    Retired("--baud", ("board",), "--board serial:PORT,baud=N", _behind("--board", ",baud={}", _EMULATED)),
+    Retired("--tool-link", (), "write ARM.urdf#LINK", _link),
+    Retired("--baud", ("board",), "write --board serial:PORT,baud=N", _behind("--board", ",baud={}", _EMULATED)),
     Retired("--calibration", ("board", "run", "live"), _FEETECH, _behind("--board", ",{}", _EMULATED)),
     Retired(
         "--cell", ("measure", "run", "live", "record", "replay"), "--stream cell:NAME", _into("--stream", "cell:{}")
     ),
     Retired("--left", _SEEN_BY_TWO, _PAIRS, _part("--source", 0, ",", before="pairs:")),
     Retired("--right", _SEEN_BY_TWO, _PAIRS, _part("--source", 1, ",", before="pairs:")),
-    Retired("--images", ("handeye",), "--source GLOB", _into("--source")),
-    Retired("--left-intrinsics", ("calibrate",), "--alone LEFT,RIGHT", _part("--alone", 0, ",")),
-    Retired("--right-intrinsics", ("calibrate",), "--alone LEFT,RIGHT", _part("--alone", 1, ",")),
-    Retired("--detections", ("calibrate", "measure"), "--source detections:FILE", _into("--source", "detections:{}")),
-    Retired("--body", ("calibrate",), "--target BODY.csv", _into("--target")),
-    Retired("--units", ("handeye",), "--columns units=mm", _into("--columns", "units={}")),
-    Retired("--seen-units", ("handeye",), "--columns seen:units=mm", _into("--columns", "seen:units={}")),
-    Retired("--detect-units", ("handeye",), "--columns units=detect", _into("--columns", "units=detect"), is_flag=True),
-    Retired("--rotation", ("handeye", "identify"), "--columns rotation=xyz", _into("--columns", "rotation={}")),
-    Retired("--seen-rotation", ("handeye",), "--columns seen:rotation=xyz", _into("--columns", "seen:rotation={}")),
-    Retired("--frames", ("handeye",), "--columns frames=BASE:FLANGE", _into("--columns", "frames={}")),
-    Retired("--scheduler", ("batch",), "--workers tcp://HOST:PORT", _into("--workers")),
-    Retired("--run", ("budget",), "--rig RUN", _into("--rig")),
-    Retired("--ar4-offsets", ("board",), "--board ar4:FILE.yaml", _into("--board", "ar4:{}")),
-    Retired("--follow-rig", ("demo",), "it for run: in the demo no rig moves", lambda *_: None, is_flag=True),
-    Retired("--host", ("live",), "--http HOST:PORT", _part("--http", 0, "127.0.0.1:8722", mark=":")),
-    Retired("--host", ("hub",), "--hub HOST:PORT", _part("--hub", 0, "127.0.0.1:7447", mark=":")),
-    Retired("--port", ("live",), "--http HOST:PORT", _part("--http", 1, "127.0.0.1:8722", mark=":")),
-    Retired("--port", ("hub",), "--hub HOST:PORT", _part("--hub", 1, "127.0.0.1:7447", mark=":")),
+    Retired("--images", ("handeye",), "write --source GLOB", _into("--source")),
+    Retired("--left-intrinsics", ("calibrate",), "write --alone LEFT,RIGHT", _part("--alone", 0, ",")),
+    Retired("--right-intrinsics", ("calibrate",), "write --alone LEFT,RIGHT", _part("--alone", 1, ",")),
+    Retired(
+        "--detections", ("calibrate", "measure"), "write --source detections:FILE", _into("--source", "detections:{}")
+    ),
+    Retired("--body", ("calibrate",), "write --target BODY.csv", _into("--target")),
+    Retired("--units", ("handeye",), "write --columns units=mm", _into("--columns", "units={}")),
+    Retired("--seen-units", ("handeye",), "write --columns seen:units=mm", _into("--columns", "seen:units={}")),
+    Retired(
+        "--detect-units", ("handeye",), "write --columns units=detect", _into("--columns", "units=detect"), is_flag=True
+    ),
+    Retired("--rotation", ("handeye", "identify"), "write --columns rotation=xyz", _into("--columns", "rotation={}")),
+    Retired(
+        "--seen-rotation", ("handeye",), "write --columns seen:rotation=xyz", _into("--columns", "seen:rotation={}")
+    ),
+    Retired("--frames", ("handeye",), "write --columns frames=BASE:FLANGE", _into("--columns", "frames={}")),
+    Retired("--scheduler", ("batch",), "write --workers tcp://HOST:PORT", _into("--workers")),
+    Retired("--run", ("budget",), "write --rig RUN", _into("--rig")),
+    Retired("--ar4-offsets", ("board",), "write --board ar4:FILE.yaml", _into("--board", "ar4:{}")),
+    Retired("--follow-rig", ("demo",), "in the demo no rig moves", _nothing, is_flag=True),
+    Retired("--rate", ("run", "live"), "the rate of the cameras is measured", _nothing),
+    Retired("--host", ("live",), "write --http HOST:PORT", _part("--http", 0, "127.0.0.1:8722", mark=":")),
+    Retired("--host", ("hub",), "write --hub HOST:PORT", _part("--hub", 0, "127.0.0.1:7447", mark=":")),
+    Retired("--port", ("live",), "write --http HOST:PORT", _part("--http", 1, "127.0.0.1:8722", mark=":")),
+    Retired("--port", ("hub",), "write --hub HOST:PORT", _part("--hub", 1, "127.0.0.1:7447", mark=":")),
 )
 
 
@@ -116,4 +127,4 @@ def in_todays_options(arguments: list[str]) -> tuple[list[str], list[str]]:
             found.append((retired, value if equals or retired.is_flag else next(rest, "")))
     for retired, value in found:
         retired.rule(kept, value)
-    return kept, [f"{retired.option} is retired: write {retired.now}" for retired, _ in found]
+    return kept, [f"{retired.option} is retired: {retired.now}" for retired, _ in found]

@@ -3,11 +3,14 @@
 import json
 import os
 import signal
+import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from armsight.app.progress import steps
+from armsight.data import Shot
 from armsight.sim.workcell.workcell import Workcell
 from cli_runs import assert_rejected
 
@@ -56,7 +59,9 @@ def test_workcell_and_devices_do_not_mix(armsight, files, tmp_path, source, boar
         ({"source": "usb:0,1", "board": "can:0"}, ("can:0", "serial:PORT")),
     ],
 )
-def test_what_is_not_there_is_named(armsight, files, tmp_path, given, said):
+def test_what_is_not_there_is_named(armsight, files, tmp_path, monkeypatch, given, said):
+    cameras = SimpleNamespace(read=lambda: time.sleep(0.002) or Shot("shot", None, None), close=lambda: None)
+    monkeypatch.setattr("armsight.app.run.devices.open_source", lambda spec: cameras)
     assert_rejected(armsight(*arguments(files, tmp_path / "run", **given)), *said)
 
 

@@ -28,7 +28,7 @@ pytestmark = [
     pytest.mark.usefixtures("host_firmware"),
     pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals"),
 ]
-CAMERAS, RATE = "640x360@15", 15
+CAMERAS = "640x360@15"
 MOTION = """
 [[motion]]
 kind = "joints"
@@ -76,7 +76,7 @@ def loops(monkeypatch):
 
 def arguments(far, tmp_path, *more):
     files = ("--rig", tmp_path / "rig.json", "--target", tmp_path / "body.toml", "--motion", tmp_path / "motion.toml")
-    ports = ("--source", "usb:0,1", "--board", f"serial:{far.port}", "--rate", RATE)
+    ports = ("--source", "usb:0,1", "--board", f"serial:{far.port}")
     return ("run", *ports, *files, "-o", tmp_path / "run", *more)
 
 

@@ -130,3 +130,30 @@ def test_whatever_ends_the_reading_is_raised_by_poll(end, said):
         polled_until_it_raises(shots)
     shots.close()
     assert source.closed
+
+
+class Paced(Reads):
+    """Cameras whose shots are so far apart by their stamps, s, with a stall; then they are silent."""
+
+    def __init__(self, apart_s):
+        super().__init__(None)
+        self.times = iter(np.cumsum(apart_s))
+
+    def read(self):
+        t_s = next(self.times, None)
+        if t_s is None:
+            self.taken.wait()
+        return None if t_s is None else Shot("shot", None, None, float(t_s))
+
+
+def test_the_rate_of_cameras_is_that_of_their_stamps_whatever_a_stall_does(monkeypatch):
+    shots = LiveShots(Paced([0.5, *[0.04] * 12]))
+    shots.start()
+    assert shots.rate_hz() == pytest.approx(25.0)
+    monkeypatch.setattr("armsight.loop.running.setup.RATE_S", 0.05)
+    source = Paced([0.1, 0.1])
+    slow = LiveShots(source)
+    slow.start()
+    with pytest.raises(DeviceError, match="2 shots came"):
+        slow.rate_hz()
+    source.taken.set()

@@ -541,7 +541,8 @@ class ArmStep(PageStep[ArmState]):
         if self._simulated is not None:
             poll = partial(self._look, self._simulated.poll_now)
             return replace(setup_of(self._simulated.workcell), arm=self.model, board=board, target=target, poll=poll)
-        rate_hz = cameras.rate_hz or options.rate_hz
+        if (rate_hz := cameras.rate_hz) is None:
+            raise InputError("the rate of the cameras is not known yet: wait for a few images")
         return Setup(self.model, board, cameras.poll, target, np.zeros_like, rate_hz, options.sync_s, HostClock())
 
     def _plan(self) -> tuple[MotionPlan, Array]:

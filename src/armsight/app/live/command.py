@@ -35,14 +35,6 @@ _HERE = ("127.0.0.1", "localhost", "::1")
 )
 @click.option("--motion", type=click.Path(path_type=Path), help="The motions (TOML, docs/howto/run.md).")
 @click.option(
-    "--rate",
-    "rate_hz",
-    type=click.FloatRange(0.1, 1000.0),
-    default=30.0,
-    show_default=True,
-    help="Rate of the cameras, Hz.",
-)
-@click.option(
     "--sync-ms",
     type=click.FloatRange(0.0, 1000.0),
     default=1.0,

@@ -35,7 +35,6 @@ class SessionOptions:
     board: str | None = None
     arm: str = "six_r"
     motion: Path | None = None
-    rate_hz: float = 30.0
     sync_s: float = 1e-3  # standard deviation of the time between the two exposures of a shot
     seed: int = 0
     streams: tuple[str, ...] = ()

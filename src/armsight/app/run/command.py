@@ -61,13 +61,6 @@ _POSES = "poses:"
     "three times in the largest cube within reach (armsight check plan).",
 )
 @click.option(
-    "--rate",
-    type=click.FloatRange(min=0.1, max=10_000.0),
-    default=60.0,
-    show_default=True,
-    help="Rate of the cameras, Hz; sim: knows its own.",
-)
-@click.option(
     "--sync-ms",
     type=click.FloatRange(min=0.0, max=1_000.0),
     default=0.1,
@@ -104,7 +97,6 @@ def command(
     fixed: tuple[str, ...],
     arm_spec: str,
     motion: Path | None,
-    rate: float,
     sync_ms: float,
     stream: tuple[str, ...],
     sync_led: bool,
@@ -162,7 +154,7 @@ def command(
     targets = handeye_poses(arm, motions.ends, _HANDEYE_POSES, 0)
     files = {"motion.toml": text, "body.toml": read_text(target_spec)}
     open_folder(output)
-    devices = Devices(source_spec, board_spec, arm, target, rate, 1e-3 * sync_ms, sync_led)
+    devices = Devices(source_spec, board_spec, arm, target, 1e-3 * sync_ms, sync_led)
     begun = False
     try:
         with steps() as progress:

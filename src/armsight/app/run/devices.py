@@ -67,7 +67,6 @@ class Devices:
     board: str  #: the controller board, such as serial:/dev/ttyACM0; or emulated:
     arm: Arm  #: the nominal arm
     target: Composite  #: the body on the tool
-    rate_hz: float  #: rate of the cameras, Hz
     sync_s: float  #: standard deviation of the time between the two exposures of a shot, s
     sync_led: bool = False  #: whether an LED on the board's clock is in view
 
@@ -112,19 +111,20 @@ def open_devices(devices: Devices) -> Iterator[Setup]:
             )
             yield replace(setup_of(workcell), target=devices.target)
             return
-        opened = stack.enter_context(open_motion_board(board))
-        require_joints(opened, board, devices.arm)
-        bit_s = sync_led_bit_s(opened, f"--board {board}") if devices.sync_led else None
         shots = LiveShots(open_source(source))
         stack.callback(shots.close)
         shots.start()
+        rate_hz = shots.rate_hz()  # before the board is opened: what it says meanwhile would pile up
+        opened = stack.enter_context(open_motion_board(board))
+        require_joints(opened, board, devices.arm)
+        bit_s = sync_led_bit_s(opened, f"--board {board}") if devices.sync_led else None
         yield Setup(
             devices.arm,
             opened,
             shots.poll,
             devices.target,
             np.zeros_like,
-            devices.rate_hz,
+            rate_hz,
             devices.sync_s,
             HostClock(),
             sync_led_bit_s=bit_s,

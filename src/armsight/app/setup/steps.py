@@ -52,7 +52,7 @@ def _by_loop(arm: str, board: str, look: SetupStep, written: SetupStep) -> tuple
         look,
         SetupStep(
             "The arm moves on its own: clear the table, keep a hand on the switch.",
-            f"run --source {CAMERAS} --board {board} --rig rig.json --target {PLATE} --arm {arm} --rate 30 -o run",
+            f"run --source {CAMERAS} --board {board} --rig rig.json --target {PLATE} --arm {arm} -o run",
         ),
         SetupStep("Accuracy and repeatability with the loop closed.", "check run --closed", needed=False),
         SetupStep("What the arm really is.", f"identify --arm {arm} --data run/handeye_poses.csv -o corrected"),

@@ -26,6 +26,10 @@ from armsight.vision.sources import Source
 
 #: Bound on the relative drift of the two clocks: 50 ppm for each crystal, and the slewing of the host's clock.
 DRIFT = 2e-4
+RATE_SHOTS = 12  # that show the cameras' rate; half: a stall at the start counts, double: a run begins later
+RATE_S = (
+    10.0  # they are waited for so long, s; half: slow cameras are rejected, double: one that is gone is noticed late
+)
 #: The clocks' rate is that of so many seconds; the least transmission times of two seconds differ by about this, s.
 _WINDOW_S, _SCATTER_S = 60, 1e-3
 
@@ -131,6 +135,7 @@ class LiveShots:
         self._lock = threading.Lock()
         self._newest: Shot | None = None
         self._failure: ArmsightError | None = None
+        self._times = deque[float](maxlen=RATE_SHOTS)
         self._ended = threading.Event()
         self._thread: threading.Thread | None = None
 
@@ -154,6 +159,23 @@ class LiveShots:
                 return
             with self._lock:
                 self._newest = shot
+            self._times.append(time.monotonic() if shot.t_s is None else shot.t_s)
+
+    def rate_hz(self) -> float:
+        """Wait for the first shots, and return how many come a second, by the median of the times between them.
+
+        Raises:
+            DeviceError: a camera was disconnected, or hardly a shot comes.
+        """
+        end = time.monotonic() + RATE_S
+        while len(self._times) < RATE_SHOTS and self._failure is None and time.monotonic() < end:
+            time.sleep(0.01)
+        if self._failure is not None:
+            raise self._failure
+        apart_s = np.diff(list(self._times))
+        if len(apart_s) < 2 or np.median(apart_s) <= 0:
+            raise DeviceError(f"{len(self._times)} shots came in {RATE_S:g} s: are both cameras there, and uncovered?")
+        return 1.0 / float(np.median(apart_s))
 
     def poll(self) -> Shot | None:
         """Return the newest shot not returned yet, or None.
