@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from armsight.data import Array, Body, Detections, Ids, Record
 from armsight.vision.markers.corner import OUTCOMES, WINDOW_MAX_PX, CornerFits, crossing_signs, refine_corners
-from armsight.vision.markers.grid import grid_points, local_squares, rotations
+from armsight.vision.markers.grid import grid_points, local_squares, rightwards, rotations
 from armsight.vision.markers.marker import CalibrationBoard
 from armsight.vision.markers.spec import Fields
 
@@ -138,14 +138,8 @@ class Chessboard(Record, CalibrationBoard):
         dark = [first_is_dark, *(first_is_dark != self._exchanges_colours(n) for n, _ in self._rotations)]
         if any(dark):
             orders = [order for order, is_dark in zip(orders, dark, strict=True) if is_dark]
-        if len(orders) == 1:
-            return orders[0]
-        uv = np.where(fits.kept[:, None], fits.uv, np.nan).reshape(self.rows, self.columns, 2)
-        rightwards = []
-        for order in orders:
-            step = np.nanmean(np.diff(uv.reshape(-1, 2)[order].reshape(uv.shape), axis=1), axis=(0, 1))
-            rightwards.append(step[0] / np.hypot(*step))
-        return np.asarray(orders[int(np.argmax(rightwards))])
+        points, kept = self.body.points, fits.kept
+        return max(orders, key=lambda order: rightwards(points[kept[order]], fits.uv[order][kept[order]]))
 
 
 def find_grid(image: NDArray[np.uint8], columns: int, rows: int) -> Array | None:

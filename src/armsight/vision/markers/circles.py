@@ -42,7 +42,7 @@ from armsight.vision.markers.circle_grid import (
     skips_line,
 )
 from armsight.vision.markers.disc.search import Grey
-from armsight.vision.markers.grid import grid_points, rotations
+from armsight.vision.markers.grid import grid_points, rightwards, rotations
 from armsight.vision.markers.marker import CalibrationBoard, Target
 from armsight.vision.markers.spec import Fields
 
@@ -224,12 +224,7 @@ class CircleGrid(Record, CalibrationBoard):
     def _upright(self, ids: Ids, uv: Array) -> Ids:
         """Return the numbering, of those that look the same, whose rows run most to the right."""
         orders = [ids, *(perm[ids] for perm in self.symmetries)]
-        rightwards = []
-        for order in orders:
-            p = self.body.points[order, :2]
-            (across, _), *_ = np.linalg.lstsq(p - p.mean(axis=0), uv - uv.mean(axis=0), rcond=None)
-            rightwards.append(across[0] / np.hypot(*across))
-        return orders[int(np.argmax(rightwards))]
+        return max(orders, key=lambda order: rightwards(self.body.points[order], uv))
 
 
 def unseen_row(target: Target, seen: Sequence[Ids]) -> tuple[str, ...]:

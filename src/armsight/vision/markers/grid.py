@@ -36,6 +36,13 @@ def rotations(points: Array) -> tuple[tuple[int, Ids], ...]:
     return tuple(found)
 
 
+def rightwards(points: Array, uv: Array) -> float:
+    """Return the cosine between x of a board and the image's rows: points (N, 3), m, seen at uv (N, 2), px."""
+    p = points[:, :2]
+    (across, _), *_ = np.linalg.lstsq(p - p.mean(axis=0), uv - uv.mean(axis=0), rcond=None)
+    return float(across[0] / np.hypot(*across))
+
+
 def local_squares(uv: Array) -> tuple[Array, Array]:
     """Estimate the shape of the squares around each point of a detected grid from its neighbours.
 
