@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 #: Largest difference of two unit rays that count as the same: a raw pixel is stored in single precision.
 _SAME_RAY = 1e-5
 #: Rows that are processed at a time, and step between the pixels that are checked for folds, px.
-_ROWS, _STEP = 32, 8
+ROWS_AT_ONCE, _STEP = 32, 8
 #: Least sine of the angle between the view and the baseline: below it one camera is behind the other.
 _ASIDE = 0.2
 
@@ -162,10 +162,10 @@ def _map(
     """Return the raw pixel (H, W, 2) of every rectified pixel, NaN where there is none."""
     width, height = int(size[0]), int(size[1])
     out = np.empty((height, width, 2), np.float32)
-    for top in range(0, height, _ROWS):
-        v, u = np.mgrid[top : min(top + _ROWS, height), :width].astype(np.float64)
+    for top in range(0, height, ROWS_AT_ONCE):
+        v, u = np.mgrid[top : min(top + ROWS_AT_ONCE, height), :width].astype(np.float64)
         rays = _rays(np.column_stack([u.ravel(), v.ravel()]), focal, principal) @ R_camera_rect.T
-        out[top : top + _ROWS] = camera.project(rays).reshape(*u.shape, 2)
+        out[top : top + ROWS_AT_ONCE] = camera.project(rays).reshape(*u.shape, 2)
     # Far off its axis a distortion polynomial folds back: a pixel whose ray is not its own is invalid. Folds are far
     # larger than a few pixels, so only every eighth pixel is checked.
     v, u = np.mgrid[0:height:_STEP, 0:width:_STEP]

@@ -15,12 +15,11 @@ from numpy.typing import NDArray
 
 from armsight.data import Array, Record
 from armsight.vision.dense.method import Disparity
-from armsight.vision.rectify import Rectification
+from armsight.vision.rectify import ROWS_AT_ONCE, Rectification
 from armsight.vision.triangulate import midpoints
 
 #: Number of positions along rows, columns and inverse disparity at which the calibration's share is computed.
 _COLUMNS, _ROWS, _DEPTHS = 7, 5, 4
-_ROWS_AT_ONCE = 32
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,8 +65,8 @@ def depth_of(rectification: Rectification, result: Disparity) -> Depth:
     seen, shape = rectification.seen("left"), result.disparity.shape
     z, share = np.full(shape, np.nan), _calibration(rectification, result.disparity, result.measured & seen)
     sigma = np.empty(shape)
-    for top in range(0, shape[0], _ROWS_AT_ONCE):
-        rows = slice(top, top + _ROWS_AT_ONCE)
+    for top in range(0, shape[0], ROWS_AT_ONCE):
+        rows = slice(top, top + ROWS_AT_ONCE)
         z[rows] = np.where(seen[rows], rectification.depth(result.disparity[rows]), np.nan)
         share[rows] *= z[rows]
         per_px = z[rows] ** 2 / (rectification.focal_px * rectification.rig.baseline_m)
@@ -91,8 +90,8 @@ def _calibration(rectification: Rectification, disparity: NDArray[np.float32], m
     )
     whole = np.isfinite(share)
     share = np.where(whole, share, share[whole].max() if whole.any() else 0.0)  # corners that a camera does not see
-    for top in range(0, height, _ROWS_AT_ONCE):
-        strip = slice(top, top + _ROWS_AT_ONCE)
+    for top in range(0, height, ROWS_AT_ONCE):
+        strip = slice(top, top + ROWS_AT_ONCE)
         v, u = np.nonzero(measured[strip])
         inverse = 1 / disparity[strip][v, u].astype(np.float64)
         positions = ((v + top) / max(height - 1, 1), u / max(width - 1, 1), (inverse - low) / (high - low))

@@ -18,7 +18,7 @@ import numpy as np
 from armsight.data import Array, Correspondences, Ids, Record
 from armsight.estimate.chance import chi_square_limit
 from armsight.geometry.pose import exp_se3, transform
-from armsight.vision.discs.assign import correspondences, settle
+from armsight.vision.discs.assign import GATE_QUANTILE, correspondences, settle
 from armsight.vision.discs.bias import LEAST_FACING, Expected, expect, visible
 from armsight.vision.discs.pairing import DEPTHS_M, SIZE_SIGMAS, SIZE_TOLERANCE, DiscView, Pairs
 
@@ -26,8 +26,6 @@ from armsight.vision.discs.pairing import DEPTHS_M, SIZE_SIGMAS, SIZE_TOLERANCE,
 FOUND = 0.9
 #: One standard deviation of an ellipse's size about the disc's, as a share, beside its noise.
 SIZE_SHARE = SIZE_TOLERANCE / 3
-#: Discs that fit worse than this quantile of chi-square are not those of the body.
-FIT_QUANTILE = 1.0 - 1e-5
 _STEPS, _DONE = 12, 1e-4
 
 
@@ -112,7 +110,7 @@ def hypothesis(view: DiscView, pairs: Pairs, T_left_body: Array, rows: Ids) -> H
 @lru_cache(maxsize=256)
 def _limit(freedom: int) -> float:
     """Chi-square above which a fit is rejected."""
-    return chi_square_limit(freedom, 1 - FIT_QUANTILE)
+    return chi_square_limit(freedom, 1 - GATE_QUANTILE)
 
 
 def _fit(view: DiscView, T: Array, rows: Ids) -> _Fit | None:

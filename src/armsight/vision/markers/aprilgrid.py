@@ -29,7 +29,7 @@ _LEAST_TAGS = 4
 #: The gap from which that of a grid of unknown size is fitted; half, double: outlines that were missed are predicted worse.
 _USUAL_SPACING = 0.3
 #: Tags of a grid lie so near to its steps, in these; half: wide lenses bend it more, double: other columns nearly fit.
-_OFF_GRID = 0.2
+OFF_GRID = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +74,7 @@ class AprilGrid(Record, CalibrationBoard):
             steps = np.stack([ids % columns, ids // columns], axis=1).astype(float)
             fitting.append((_off_plane(steps, middles), columns))
         off, columns = min(fitting, default=(np.inf, 1))
-        if off > _OFF_GRID:
+        if off > OFF_GRID:
             return None
         board = AprilGrid(columns, count // columns, tag_m, _USUAL_SPACING)
         seen = board.detect(image)

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from armsight.data import Array, Body, Detections, Record
 from armsight.errors import InputError
+from armsight.vision.markers.aprilgrid import OFF_GRID
 from armsight.vision.markers.aruco import charuco_detector, detect_markers, family_name, family_size, marker_corners
 from armsight.vision.markers.chessboard import fit_grid, misfits
 from armsight.vision.markers.grid import completed, grid_points
@@ -28,8 +29,6 @@ from armsight.vision.markers.spec import Fields, first_id
 #: Markers from whose neighbours the image's scale at one follows, it included, and how far they may be from it, squares;
 #: of more, or of those further off, the perspective bends the fit. Fewest markers that have such neighbours.
 _NEIGHBOURS, _REACH, _FITS = 5, 2.1, 3
-#: Markers that are off their layout by more than this share of a square have another one.
-_OFF = 0.2
 #: OpenCV's outline of a marker runs through the middles of its outermost pixels: it is this much smaller, px.
 _OUTLINE_PX = 1.0
 #: A given side of the markers that differs from the image's by more than this share, and by more than so many pixels
@@ -97,7 +96,7 @@ class Charuco(Record, CalibrationBoard):
                 board = Charuco(columns, squares // columns, square_m, 0.75 * square_m, family)
                 off, side_m, _ = min(board._sides(corners, outlined, identities, legacy) for legacy in (False, True))
                 fitting.append((off, side_m, board))
-        if not fitting or min(fitting, key=lambda each: each[0])[0] > _OFF:
+        if not fitting or min(fitting, key=lambda each: each[0])[0] > OFF_GRID:
             return None
         _, side_m, board = min(fitting, key=lambda each: each[0])
         marker_m = round(side_m / _TO_M) * _TO_M if np.isfinite(side_m) else board.marker_m
@@ -176,7 +175,7 @@ class Charuco(Record, CalibrationBoard):
         outlined = _outlined(image, corners)
         sides = [self._sides(corners, outlined, identities, legacy) for legacy in (False, True)]
         off, seen_m, px = min(sides, key=lambda found: found[0])
-        if off > _OFF:
+        if off > OFF_GRID:
             if (first := self._other_first(corners, outlined, identities)) is not None:
                 last = first + len(self.codes[1]) - 1
                 return (
@@ -205,7 +204,7 @@ class Charuco(Record, CalibrationBoard):
         low, high = max(0, int(ids.max()) - count + 1), min(int(ids.min()), family_size(self.family) - count)
         for first in range(high, low - 1, -1):
             shifted = (identities + self.first) - first
-            if min(self._sides(corners, outlined, shifted, legacy)[0] for legacy in (False, True)) <= _OFF:
+            if min(self._sides(corners, outlined, shifted, legacy)[0] for legacy in (False, True)) <= OFF_GRID:
                 return first
         return None
 

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array, Body, Detections, Ids, Record
+from armsight.vision.markers.chessboard import KEPT_SHARE
 from armsight.vision.markers.circle_blobs import (
     Blobs,
     contrasts,
@@ -46,8 +47,8 @@ from armsight.vision.markers.grid import grid_points, rightwards, rotations
 from armsight.vision.markers.marker import CalibrationBoard, Target
 from armsight.vision.markers.spec import Fields
 
-#: The share of a board's discs that must be measured; with rings a smaller part is enough.
-_KEPT_SHARE, _KEPT_WITH_RINGS = 0.5, 0.2
+#: The share of a board's discs that must be measured where it has rings; a smaller part is enough then.
+_KEPT_WITH_RINGS = 0.2
 #: Grids in one image that may be the board, the best first.
 _GRIDS = 4
 #: A disc that the search missed is there if its contrast is at least this share of the others'.
@@ -172,7 +173,7 @@ class CircleGrid(Record, CalibrationBoard):
 
     def _found(self, image: Grey, dark: bool, light: bool) -> Detections:
         """Find the board by its dark discs, its light ones, or whichever make the board."""
-        least = max(4, int((_KEPT_WITH_RINGS if self.rings else _KEPT_SHARE) * len(self._ring)))
+        least = max(4, int((_KEPT_WITH_RINGS if self.rings else KEPT_SHARE) * len(self._ring)))
         grids: list[tuple[float, bool, Blobs, Lattice]] = []
         for polarity, blobs in zip((False, True), find_blobs(image, light, dark), strict=True):
             lattices = grow_lattices(blobs, len(self._ring))

@@ -23,6 +23,7 @@ _ENVIRONMENT = {
     "OPENCV_FFMPEG_LOGLEVEL": "-8",  # FFmpeg's level for quiet
     "OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT": "2",  # s; instead of 10, so that a camera's stall is seen in time
 }
+STALL_S = 5.0  # without data for that long a camera or stream has stalled; half: slow starts fail, double: a user waits
 #: Time stamps a period is taken from: long enough that a late frame does not move the median, short enough to follow
 #: a camera that lengthens its exposure in the dark.
 _STAMPS = 10

@@ -28,9 +28,8 @@ from armsight.data import Image, Shot
 from armsight.errors import DeviceError, InputError
 from armsight.vision.image import jpeg_in
 from armsight.vision.source import Source
-from armsight.vision.sources.capture import Rhythm, allowed_skew, open_capture
+from armsight.vision.sources.capture import STALL_S, Rhythm, allowed_skew, open_capture
 
-TIMEOUT_S = 5.0  # without data for that long a stream has stalled
 _SETTLE_S = 1.0  # FFmpeg hands out what it collected while it looked at an RTSP stream in one burst: passed over
 _MAX_FRAME = 64 << 20  # bytes; beyond it the stream is not MJPEG
 
@@ -55,7 +54,7 @@ class Stream(Protocol):
 class MjpegStream:
     """MJPEG over HTTP or HTTPS, with the user and password of the address if it has them."""
 
-    def __init__(self, url: str, timeout_s: float = TIMEOUT_S) -> None:
+    def __init__(self, url: str, timeout_s: float = STALL_S) -> None:
         self.url = shown(url)
         self._address, self._timeout_s = urlsplit(url), timeout_s
         self._socket: socket.socket | None = None
@@ -141,7 +140,7 @@ class MjpegStream:
 class RtspStream:
     """RTSP through OpenCV's FFmpeg, over TCP."""
 
-    def __init__(self, url: str, timeout_s: float = TIMEOUT_S) -> None:
+    def __init__(self, url: str, timeout_s: float = STALL_S) -> None:
         self.url = shown(url)
         self._address, self._timeout_s = url, timeout_s
         self._stop = threading.Event()
@@ -218,7 +217,7 @@ class UrlSource(Source):
 
     count: int | None = None
 
-    def __init__(self, left: Stream, right: Stream, timeout_s: float = TIMEOUT_S + 2) -> None:
+    def __init__(self, left: Stream, right: Stream, timeout_s: float = STALL_S + 2) -> None:
         self._changed = threading.Condition()
         self._readers = [_Reader(stream, self._changed) for stream in (left, right)]
         self._timeout_s = timeout_s

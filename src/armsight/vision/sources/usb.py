@@ -27,10 +27,9 @@ from armsight.data import Image, Shot
 from armsight.errors import DeviceError, InputError
 from armsight.vision.image import jpeg_in
 from armsight.vision.source import Source
-from armsight.vision.sources.capture import QuietCapture, Rhythm, allowed_skew, open_capture
+from armsight.vision.sources.capture import STALL_S, QuietCapture, Rhythm, allowed_skew, open_capture
 from armsight.vision.sources.v4l2 import EXPOSURE_UNIT_MS
 
-STALL_S = 5.0  # without a frame for that long a camera has stalled
 _MANUAL, _AUTO = 1, 3  # of V4L2's auto_exposure: manual mode, aperture priority mode
 _QUEUE = 4  # frames OpenCV's V4L2 lets the driver queue
 _CATCH_UP = 30  # grabs after which two cameras that never come close in time are given up
