@@ -191,11 +191,11 @@ CASES["quaternion columns exchanged"] = wrong(
 )
 CASES["conjugate quaternions"] = wrong(quaternions(transposed(A)), "the rotations are inverse")
 CASES["conjugate quaternions, seen"] = wrong(None, "the rotations are inverse", seen=quaternions(transposed(B)))
-CASES["no convention of three angles"] = wrong(poses(A, "xyz", 1.0, EULER), "say --columns rotation=")
+CASES["no convention of three angles"] = wrong(poses(A, "xyz", 1.0, EULER), "give --columns rotation=")
 CASES["no convention of a quaternion"] = wrong(poses(A), "which of the four numbers of a quaternion is w")
 CASES["an unknown convention"] = wrong(poses(A), "known are wxyz, xyzw, rotvec", rotation="rpy")
 CASES["a quaternion convention for angles"] = wrong(
-    poses(A, "xyz", 1.0, EULER), "say --columns rotation=", rotation="wxyz"
+    poses(A, "xyz", 1.0, EULER), "give --columns rotation=", rotation="wxyz"
 )
 CASES["KUKA's angles as Fanuc's"] = wrong(
     csv("X,Y,Z,W,P,R", 1e3 * A[:, :3, 3], rotations_as(A, "ZYX")[:, ::-1]), "about x and z are exchanged|W about x"

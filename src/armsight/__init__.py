@@ -143,7 +143,13 @@ def __getattr__(name: str) -> Any:  # noqa: ANN401 - a module's names are of any
 
 
 #: Option of the command line in a message -> the argument that a Python caller gives instead, where the names differ.
-_ARGUMENTS = {"model": "arm", "units": "unit", "seen-units": "unit", "seen-rotation": "rotation"}
+_ARGUMENTS = {"model": "arm"}
+#: What --columns says in a message -> the same of a Python caller.
+_SAID = {
+    r"--columns (?:seen:)?(?=rotation=|units=)": "",
+    r"(?:seen:)?units=detect": "detect_units=True",
+    r"\bunits=": "unit=",
+}
 
 
 def _in_python(function: Callable[..., Any], name: str) -> Callable[..., Any]:
@@ -155,9 +161,10 @@ def _in_python(function: Callable[..., Any], name: str) -> Callable[..., Any]:
             return function(*args, **options)
         except _root() as error:
             said = lambda m: f"{_ARGUMENTS.get(m[1], m[1].replace('-', '_'))}{'=' if m[2] else ''}"  # noqa: E731
-            error.args = (
-                re.sub(r"(?<![\w-])--([a-z][a-z-]*)( (?=[A-Za-z]+[:=]|wxyz|xyzw|rotvec|m\b|mm\b))?", said, str(error)),
-            )
+            text = str(error)
+            for option, argument in _SAID.items():
+                text = re.sub(option, argument, text)
+            error.args = (re.sub(r"(?<![\w-])--([a-z][a-z-]*)( (?=[A-Za-z]+[:=]))?", said, text),)
             raise
 
     call.__module__, call.__name__, call.__qualname__ = __name__, name, name  # where pickle finds it

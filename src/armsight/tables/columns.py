@@ -299,7 +299,8 @@ class Columns:
         """Return four numbers (N, 4) without names, and their convention; reject those that stand before the position."""
         if rotation not in ("wxyz", "xyzw"):
             raise InputError(
-                f"{self.path}: which of the four numbers of a quaternion is w? say --columns rotation=wxyz or rotation=xyzw"
+                f"{self.path}: which of the four numbers of a quaternion is w? "
+                "give --columns rotation=wxyz or rotation=xyzw"
             )
         last, first = self.numbers(["n1", "n2", "n3", "n4"]), self.numbers([*"xyz", "n1"])
         off, other = (float(np.abs(np.linalg.norm(four, axis=1) - 1).max()) for four in (last, first))
@@ -323,7 +324,7 @@ class Columns:
         convention = rotation or ("rotvec" if unit == "_rad" else None)
         if convention is None or convention in ("wxyz", "xyzw"):
             raise InputError(
-                f"{self.path}: what do the three numbers of a rotation mean? say --columns rotation=rotvec, or the order "
+                f"{self.path}: what do the three numbers of a rotation mean? give --columns rotation=rotvec, or the order "
                 "of the angles: xyz (about fixed axes), XYZ (about the rotated axes), zyx ..."
             )
         if unit == "_rad" and np.abs(found).max() > MOST_RAD:

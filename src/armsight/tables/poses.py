@@ -216,14 +216,14 @@ def _positions(table: Columns, unit: str | None, detect: bool, side: str) -> tup
         if not detect:
             raise InputError(
                 f"{table.path}: positions of up to {far:.0f} m: are they millimetres? name the columns x_mm y_mm z_mm, or "
-                f"say {'' if suffix else f'{option}units=mm or '}{option}units=detect{_or_else(table, far, side)}"
+                f"give {'' if suffix else f'{option}units=mm or '}{option}units=detect{_or_else(table, far, side)}"
             )
         return 1e-3 * p, 1e-3, (f"{table.path}: positions read as millimetres: as metres they would reach {far:.0f} m",)
     if unit_m == 1e-3 and far < NEAR_M:
         if not detect:
             raise InputError(
                 f"{table.path}: positions of at most {1e3 * far:.2g} mm: are they metres? name the columns x_m y_m z_m, or "
-                f"say {'' if suffix else f'{option}units=m or '}{option}units=detect"
+                f"give {'' if suffix else f'{option}units=m or '}{option}units=detect"
             )
         within = f"as millimetres they would stay within {1e3 * far:.2g} mm"
         return p, 1.0, (f"{table.path}: positions read as metres: {within}",)

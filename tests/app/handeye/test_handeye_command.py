@@ -295,7 +295,9 @@ def test_millimetres_are_rejected_or_detected(armsight, tmp_path, seen):
         "--eye",
         "in-hand",
     )
-    assert_rejected(armsight(*given), "centimetres taken for metres: correct seen:units, or say --columns units=detect")
+    assert_rejected(
+        armsight(*given), "centimetres taken for metres: correct seen:units, or give --columns units=detect"
+    )
     document, notes = found(armsight, robot, tmp_path / "cm.txt", "--columns", "units=detect")
     assert "the target's lengths are centimetres taken for metres; converted" in notes
     np.testing.assert_allclose(np.array(document["T_flange_rig"])[:3, 3], X[:3, 3] / 10, atol=1e-3)
@@ -327,7 +329,7 @@ def test_what_does_not_fit_is_named(armsight, tmp_path, seen):
     angles = Rotation.from_matrix(A[:, :3, :3]).as_euler("xyz", degrees=True)
     euler = named(tmp_path / "e.csv", "x_m,y_m,z_m,rx_deg,ry_deg,rz_deg", np.hstack([A[:, :3, 3], angles]))
     rejected(euler, "the rotations are xyz, not zyx", more=("--columns", "rotation=zyx"))
-    rejected(euler, "say --columns rotation=")
+    rejected(euler, "give --columns rotation=")
     joints = named(tmp_path / "q.csv", ",".join(f"q{i}_rad" for i in range(1, 7)), q[:, [0, 2, 1, 3, 4, 5]])
     rejected(joints, "the joints are in another order", "q1, q3, q2", more=("--model", "six_r"))
     rejected(joints, "give --model")

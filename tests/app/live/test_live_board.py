@@ -8,7 +8,6 @@ import pytest
 
 from armsight.app.live import arm
 from armsight.app.live.arm import ArmStep
-from armsight.app.live.board import StoppableBoard
 from armsight.app.live.step import SessionOptions, Shared
 from armsight.data import JointStates, Missed
 from armsight.errors import DeviceError, InputError
@@ -16,6 +15,7 @@ from armsight.robot.boards.codes import BoardState, Command
 from armsight.robot.boards.contract import Abilities
 from armsight.robot.boards.feetech.board import FeetechBoard
 from armsight.robot.boards.feetech.bus import ServoBus
+from armsight.robot.boards.stoppable import StoppableBoard
 from armsight.robot.models import MODELS
 from armsight.sim.boards.device import SteppedLink
 from armsight.sim.boards.so101 import So101Bus

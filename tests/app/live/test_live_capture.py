@@ -10,9 +10,9 @@ from armsight.app.live import capture as module
 from armsight.app.live.capture import CameraCapture, LiveShot
 from armsight.app.live.records import UseCameras
 from armsight.app.live.session import LiveSession, SessionOptions
-from armsight.app.live.simulated import SimulatedCameras
 from armsight.data import PoseEstimate, Shot
 from armsight.errors import DeviceError, InputError
+from armsight.sim.workcell.person import SimulatedCameras
 from armsight.vision.markers.targets import open_target
 from armsight.vision.pose.measure import measure
 from waiting import until

@@ -5,13 +5,14 @@ import urllib.request
 
 import pytest
 
-from armsight.app.live import calibration, records, simulated
+from armsight.app.live import calibration, records
 from armsight.app.live.body import scaled_spec
 from armsight.app.live.server import LiveServer
 from armsight.app.live.session import LiveSession
 from armsight.app.live.step import SessionOptions
 from armsight.errors import InputError
 from armsight.files import read_table
+from armsight.sim.workcell import person
 from armsight.vision.pose.shot_pose import CSV_COLUMNS
 from armsight.vision.rig import StereoRig
 from waiting import until
@@ -49,7 +50,7 @@ def browsers():
 @pytest.fixture(scope="module")
 def session(tmp_path_factory, host_firmware):
     quick = pytest.MonkeyPatch()
-    quick.setattr(simulated, "_MOVE_S", 0.15)
+    quick.setattr(person, "_MOVE_S", 0.15)
     quick.setattr(calibration, "STILL_S", 0.05)
     quick.setattr(calibration, "MODELS", ("brown5",))
     folder = tmp_path_factory.mktemp("live")

@@ -4,14 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from armsight.app.live.cameras import (
-    FlickerWatch,
-    ImageQuality,
-    edge_spread_px,
-    image_quality,
-    quality_notes,
-    same_camera,
-)
+from armsight.app.live.cameras import flicker_note, quality_notes
+from armsight.vision.quality import FlickerWatch, ImageQuality, edge_spread_px, image_quality, same_camera
 
 
 def squares(sigma_px, noise=1.0):
@@ -67,7 +61,7 @@ def test_flicker_is_found_with_its_frequency(hz, rate_hz):
     amplitude, found_hz = flicker.found()
     assert found_hz == hz
     assert 0.01 < amplitude < 0.05
-    assert f"{hz:.0f} Hz" in flicker.note().text
+    assert f"{hz:.0f} Hz" in flicker_note(flicker).text
 
 
 def test_what_moves_does_not_flicker():
@@ -76,7 +70,7 @@ def test_what_moves_does_not_flicker():
     for k in range(12):
         flicker.take(np.roll(still, 9 * k, axis=0))
     assert flicker.found() is None
-    assert FlickerWatch(30.0).note() is None
+    assert flicker_note(FlickerWatch(30.0)) is None
 
 
 def test_one_camera_twice_is_noticed():

@@ -147,7 +147,7 @@ def test_another_convention_of_angles_is_rejected_and_the_right_one_named(tmp_pa
     for given in set(ROTATIONS) - set(right):
         text = said(w, read_poses(path, rotation=given).measured)
         assert f"meant as {' or '.join(right)}, not as {given} " in text
-        assert text.endswith(f"say --columns rotation={right[0]}")
+        assert text.endswith(f"give --columns rotation={right[0]}")
     for given in right:
         check_plausible(arm, read_poses(path, rotation=given).measured)
 

@@ -2,8 +2,8 @@
 
 In: the arm's board, the session's cameras, rig and body. Out: an :class:`ArmState` at any time, and the folder of a run as
 ``armsight run`` writes it. One thread drives the board: it reads the joints and runs the experiment. A stop goes to the
-board from its own thread (:class:`~armsight.app.live.board.StoppableBoard`), and is answered with the state that the board
-itself reports. With ``poses:FILE`` nothing is driven: another program moves the arm, and logged its joint angles.
+board from its own thread (:class:`~armsight.robot.boards.stoppable.StoppableBoard`), and is answered with the state that
+the board itself reports. With ``poses:FILE`` nothing is driven: another program moves the arm, and logged its joint angles.
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ from pathlib import Path
 
 import numpy as np
 
-from armsight.app.live.board import StoppableBoard
 from armsight.app.live.handeye import (
     HandEyeGuide,
     HandEyeState,
@@ -61,6 +60,7 @@ from armsight.robot.arm_file import open_arm
 from armsight.robot.board_registry import emulator_name, is_real, open_motion_board, slowed
 from armsight.robot.boards.codes import STATE_TEXTS, BoardState, Fault
 from armsight.robot.boards.serial import list_ports
+from armsight.robot.boards.stoppable import StoppableBoard
 from armsight.robot.kinematics.arm import Arm
 from armsight.robot.models import MODELS
 from armsight.robot.trajectories import point_to_point

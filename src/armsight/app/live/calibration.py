@@ -19,7 +19,6 @@ import numpy as np
 
 from armsight.app.calibrate.assessment import advice, assess, graded_metrics
 from armsight.app.calibrate.run import provenance
-from armsight.app.live.cameras import SHARP_PX, edge_spread_px
 from armsight.app.live.capture import LiveShot
 from armsight.app.live.records import Drawn, asked, dots, polyline
 from armsight.app.live.step import Guided, GuidedState, Shared
@@ -38,6 +37,7 @@ from armsight.vision.markers.board import open_board
 from armsight.vision.markers.chessboard import Chessboard
 from armsight.vision.markers.marker import CalibrationBoard
 from armsight.vision.pose.pnp import body_poses
+from armsight.vision.quality import SHARP_PX, edge_spread_px
 from armsight.vision.rig import StereoRig
 
 #: The board stands still when its corners moved less than this in so long, px and s, over so many detections.

@@ -24,7 +24,7 @@ from armsight.app.stream.mcap_file import LazyMcap, properties
 from armsight.app.stream.streams import open_streams
 from armsight.data import Array, Body, Missed, PoseEstimate, Shot
 from armsight.errors import InputError
-from armsight.geometry.pose import adjoint, inverse, transform
+from armsight.geometry.pose import adjoint, inverse, left_axes, transform
 from armsight.geometry.rotation import euler_zyx, skew
 from armsight.loop.handeye.pivot import MIN_POSES, Pivot, calibrate_pivot
 from armsight.loop.health import HealthMonitor
@@ -334,7 +334,7 @@ class MeasureStep(PageStep[MeasureState]):
     def mark_position(self) -> None:
         """Mark the present position: distances are measured from it."""
         pose = self._pose()
-        self._mark = np.array(pose.T_left_body[:3, 3]), _along(pose.T_left_body, pose.cov_noise)[:3, :3]
+        self._mark = np.array(pose.T_left_body[:3, 3]), left_axes(pose.T_left_body, pose.cov_noise)[:3, :3]
 
     @asked("measuring")
     def pivot_tip(self) -> None:
@@ -449,7 +449,7 @@ class MeasureStep(PageStep[MeasureState]):
             return None
         marked, cov = self._mark
         away = pose.T_left_body[:3, 3] - marked
-        return _length_mm(away, cov + _along(pose.T_left_body, pose.cov_noise)[:3, :3])
+        return _length_mm(away, cov + left_axes(pose.T_left_body, pose.cov_noise)[:3, :3])
 
     def _tip_now(self, pose: PoseEstimate) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
         """Return where the tip is, and one sigma of it, mm."""
@@ -494,7 +494,7 @@ class MeasureStep(PageStep[MeasureState]):
         if abs(newest[0].number - live.number) > 1:
             return RelativeShown(spec, "not measured while the arm moves")
         T, cov = relative_pose(rig, pose, newest[1])
-        cov = _along(T, cov)
+        cov = left_axes(T, cov)
         angles = tuple(np.degrees(euler_zyx(T[:3, :3])[0]).tolist())
         distance = _length_mm(T[:3, 3], cov[:3, :3])
         return RelativeShown(spec, None, _mm(T[:3, 3]), angles, *_sigmas(cov), distance)
@@ -502,7 +502,7 @@ class MeasureStep(PageStep[MeasureState]):
 
 def shown_pose(pose: PoseEstimate, T_zero_left: Array | None) -> PoseShown:
     """Return a pose as people read it; relative to a zero where one is given."""
-    whole, noise = _along(pose.T_left_body, pose.cov), _along(pose.T_left_body, pose.cov_noise)
+    whole, noise = left_axes(pose.T_left_body, pose.cov), left_axes(pose.T_left_body, pose.cov_noise)
     shown = pose.T_left_body if T_zero_left is None else T_zero_left @ pose.T_left_body
     (sigma_mm, sigma_deg), ellipsoid = _sigmas(whole), 1e6 * whole[:3, :3]
     return PoseShown(
@@ -516,12 +516,6 @@ def shown_pose(pose: PoseEstimate, T_zero_left: Array | None) -> PoseShown:
         len(pose.points.ids),
         tuple(map(tuple, ellipsoid.tolist())),
     )
-
-
-def _along(T: Array, cov: Array) -> Array:
-    """Return the covariance (6, 6) of a pose (4, 4), right tangent, along the axes of the frame that it is in."""
-    R = np.kron(np.eye(2), T[:3, :3])
-    return np.asarray(R @ cov @ R.T)
 
 
 def _sigmas(cov: Array) -> tuple[tuple[float, ...], tuple[float, ...]]:

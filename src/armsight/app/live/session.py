@@ -26,7 +26,6 @@ from armsight.app.live.capture import CameraCapture, LiveShot
 from armsight.app.live.measuring import MeasureState, MeasureStep
 from armsight.app.live.recorded import RecordedStep
 from armsight.app.live.records import STEPS, Event, PageCommand, asked
-from armsight.app.live.simulated import SimulatedCameras
 from armsight.app.live.step import SessionOptions, Shared, why
 from armsight.app.run.motion_file import DEFAULT_MOTION, QUICK
 from armsight.app.show.messages import Level, Note
@@ -35,6 +34,7 @@ from armsight.errors import ArmsightError, InputError
 from armsight.files import check_folder, read_json, require_version, unused, write_text
 from armsight.robot.arm_file import open_arm
 from armsight.robot.board_registry import EMULATED, slowed
+from armsight.sim.workcell.person import SimulatedCameras
 from armsight.sim.workcell.workcell import CHESSBOARD
 from armsight.vision.rig import StereoRig
 

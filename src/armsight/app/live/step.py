@@ -15,10 +15,10 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from armsight.app.live.capture import CameraCapture
-from armsight.app.live.simulated import SimulatedCameras
 from armsight.app.run.motion_file import DEFAULT_MOTION
 from armsight.app.show.messages import Level
 from armsight.errors import ArmsightError
+from armsight.sim.workcell.person import SimulatedCameras
 
 S = TypeVar("S")
 

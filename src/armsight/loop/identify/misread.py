@@ -359,7 +359,7 @@ def _scaled(recording: PairedPoses) -> Iterator[_Reading]:
         for name, length in UNITS.items():
             by = length / unit_m
             said = (
-                f"the {whose}'s lengths are {name} taken for {given}: correct {option}, or say --columns units=detect"
+                f"the {whose}'s lengths are {name} taken for {given}: correct {option}, or give --columns units=detect"
             )
             if name != given and side == "A":
                 yield _Reading(replace(p, A=_longer(p.A, by)), said, path, by, of_units=True)
@@ -800,7 +800,7 @@ def _check_rotations(arm: Arm, measured: Measured, rows: Rows) -> None:
             raise InputError(
                 f"the rotations fit this arm if rx_deg, ry_deg, rz_deg are meant as {' or '.join(same)}, not as "
                 f"{measured.rotation} (off by {np.degrees(off):.2f} deg as they are, {np.degrees(offs[best]):.2f} deg so): "
-                f"say --columns rotation={same[0]}"
+                f"give --columns rotation={same[0]}"
             )
     near = CLEAR * max(points_off(arm, q, p).right, ALIKE_M)
     signs = itertools.product((1, -1), repeat=arm.joints)

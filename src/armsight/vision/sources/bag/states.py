@@ -91,7 +91,7 @@ def read_joints(bag: Bag, names: tuple[str, ...] | None = None) -> JointStream |
         if theirs is not None and here != theirs:
             raise InputError(
                 f"{bag.path}: two arms have the joints {', '.join(names)}: {', '.join(theirs)} and {', '.join(here)};"
-                " record one, or say --columns frames=BASE:FLANGE"
+                " record one, or give --columns frames=BASE:FLANGE"
             )
         theirs = here
         stamp = message.stamp_ns()
