@@ -104,7 +104,7 @@ def memory(folder: Path) -> dict[str, Any]:
         for name in ("block", "scanline", "semiglobal"):
             out = str(Path(room) / "out")
             begin = "from armsight.app.main import main; main()"
-            line = [sys.executable, "-c", begin, "dense", "--rectified", "--method", name, "-o", out]
+            line = [sys.executable, "-c", begin, "dense", "--method", name, "-o", out]
             line += ["--max-disparity", str(COUNT), *paths]
             peak = peak_mb(line, {})
             found[name] = {"peak_mb": peak}

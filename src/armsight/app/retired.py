@@ -105,6 +105,7 @@ RETIRED = (
     Retired("--run", ("budget",), "write --rig RUN", _into("--rig")),
     Retired("--ar4-offsets", ("board",), "write --board ar4:FILE.yaml", _into("--board", "ar4:{}")),
     Retired("--follow-rig", ("demo",), "in the demo no rig moves", _nothing, is_flag=True),
+    Retired("--rectified", ("dense",), "a pair without a RIG.json is rectified", _nothing, is_flag=True),
     Retired("--rate", ("run", "live"), "the rate of the cameras is measured", _nothing),
     Retired("--host", ("live",), "write --http HOST:PORT", _part("--http", 0, "127.0.0.1:8722", mark=":")),
     Retired("--host", ("hub",), "write --hub HOST:PORT", _part("--hub", 0, "127.0.0.1:7447", mark=":")),

@@ -44,7 +44,7 @@ def flat(tmp_path):
 def test_a_rectified_pair(dense, flat, tmp_path, method):
     left, right, truth = flat
     out = tmp_path / "out"
-    said = dense("--rectified", "--max-disparity", 32, left, right, "--method", method, "-o", out, "--json")
+    said = dense("--max-disparity", 32, left, right, "--method", method, "-o", out, "--json")
     assert said.code == 0, said.err
     (record,) = said.lines
     disparity, valid = read_pfm(out / "disparity.pfm"), cv2.imread(str(out / "valid.png"), cv2.IMREAD_UNCHANGED)
@@ -70,13 +70,13 @@ def test_floats_are_read_as_grey_levels(dense, flat, tmp_path):
     left, right, truth = flat
     cv2.imwrite(str(tmp_path / "left.tiff"), cv2.imread(str(left), cv2.IMREAD_UNCHANGED).astype(np.float32))
     out = tmp_path / "out"
-    said = dense("--rectified", "--max-disparity", 32, tmp_path / "left.tiff", right, "--method", "block", "-o", out)
+    said = dense("--max-disparity", 32, tmp_path / "left.tiff", right, "--method", "block", "-o", out)
     assert said.code == 0, said.err
     assert np.median(np.abs(read_pfm(out / "disparity.pfm") - truth)) < 0.1
 
 
 def test_the_text_says_how_much_is_measured(dense, flat, tmp_path):
-    said = dense(*flat[:2], "--rectified", "--max-disparity", 32, "-o", tmp_path / "out")
+    said = dense(*flat[:2], "--max-disparity", 32, "-o", tmp_path / "out")
     assert said.code == 0
     for word in ("% measured", "hidden", "filled", "written to"):
         assert word in said.out
@@ -85,7 +85,7 @@ def test_the_text_says_how_much_is_measured(dense, flat, tmp_path):
 def test_every_mistake_is_one_line(dense, flat, tmp_path):
     left, right, _ = flat
     out = ("-o", tmp_path / "out")
-    ready = ("--rectified", "--max-disparity", 32)
+    ready = ("--max-disparity", 32)
     image = cv2.imread(str(right), cv2.IMREAD_UNCHANGED)
     for name, changed in {"shifted": np.roll(image, 6, axis=0), "small": image[:-2]}.items():
         cv2.imwrite(str(tmp_path / f"{name}.png"), changed)
@@ -97,12 +97,11 @@ def test_every_mistake_is_one_line(dense, flat, tmp_path):
     assert_rejected(dense(*ready, left, tmp_path / "small.png", *out), "320x200", "320x198", "small.png")
     assert_rejected(dense(*ready, left, tmp_path / "nan.tiff", *out), "nan.tiff", "1 values are NaN")
     assert_rejected(dense(*ready, "--source", tmp_path / "nowhere", *out), "nowhere", "not a source")
-    assert_rejected(dense("--rectified", "--max-disparity", 321, left, right, *out), "outside the image")
-    assert_rejected(dense("--rectified", "--max-disparity", 0, left, right, *out), "outside the image")
-    assert_rejected(dense("--rectified", left, right, *out), "--max-disparity")
+    assert_rejected(dense("--max-disparity", 321, left, right, *out), "outside the image")
+    assert_rejected(dense("--max-disparity", 0, left, right, *out), "outside the image")
+    assert_rejected(dense(left, right, *out), "no RIG.json before the images", "--max-disparity")
     assert_rejected(dense(*ready, left, *out), "LEFT RIGHT")
     assert_rejected(dense(*ready, left, tmp_path / "none.png", *out), "none.png", "no such file")
-    assert_rejected(dense(left, right, *out), "RIG.json LEFT RIGHT")
     assert_rejected(dense(left, left, right, *out), "left.png")
     assert_rejected(dense(*ready, "--near", 0.5, left, right, *out), "--near")
     assert_rejected(dense(*ready, left, right, "-o", left), "folder")
@@ -115,7 +114,7 @@ def test_no_texture_is_an_empty_result_with_the_reason(dense, tmp_path):
     for side in ("l", "r"):
         cv2.imwrite(str(tmp_path / f"{side}.png"), np.full((90, 160), 77, np.uint8))
     out = tmp_path / "out"
-    said = dense("--rectified", "--max-disparity", 32, tmp_path / "l.png", tmp_path / "r.png", "-o", out, "--json")
+    said = dense("--max-disparity", 32, tmp_path / "l.png", tmp_path / "r.png", "-o", out, "--json")
     assert said.code == 0
     (record,) = said.lines
     assert "no texture" in record["problem"]

@@ -37,7 +37,7 @@ def command() -> None:
     \b
     armsight dense RIG.json LEFT RIGHT -o OUT        depth, point cloud
     armsight dense RIG.json --source SOURCE -o OUT   every shot of a sequence
-    armsight dense --rectified --max-disparity N LEFT RIGHT -o OUT
+    armsight dense LEFT RIGHT --max-disparity N -o OUT   a rectified pair
     armsight dense evaluate DIR                      the Middlebury benchmark's metrics
 
     More: armsight dense match -h, armsight dense evaluate -h.
@@ -58,7 +58,6 @@ def command() -> None:
     "-o", "--output", required=True, metavar="DIR", type=click.Path(path_type=Path), help="Folder for the files."
 )
 @click.option("--source", metavar="SOURCE", help="A sequence instead of LEFT RIGHT (see armsight record -h).")
-@click.option("--rectified", is_flag=True, help="The pair is rectified already; no RIG.json.")
 @click.option("--max-disparity", type=int, metavar="N", help="Disparities below N px are tried.")
 @click.option("--near", type=float, metavar="M", help="Nearest depth, m, instead of N; 3 baselines by default.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object a pair.")
@@ -67,7 +66,6 @@ def match(
     name: str,
     output: Path,
     source: str | None,
-    rectified: bool,
     max_disparity: int | None,
     near: float | None,
     as_json: bool,
@@ -84,7 +82,7 @@ def match(
     from armsight.app.progress import bar
     from armsight.vision.sources import open_source
 
-    form, pair = _arguments(paths, source, rectified, max_disparity, near)
+    form, pair = _arguments(paths, source, max_disparity, near)
     check_folder(output, holding=RESULT_FILES, apart_from=paths, advice="; give a folder")
     if form is not None and near is not None:
         check_near(form, near)
@@ -114,23 +112,27 @@ def match(
 
 
 def _arguments(
-    paths: tuple[Path, ...], source: str | None, rectified: bool, max_disparity: int | None, near: float | None
+    paths: tuple[Path, ...], source: str | None, max_disparity: int | None, near: float | None
 ) -> tuple[Rectification | None, tuple[Path, Path] | None]:
     """Return how to rectify (None: rectified already), and the pair (None: a source was given)."""
     from armsight.vision.rig import StereoRig
 
-    if rectified and max_disparity is None:
-        raise InputError("--rectified needs --max-disparity N: nothing else says how near the scene is")
+    images = 0 if source is not None else 2
+    if len(paths) not in (images, images + 1):
+        form = "RIG.json and --source" if source is not None else "RIG.json LEFT RIGHT"
+        raise InputError(f"expected {form}, got {len(paths)} path{'' if len(paths) == 1 else 's'}")
+    rectified = len(paths) == images
     if rectified and near is not None:
         raise InputError("--near needs a RIG.json: a rectified pair alone has no depth; give --max-disparity")
+    if rectified and max_disparity is None:
+        raise InputError(
+            "no RIG.json before the images: a rectified pair needs --max-disparity N, as nothing else says how near the "
+            "scene is"
+        )
     if max_disparity is not None and near is not None:
         raise InputError("give --max-disparity or --near, not both")
     if near is not None and not 0.01 <= near <= 1000:
         raise InputError(f"--near {near:g}: expected metres, between 0.01 and 1000")
-    needed = (0 if rectified else 1) + (0 if source is not None else 2)
-    if len(paths) != needed:
-        form = ("" if rectified else "RIG.json ") + ("and --source" if source is not None else "LEFT RIGHT")
-        raise InputError(f"expected {form.strip()}, got {len(paths)} path{'' if len(paths) == 1 else 's'}")
     rig = None if rectified else StereoRig.load_trusted(paths[0])
     if rig is not None and not rig.cov.any():
         click.echo(f"note: {paths[0]} does not say how well it is known: sigma is the matching's share alone", err=True)

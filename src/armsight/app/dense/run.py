@@ -72,8 +72,7 @@ def search_of(form: Rectification | None, max_disparity: int | None, near: float
         if not 2 <= max_disparity <= width:
             raise InputError(f"--max-disparity {max_disparity}: outside the image: expected 2 to its width, {width} px")
         return Search(0, max_disparity)
-    if form is None:
-        raise InputError("--rectified needs --max-disparity N: nothing else says how near the scene is")
+    assert form is not None  # the command's check
     nearest = near if near is not None else _NEAREST_BASELINES * form.rig.baseline_m
     count = int(np.ceil(form.disparity_of(nearest))) + 1
     if near is not None and count > width:
