@@ -19,9 +19,7 @@ from armsight.vision.pose.pnp import MIN_POINTS, body_poses
 #: Focal lengths tried, in units of the image's longer side: fields of view from 115 to 11 degrees.
 _FOCAL_LADDER = np.geomspace(0.32, 5.0, 18)
 _STARTS_KEPT = 3
-#: Views, spread over all, from which the first focal lengths are estimated: a few choose a third of the ladder, more
-#: choose from that. Half: a blurred or frontal view may choose a wrong minimum, double: slower.
-_FEW_VIEWS, _FOCAL_VIEWS = 4, 12
+_FOCAL_VIEWS = 8  # spread over all, that choose the first focal lengths; half: blurred ones may choose, double: slower
 #: Corners that all fit so well, px RMS, leave no doubt about the minimum: wrong ones are off by whole pixels. So does a
 #: lens that imitates another one, to begin with.
 _FITS_PX, _IMITATES_PX = 0.1, 1.0
@@ -53,19 +51,16 @@ def _focal_candidates(
 ) -> list[float]:
     """Return the focal lengths, px, under which one camera's views fit best, best first."""
     every = [rows for rows in _views(observations, side) if len(rows) >= MIN_POINTS]
-    focals = list(_FOCAL_LADDER * max(size))
-    for count, kept in ((_FEW_VIEWS, len(focals) // 3), (_FOCAL_VIEWS, _STARTS_KEPT)):
-        views = [every[k] for k in np.unique(np.linspace(0, len(every) - 1, min(len(every), count)).astype(int))]
-        scores = []
-        for focal in focals:
-            camera = pinhole(size, focal, model)
-            errors = []
-            for rows in views:
-                candidates = body_poses(points[observations.point[rows]], camera, observations.uv[rows])
-                errors.append(candidates[0][1] if candidates else max(size))
-            scores.append((float(np.mean(np.square(errors))) if errors else np.inf, focal))
-        focals = [focal for _, focal in sorted(scores)[:kept]]
-    return focals
+    views = [every[k] for k in np.unique(np.linspace(0, len(every) - 1, min(len(every), _FOCAL_VIEWS)).astype(int))]
+    scores = []
+    for focal in (_FOCAL_LADDER * max(size)).tolist():
+        camera = pinhole(size, focal, model)
+        errors = []
+        for rows in views:
+            candidates = body_poses(points[observations.point[rows]], camera, observations.uv[rows])
+            errors.append(candidates[0][1] if candidates else max(size))
+        scores.append((float(np.mean(np.square(errors))) if errors else np.inf, focal))
+    return [focal for _, focal in sorted(scores)[:_STARTS_KEPT]]
 
 
 def _apart(a: Array, b: Array, scale_m: float = 1.0) -> Array:
