@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from armsight.app.options import PATH, output
 from armsight.errors import InputError
 from armsight.files import check_suffix, check_writable, read_text, write_text
 
@@ -23,7 +24,6 @@ _NUMBERS = {"ignore_unknown_options": True}  # a minus before a number is no opt
 _NARROW_M = 0.15
 _POSE = ("x", "y", "z", "euler_z", "euler_y", "euler_x")
 
-_PATH = click.Path(path_type=Path)
 _ARM = click.argument("arm_name", metavar="ARM")
 _JSON = click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
 _ANGLES = click.argument("angles", nargs=-1, metavar="Q1 Q2 ...")
@@ -66,7 +66,7 @@ def list_(as_json: bool) -> None:
 
 @command.command()
 @_ARM
-@click.option("-o", "--output", metavar="ARM.png", type=_PATH, help="Draw the arm at home.")
+@output("ARM.png", "Draw the arm at home.")
 @_JSON
 def show(arm_name: str, output: Path | None, as_json: bool) -> None:
     """Print an arm's table, limits and reach."""
@@ -150,7 +150,7 @@ def ik(arm_name: str, numbers: tuple[str, ...], as_json: bool) -> int:
 
 @command.command()
 @_ARM
-@click.option("-o", "--output", required=True, metavar="ARM.urdf", type=_PATH, help="The file to write.")
+@output("ARM.urdf", "The file to write.", required=True)
 @_JSON
 def urdf(arm_name: str, output: Path, as_json: bool) -> None:
     """Write an arm as a URDF file."""
@@ -170,7 +170,7 @@ def urdf(arm_name: str, output: Path, as_json: bool) -> None:
 @click.option(
     *("-o", "--output"),
     metavar="OUT",
-    type=_PATH,
+    type=PATH,
     help="Write FILE's arm: .urdf, or .yaml as the maker's driver reads it; one that exists is kept as OUT.old.",
 )
 @click.option("--yes", is_flag=True, help="Do not ask before OUT is replaced.")
@@ -212,7 +212,7 @@ def calibrated(arm_name: str, file: str, output: Path | None, yes: bool, as_json
     "--around",
     required=True,
     metavar="RUN",
-    type=_PATH,
+    type=PATH,
     help="An earlier run of this arm before these cameras, such as with the default motion: where the body was seen.",
 )
 @click.option(
@@ -222,7 +222,7 @@ def calibrated(arm_name: str, file: str, output: Path | None, yes: bool, as_json
     "--cycles", type=click.IntRange(0, 1000), default=30, show_default=True, help="How often five poses come again."
 )
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seed of the choice.")
-@click.option("-o", "--output", required=True, metavar="FILE.toml", type=_PATH, help="The motions to write.")
+@output("FILE.toml", "The motions to write.", required=True)
 @_JSON
 def plan(arm_name: str, around: Path, output: Path, as_json: bool, **chosen: int) -> None:
     """Plan the recording of `arm report`: motions for `armsight run --open-loop --motion FILE.toml`.
@@ -250,10 +250,10 @@ def plan(arm_name: str, around: Path, output: Path, as_json: bool, **chosen: int
 
 
 @command.command()
-@click.argument("run", metavar="RUN", type=_PATH)
+@click.argument("run", metavar="RUN", type=PATH)
 @click.option("--arm", "arm_name", metavar="ARM", help="The nominal arm; by default the one that the run names.")
-@click.option("--compare", multiple=True, metavar="FILE.json", type=_PATH, help="Another arm's report.json.")
-@click.option("-o", "--output", metavar="DIR", type=_PATH, help="Folder for report.html, .pdf and .json.")
+@click.option("--compare", multiple=True, metavar="FILE.json", type=PATH, help="Another arm's report.json.")
+@output("DIR", "Folder for report.html, .pdf and .json.")
 @_JSON
 def report(run: Path, arm_name: str | None, compare: tuple[Path, ...], output: Path | None, as_json: bool) -> None:
     """Report what an arm does, what explains its error, and what each remedy would bring.

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import click
 
+from armsight.app.options import output
+
 OPERATIONS = ("measure", "replay", "identify", "check")
 REPORT = "report"
 _REASONS = 3  # why recordings failed, on the terminal; half: a second mistake is not seen, double: a long list
@@ -15,9 +17,7 @@ _REASONS = 3  # why recordings failed, on the terminal; half: a second mistake i
 @click.command("batch")
 @click.argument("operation", type=click.Choice((*OPERATIONS, REPORT)))
 @click.argument("recordings", metavar="'GLOB'...", nargs=-1, required=True)
-@click.option(
-    "-o", "--output", metavar="DIR", type=click.Path(path_type=Path), help="Folder of the results; report needs none."
-)
+@output("DIR", "Folder of the results; report needs none.")
 @click.option("--rig", metavar="RIG.json", help="The rig, where the recordings have no camera_info, or instead of it.")
 @click.option("--target", metavar="SPEC|BODY", help="The board or body that is measured.")
 @click.option("--arm", metavar="ARM", help="The arm model.")

@@ -17,6 +17,7 @@ import click
 from click.core import ParameterSource
 
 from armsight.app.board.flash import FLASHED, PROGRAMMERS
+from armsight.app.options import PATH
 from armsight.app.show.messages import UNTRUSTED
 from armsight.errors import DeviceError, InputError
 
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
     from armsight.robot.boards.contract import MotionBoard
 
 _JSON = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-_FILE = click.argument("file", type=click.Path(path_type=Path))
+_FILE = click.argument("file", type=PATH)
 _WATCH_S = 2.0  # how long an emulated board is watched where nobody says how long
 #: The steps of a bring-up, in their order, and what each finds of a joint (``found.JointFound``).
 STEPS = {
@@ -44,7 +45,7 @@ STEPS = {
 def _path(*names: str, metavar: str = "FILE", default: str | None = None, **given: Any) -> Callable[..., Any]:  # noqa: ANN401
     """Return an option that names a file or folder."""
     start = None if default is None else Path(default)
-    kind, shown = click.Path(path_type=Path), default is not None
+    kind, shown = PATH, default is not None
     return click.option(*names, metavar=metavar, type=kind, default=start, show_default=shown, **given)
 
 

@@ -9,13 +9,12 @@ from pathlib import Path
 
 import click
 
+from armsight.app.options import PATH, output
 from armsight.app.show.messages import UNTRUSTED
 from armsight.app.source_kinds import DETECTIONS
 from armsight.errors import InputError
 from armsight.files import check_folder, check_outputs, check_writable
 from armsight.vision.calibrate import FOLDS, MODELS
-
-_FILE = click.Path(path_type=Path)
 
 
 @dataclass(frozen=True)
@@ -54,15 +53,15 @@ class CalibrateOptions:
     "--lens-model", type=click.Choice(MODELS), help="Distortion model; by default the held-out error chooses."
 )
 @click.option("--flat-target", is_flag=True, help="Do not estimate the target's deviation from its drawing.")
-@click.option("--cameras", metavar="CAMERAS.json", type=_FILE, help="Intrinsics of both cameras, with detections.")
+@click.option("--cameras", metavar="CAMERAS.json", type=PATH, help="Intrinsics of both cameras, with detections.")
 @click.option(
-    "--refine-body", metavar="OUT.csv", type=_FILE, help="Estimate the body's points too, and write them here."
+    "--refine-body", metavar="OUT.csv", type=PATH, help="Estimate the body's points too, and write them here."
 )
 @click.option(
     "--folds", type=click.IntRange(min=2), default=FOLDS, show_default=True, help="Parts for the held-out errors."
 )
-@click.option("-o", "--output", required=True, metavar="RIG.json", type=_FILE, help="The rig to write.")
-@click.option("--report", metavar="DIR", type=_FILE, help="Write an HTML report with figures.")
+@output("RIG.json", "The rig to write.", required=True)
+@click.option("--report", metavar="DIR", type=PATH, help="Write an HTML report with figures.")
 @click.option("--json", "as_json", is_flag=True, help="Print the result as one JSON object.")
 def command(**given: object) -> int:
     """Calibrate two cameras, and evaluate the calibration on pairs held out of the fit.

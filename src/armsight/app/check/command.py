@@ -8,10 +8,9 @@ from pathlib import Path
 import click
 
 from armsight.app.check import CYCLES
+from armsight.app.options import PATH, output
 from armsight.errors import InputError
 from armsight.files import check_folder, check_writable, write_text
-
-_PATH = click.Path(path_type=Path)
 
 
 class _Context(click.Context):
@@ -53,9 +52,9 @@ def command() -> None:
 
 
 @command.command("evaluate", cls=_Evaluate)
-@click.argument("data", metavar="RUN|POSES.csv", type=_PATH)
+@click.argument("data", metavar="RUN|POSES.csv", type=PATH)
 @click.option("--closed", is_flag=True, help="Of a run: evaluate the motions with the loop closed on vision.")
-@click.option("-o", "--output", metavar="DIR", type=_PATH, help="Folder for report.html, check.json, figures.")
+@output("DIR", "Folder for report.html, check.json, figures.")
 @click.option(
     "--columns", metavar="NAME=COLUMN,...", help="Names of columns in your CSV, such as x_m=X,command_x_m=X0."
 )
@@ -126,11 +125,9 @@ def evaluated(
     "--speed", type=click.FloatRange(1.0, 1e4), default=100.0, show_default=True, help="Speed on paths, mm/s."
 )
 @click.option(
-    "--visible-in", metavar="RUN", type=_PATH, help="An earlier run; both of its cameras must see the whole test."
+    "--visible-in", metavar="RUN", type=PATH, help="An earlier run; both of its cameras must see the whole test."
 )
-@click.option(
-    "-o", "--output", metavar="FILE", type=_PATH, help="check.toml for armsight run --motion; .csv: the poses alone."
-)
+@output("FILE", "check.toml for armsight run --motion; .csv: the poses alone.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object, SI units.")
 def plan(
     arm_name: str,

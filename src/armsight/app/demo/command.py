@@ -7,19 +7,12 @@ from pathlib import Path
 
 import click
 
+from armsight.app.options import output
 from armsight.app.show.messages import require
 
 
 @click.command("demo")
-@click.option(
-    "-o",
-    "--output",
-    default="demo",
-    show_default=True,
-    metavar="DIR",
-    type=click.Path(path_type=Path),
-    help="Folder of the run.",
-)
+@output("DIR", "Folder of the run.", default="demo")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seed of all random numbers.")
 @click.option(
     "--arm",

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from armsight.app.options import PATH, output
 from armsight.errors import ArmsightError, InputError
 from armsight.files import check_folder
 from armsight.vision.dense import METHODS, open_method
@@ -45,7 +46,7 @@ def command() -> None:
 
 
 @command.command("match")
-@click.argument("paths", nargs=-1, metavar="[RIG.json] [LEFT RIGHT]", type=click.Path(path_type=Path))
+@click.argument("paths", nargs=-1, metavar="[RIG.json] [LEFT RIGHT]", type=PATH)
 @click.option(
     "--method",
     "name",
@@ -54,9 +55,7 @@ def command() -> None:
     type=click.Choice(list(METHODS)),
     help="Matching method.",
 )
-@click.option(
-    "-o", "--output", required=True, metavar="DIR", type=click.Path(path_type=Path), help="Folder for the files."
-)
+@output("DIR", "Folder for the files.", required=True)
 @click.option("--source", metavar="SOURCE", help="A sequence instead of LEFT RIGHT (see armsight record -h).")
 @click.option("--max-disparity", type=int, metavar="N", help="Disparities below N px are tried.")
 @click.option("--near", type=float, metavar="M", help="Nearest depth, m, instead of N; 3 baselines by default.")
@@ -141,13 +140,11 @@ def _arguments(
 
 
 @command.command("evaluate")
-@click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
+@click.argument("folder", metavar="DIR", type=PATH)
 @click.option(
     "--method", "names", multiple=True, type=click.Choice(list(METHODS)), help="May be repeated; all by default."
 )
-@click.option(
-    "-o", "--output", metavar="OUT", type=click.Path(path_type=Path), help="Write the table and error maps there."
-)
+@output("OUT", "Write the table and error maps there.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
 def evaluate(folder: Path, names: tuple[str, ...], output: Path | None, as_json: bool) -> None:
     """Evaluate the methods on scenes with a truth, in the folder layouts of the Middlebury benchmark.

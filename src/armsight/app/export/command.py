@@ -7,20 +7,15 @@ from pathlib import Path
 
 import click
 
+from armsight.app.options import output
+
 FORMS = ("csv", "parquet", "mcap", "tum", "ros2")
 
 
 @click.command("export")
 @click.argument("run", metavar="RUN")
 @click.option("--to", "form", required=True, type=click.Choice(FORMS), help="The form.")
-@click.option(
-    "-o",
-    "--output",
-    required=True,
-    metavar="OUT",
-    type=click.Path(path_type=Path),
-    help="New or empty folder; with --to mcap a file.",
-)
+@output("OUT", "New or empty folder; with --to mcap a file.", required=True)
 @click.option("--json", "as_json", is_flag=True, help="Print the written files as one JSON object.")
 def command(run: str, form: str, output: Path, as_json: bool) -> None:
     """Write the tables of a run or a recording in another form: CSV, Parquet, MCAP, TUM or a ROS 2 bag.

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from armsight.app.options import PATH, output
 from armsight.errors import InputError
 
 if TYPE_CHECKING:
@@ -47,7 +48,7 @@ class Options:
     "--robot",
     required=True,
     metavar="POSES.csv|BAG",
-    type=click.Path(path_type=Path),
+    type=PATH,
     help="Poses or joints: a table, or a recording with /tf or joint states.",
 )
 @click.option(
@@ -65,11 +66,9 @@ class Options:
     "units=mm, or units=detect where lengths cannot be metres; rotation=rotvec, wxyz, xyzw, xyz (fixed axes), XYZ (rotated "
     "axes) ...; of a recording frames=base_link:tool0. With seen: of the target's table.",
 )
-@click.option(
-    "--seen", metavar="TARGET.csv", type=click.Path(path_type=Path), help="Poses of the target in the camera."
-)
+@click.option("--seen", metavar="TARGET.csv", type=PATH, help="Poses of the target in the camera.")
 @click.option("--camera", metavar="CAMERA|fit", help="Calibration of one camera, .json or .yaml; fit: from its images.")
-@click.option("--rig", metavar="RIG.json", type=click.Path(path_type=Path), help="A calibrated pair of cameras.")
+@click.option("--rig", metavar="RIG.json", type=PATH, help="A calibrated pair of cameras.")
 @click.option(
     "--source",
     metavar="SOURCE",
@@ -79,9 +78,7 @@ class Options:
 @click.option("--streams", is_flag=True, help="Both tables are streams (t_s) whose clocks differ: find the offset.")
 @click.option("--scale", is_flag=True, help="The target's size may be wrong: fit it.")
 @click.option("--plan", metavar="N", type=click.IntRange(min=0, max=50), default=0, help="Choose the next N poses.")
-@click.option(
-    "-o", "--output", metavar="DIR", type=click.Path(path_type=Path), help="Folder for the page and the files."
-)
+@output("DIR", "Folder for the page and the files.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object, SI units.")
 def command(**given: object) -> int:
     """Calibrate hand and eye from your own data: robot poses, and images or poses of a target.

@@ -7,11 +7,12 @@ from pathlib import Path
 
 import click
 
-_PATH = click.Path(path_type=Path)
+from armsight.app.options import PATH, output
+
 _KEYS = "site-keys"
 _JSON = click.option("--json", "as_json", is_flag=True, help="Print the result as one JSON object.")
 _KEYS_OPTION = click.option(
-    "--keys", default=_KEYS, show_default=True, metavar="DIR", type=_PATH, help="Folder of the site's keys."
+    "--keys", default=_KEYS, show_default=True, metavar="DIR", type=PATH, help="Folder of the site's keys."
 )
 _HUB = click.option(
     "--hub",
@@ -32,10 +33,8 @@ _HUB = click.option(
     help="Where cells connect: tls/0.0.0.0:7447, with --keys, for other computers.",
 )
 @click.option("--http", default="127.0.0.1:8730", show_default=True, metavar="HOST:PORT", help="Where the page is.")
-@click.option("--keys", metavar="DIR", type=_PATH, help="Folder of the site's keys (armsight hub keys).")
-@click.option(
-    "-o", "--output", default="hub", show_default=True, metavar="DIR", type=_PATH, help="Folder of events and history."
-)
+@click.option("--keys", metavar="DIR", type=PATH, help="Folder of the site's keys (armsight hub keys).")
+@output("DIR", "Folder of events and history.", default="hub")
 @_JSON
 @click.pass_context
 def command(ctx: click.Context, listen: str, http: str, keys: Path | None, output: Path, as_json: bool) -> None:
@@ -72,7 +71,7 @@ def command(ctx: click.Context, listen: str, http: str, keys: Path | None, outpu
 @command.command("keys")
 @click.argument("site")
 @click.argument("cells", nargs=-1, metavar="CELL...")
-@click.option("-o", "--output", default=_KEYS, show_default=True, metavar="DIR", type=_PATH, help="Folder of the keys.")
+@output("DIR", "Folder of the keys.", default=_KEYS)
 @_HUB
 @_JSON
 def keys_command(site: str, cells: tuple[str, ...], output: Path, address: str, as_json: bool) -> None:
@@ -122,7 +121,7 @@ def hold_command(cell: str, reason: str, keys: Path, address: str, as_json: bool
 
 
 @command.command("push")
-@click.argument("runs", type=_PATH)
+@click.argument("runs", type=PATH)
 @click.argument("store")
 @click.option("--cell", "spec", required=True, metavar="NAME|cell.toml", help="Whose runs they are.")
 @click.option("--rate", type=click.FloatRange(0.01, 1e4), default=10.0, show_default=True, help="MB/s at most.")

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from armsight.app.options import PATH, output
 from armsight.errors import InputError
 from armsight.files import check_folder, check_writable, write_text
 
@@ -27,18 +28,16 @@ if TYPE_CHECKING:
 @click.option(
     "--data",
     metavar="POSES.csv",
-    type=click.Path(path_type=Path),
+    type=PATH,
     help="Required: joint angles, and measured poses of the tool.",
 )
 @click.option(
     "--joints",
     metavar="JOINTS.csv",
-    type=click.Path(path_type=Path),
+    type=PATH,
     help="The joint angles, where the poses have none: by name, row or time.",
 )
-@click.option(
-    "--validate", "other", metavar="OTHER.csv", type=click.Path(path_type=Path), help="Poses to validate with."
-)
+@click.option("--validate", "other", metavar="OTHER.csv", type=PATH, help="Poses to validate with.")
 @click.option(
     "--columns",
     multiple=True,
@@ -49,13 +48,7 @@ if TYPE_CHECKING:
 @click.option(
     "--prior", "priors", multiple=True, metavar="NAME=SIGMA", help="Sigma (m, rad) of a parameter or kind; 0 keeps it."
 )
-@click.option(
-    "-o",
-    "--output",
-    metavar="DIR",
-    type=click.Path(path_type=Path),
-    help="Folder for the corrected arm and the report.",
-)
+@output("DIR", "Folder for the corrected arm and the report.")
 @click.option("-v", "--verbose", is_flag=True, help="Print all numbers, and why the others were not fitted.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object, SI units.")
 @click.pass_context
@@ -126,13 +119,13 @@ def command(
 @click.option(
     "--arm", "arm_name", required=True, metavar="ARM", help="The nominal arm: a name, a .toml or a .urdf file."
 )
-@click.option("--data", metavar="DONE.csv", type=click.Path(path_type=Path), help="Poses that were measured already.")
-@click.option("--rig", metavar="RIG.json", type=click.Path(path_type=Path), help="The cameras that must see the poses.")
+@click.option("--data", metavar="DONE.csv", type=PATH, help="Poses that were measured already.")
+@click.option("--rig", metavar="RIG.json", type=PATH, help="The cameras that must see the poses.")
 @click.option(
     "-n", "count", type=click.IntRange(min=1, max=200), default=20, show_default=True, help="Number of poses."
 )
 @click.option("--seed", type=int, default=0, show_default=True, help="Seed of the random candidates.")
-@click.option("-o", "--output", metavar="PLAN.csv", type=click.Path(path_type=Path), help="Write the poses here.")
+@output("PLAN.csv", "Write the poses here.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object, SI units.")
 def plan(
     arm_name: str, data: Path | None, rig: Path | None, count: int, seed: int, output: Path | None, as_json: bool

@@ -5,11 +5,11 @@ from __future__ import annotations
 import json
 import secrets
 import time
-from pathlib import Path
 from typing import Any
 
 import click
 
+from armsight.app.options import PATH, output
 from armsight.app.show.messages import require
 from armsight.app.stream_option import CELL, stream_option
 
@@ -18,7 +18,7 @@ _HERE = ("127.0.0.1", "localhost", "::1")
 
 @click.command("live")
 @click.option("--source", help="The cameras, such as usb:0,1 (see armsight record -h); sim: is the simulated workcell.")
-@click.option("--rig", type=click.Path(path_type=Path), help="A calibrated rig; begins with measuring.")
+@click.option("--rig", type=PATH, help="A calibrated rig; begins with measuring.")
 @click.option("--target", help="The body that is measured: a body file or a board.")
 @click.option("--calibration-board", metavar="SPEC", help="The calibration board, such as chessboard:9x6:25mm.")
 @click.option(
@@ -33,7 +33,7 @@ _HERE = ("127.0.0.1", "localhost", "::1")
     help="The arm: a name (armsight arm list), a .toml or a .urdf file.",
     metavar="ARM",
 )
-@click.option("--motion", type=click.Path(path_type=Path), help="The motions (TOML, docs/howto/run.md).")
+@click.option("--motion", type=PATH, help="The motions (TOML, docs/howto/run.md).")
 @click.option(
     "--sync-ms",
     type=click.FloatRange(0.0, 1000.0),
@@ -41,16 +41,7 @@ _HERE = ("127.0.0.1", "localhost", "::1")
     show_default=True,
     help="Sigma of the time between the two exposures of a shot, ms.",
 )
-@click.option(
-    "-o",
-    "--output",
-    "folder",
-    default="live",
-    show_default=True,
-    metavar="DIR",
-    type=click.Path(path_type=Path),
-    help="Folder of the session.",
-)
+@output("DIR", "Folder of the session.", "folder", default="live")
 @click.option(
     "--http",
     default="127.0.0.1:8722",

@@ -8,11 +8,10 @@ from pathlib import Path
 
 import click
 
+from armsight.app.options import PATH, output
 from armsight.app.show.messages import UNTRUSTED
 from armsight.app.source_kinds import DETECTIONS
 from armsight.app.stream_option import stream_option
-
-_PATH = click.Path(path_type=Path)
 
 
 @dataclass(frozen=True)
@@ -38,7 +37,7 @@ class MeasureOptions:
 
 
 @click.command("measure")
-@click.argument("rig", metavar="RIG.json", type=_PATH)
+@click.argument("rig", metavar="RIG.json", type=PATH)
 @click.option(
     "--target",
     required=True,
@@ -67,12 +66,12 @@ class MeasureOptions:
 @click.option(
     "--save-rig",
     metavar="RIG2.json",
-    type=_PATH,
+    type=PATH,
     help="Write the rig with the skew and readout found, and the noise of a moved body's discs.",
 )
-@click.option("-o", "--output", metavar="POSES.csv", type=_PATH, help="Write the poses as CSV.")
+@output("POSES.csv", "Write the poses as CSV.")
 @stream_option()
-@click.option("--view", "view_dir", metavar="DIR", type=_PATH, help="Write annotated pictures.")
+@click.option("--view", "view_dir", metavar="DIR", type=PATH, help="Write annotated pictures.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object per shot.")
 def command(**given: object) -> None:
     """Measure the pose of a target in the left camera's frame, with its uncertainty.

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from armsight.app.options import output
 from armsight.app.stream_option import stream_option
 from armsight.errors import ArmsightError
 
@@ -19,9 +20,7 @@ if TYPE_CHECKING:
 
 @click.command("record")
 @click.argument("source")
-@click.option(
-    "-o", "--output", required=True, metavar="DIR", type=click.Path(path_type=Path), help="New or empty folder."
-)
+@output("DIR", "New or empty folder.", required=True)
 @click.option("--shots", type=click.IntRange(min=1), help="Stop after so many shots.")
 @click.option("--seconds", type=click.FloatRange(min=0, min_open=True), help="Stop after so many seconds.")
 @stream_option()

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from armsight.app.options import PATH, output
+
 if TYPE_CHECKING:
     from armsight.app.show.report import Grade, Report
     from armsight.loop.references.calibrate import ReferenceCalibration
@@ -43,7 +45,7 @@ def command() -> None:
 
 
 @command.command()
-@click.argument("path", metavar="REFERENCES.toml", type=click.Path(path_type=Path))
+@click.argument("path", metavar="REFERENCES.toml", type=PATH)
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
 def check(path: Path, as_json: bool) -> None:
     """Say what the recordings of references are like: rate, gaps, clock, noise at rest beside that of their class."""
@@ -53,9 +55,9 @@ def check(path: Path, as_json: bool) -> None:
 
 
 @command.command()
-@click.argument("path", metavar="REFERENCES.toml", type=click.Path(path_type=Path))
+@click.argument("path", metavar="REFERENCES.toml", type=PATH)
 @click.option("--poses", required=True, metavar="POSES.csv", help="Poses of the tool in the base, with times t_s.")
-@click.option("-o", "--output", metavar="OUT.toml", type=click.Path(path_type=Path), help="Where to write the result.")
+@output("OUT.toml", "Where to write the result.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
 def calibrate(path: Path, poses: str, output: Path | None, as_json: bool) -> None:
     """Find mounting, biases, scales and delay from one sweep with poses by vision or by the arm."""
@@ -74,7 +76,7 @@ def calibrate(path: Path, poses: str, output: Path | None, as_json: bool) -> Non
 
 
 @command.command()
-@click.argument("path", metavar="REFERENCES.toml", type=click.Path(path_type=Path))
+@click.argument("path", metavar="REFERENCES.toml", type=PATH)
 @click.option("--model", required=True, metavar="ARM", help="The arm: a name of armsight arm list, or a file.")
 @click.option("--joints", required=True, metavar="JOINTS.csv", help="Joint angles of 8 rests or more, with times t_s.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")

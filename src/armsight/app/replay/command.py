@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from armsight.app.options import PATH, output
 from armsight.app.stream_option import stream_option
 
 if TYPE_CHECKING:
@@ -22,14 +23,12 @@ _REASONS = 3
 
 @click.command("replay")
 @click.argument("recording", metavar="RUN|BAG")
-@click.option("-o", "--output", metavar="DIR", type=click.Path(path_type=Path), help="Write the tables to this folder.")
+@output("DIR", "Write the tables to this folder.")
 @click.option("--rig", metavar="RIG.json", help="Another rig: needs images or tags in the recording.")
 @click.option("--target", metavar="SPEC|BODY", help="Another body: needs images or tags in the recording.")
 @click.option("--arm", metavar="ARM", help="Another arm model.")
 @click.option("--estimator", type=click.Choice(["kalman", "latest"]), default="kalman", show_default=True)
-@click.option(
-    "--references", metavar="REFERENCES.toml", type=click.Path(path_type=Path), help="Fuse an inertial unit, too."
-)
+@click.option("--references", metavar="REFERENCES.toml", type=PATH, help="Fuse an inertial unit, too.")
 @click.option(
     "--rate", type=click.FloatRange(min=0), default=0.0, help="1 is real time; by default as fast as possible."
 )
@@ -38,7 +37,7 @@ _REASONS = 3
     "--compare",
     "other",
     metavar="DIR",
-    type=click.Path(path_type=Path),
+    type=PATH,
     help="Show what differs from the tables in this folder.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print the result as one JSON object.")

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from armsight.app.options import PATH
 from armsight.errors import InputError
 from armsight.files import check_outputs, check_writable
 from armsight.vision.rigfiles import ASSUMED_SIGMA_PX, EXPORTED, FORMATS, export_rig, import_rig, open_format
@@ -112,7 +113,7 @@ def export(path: str, more: tuple[str, ...], output: tuple[str, ...], name: str,
 
 
 @command.command("update")
-@click.argument("run", type=click.Path(path_type=Path))
+@click.argument("run", type=PATH)
 @click.option("-o", "--output", required=True, metavar="RIG.json", help="The rig file to write.")
 @click.option(
     "--since",
@@ -120,7 +121,7 @@ def export(path: str, more: tuple[str, ...], output: tuple[str, ...], name: str,
     metavar="S",
     help="Use shots from this time on, board's clock, s; by default from when the run found that the cameras had moved.",
 )
-@click.option("--report", type=click.Path(path_type=Path), metavar="DIR", help="Folder for a page: old rig beside new.")
+@click.option("--report", type=PATH, metavar="DIR", help="Folder for a page: old rig beside new.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
 def update_(run: Path, output: str, since: float | None, report: Path | None, as_json: bool) -> None:
     """Estimate the relative pose of a run's cameras again, from the body that the run saw: without a board.

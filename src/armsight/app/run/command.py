@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from armsight.app.options import PATH, output
 from armsight.app.show.messages import UNTRUSTED, require
 from armsight.app.stream_option import stream_option
 from armsight.errors import InputError
@@ -38,7 +39,7 @@ _POSES = "poses:"
     help="The controller: serial:PORT, feetech:PORT,LEROBOT.json, ar4:PORT (docs/howto/board.md); emulated: with sim:;"
     " poses:FILE where another program moves the arm and logs its angles.",
 )
-@click.option("--rig", "rig_path", required=True, type=click.Path(path_type=Path), help="The calibrated rig, rig.json.")
+@click.option("--rig", "rig_path", required=True, type=PATH, help="The calibrated rig, rig.json.")
 @click.option("--target", "target_spec", required=True, help="The body on the tool: a body file of discs.")
 @click.option(
     "--fixed",
@@ -56,7 +57,7 @@ _POSES = "poses:"
 )
 @click.option(
     "--motion",
-    type=click.Path(path_type=Path),
+    type=PATH,
     help="The motions (TOML, docs/howto/run.md). Without: of six_r five poses, a line and a circle, of others five poses "
     "three times in the largest cube within reach (armsight check plan).",
 )
@@ -79,15 +80,7 @@ _POSES = "poses:"
     is_flag=True,
     help="Put the rig right during the run where its cameras, or both, moved (docs/concepts/health.md).",
 )
-@click.option(
-    "-o",
-    "--output",
-    default="run",
-    show_default=True,
-    metavar="DIR",
-    type=click.Path(path_type=Path),
-    help="Folder of the run.",
-)
+@output("DIR", "Folder of the run.", default="run")
 @click.option("--json", "as_json", is_flag=True, help="Print the summary as one JSON object.")
 def command(
     source_spec: str,

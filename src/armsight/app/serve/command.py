@@ -8,9 +8,11 @@ from typing import Any
 
 import click
 
+from armsight.app.options import PATH
+
 
 @click.command("serve")
-@click.argument("config", metavar="CONFIG.toml", type=click.Path(path_type=Path))
+@click.argument("config", metavar="CONFIG.toml", type=PATH)
 @click.option("--json", "as_json", is_flag=True, help="Print each event as one JSON object.")
 def command(config: Path, as_json: bool) -> None:
     """Keep `armsight measure` going for days.
