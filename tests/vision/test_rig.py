@@ -228,30 +228,15 @@ def rig_text(model):
         return Path(f"{folder}/rig.json").read_text()
 
 
-@pytest.mark.parametrize("text", ["[" * 100_000, '{"format": ' + "9" * 5000 + "}"])
-def test_monstrous_files_are_reported(tmp_path, text):
-    path = tmp_path / "rig.json"
-    path.write_text(text)
-    with pytest.raises(InputError, match=r"rig\.json: not (a rig file|JSON).*"):
-        StereoRig.load(path)
-
-
-def test_every_truncation_is_reported(tmp_path):
+def test_what_is_no_rig_file_or_cut_short_is_reported(tmp_path):
     path = tmp_path / "rig.json"
     ordinary_rig("none").save(path)
-    whole = path.read_text()
-    for length in range(0, len(whole.rstrip()) - 1, 97):
-        path.write_text(whole[:length])
+    whole = path.read_bytes()
+    others = [b"[]", b"3", b"\xff\xfe\x00rig", b"left: 1\n", b"[" * 100_000, b'{"format": ' + b"9" * 5000 + b"}"]
+    for content in (*others, *(whole[:length] for length in range(0, len(whole.rstrip()) - 1, 97))):
+        path.write_bytes(content)
         with pytest.raises(InputError, match=r"rig\.json"):
             StereoRig.load(path)
-
-
-@pytest.mark.parametrize("content", [b"", b"[]", b"3", b"\xff\xfe\x00rig", b"left: 1\n"])
-def test_other_files_are_reported(tmp_path, content):
-    path = tmp_path / "rig.json"
-    path.write_bytes(content)
-    with pytest.raises(InputError, match=r"rig\.json"):
-        StereoRig.load(path)
 
 
 def test_the_noise_of_discs_is_stored_and_files_without_it_are_read(tmp_path):

@@ -323,10 +323,6 @@ class _Side(NamedTuple):
     """The N discs of one image as the compiled sweep needs them; the first four as in :class:`_Lines`.
 
     Attributes:
-        angle: (N,) of the epipolar plane, rad.
-        along: (N,) component of the ray along the baseline.
-        out: (N, 3) the ray, one unit away from the baseline.
-        scale: (N, 2) smallest and largest half axis, px, of a disc of unit radius at unit distance.
         radius_px: (N,) longer half axis of the ellipse.
         tolerance_px: (N,) of that half axis.
         bright: (N,) whether the disc is bright.
