@@ -189,8 +189,8 @@ MOVED_SHARE, MOVED_MAX_PX = 0.25, 3.0
 CONTRAST_MIN = 8.0
 #: Largest residual as a share of the contrast (half the step). Camera noise of 10 grey levels on a contrast of 50
 #: gives 0.4; half a window of the wrong colour gives 0.9. Where those of most corners of an image are large, as the halos
-#: of sharpening make them, it is the image that is so: up to so many times their median is usual then, up to a limit.
-MISFIT_MAX, MISFIT_RATIO, MISFIT_LIMIT = 0.45, 1.5, 0.8
+#: of sharpening make them, it is the image that is so: up to so many times their median is usual then.
+MISFIT_MAX, MISFIT_RATIO = 0.45, 1.5
 
 #: Why a corner was not kept; the index is the code in :attr:`CornerFits.outcome`.
 OUTCOMES = (
@@ -434,7 +434,7 @@ def refine_corners(
     outcome[lost], residual[lost], cov[lost] = _DIVERGED, 0.0, 0.0
     share, good = residual / np.maximum(np.abs(models[:, 7]), 1e-9), outcome == _KEPT
     usual = 0.0 if rough or good.sum() < _MANY else median(share[good].tolist())
-    outcome[good & (share > max(MISFIT_MAX, min(MISFIT_RATIO * usual, MISFIT_LIMIT)))] = _MISFIT
+    outcome[good & (share > max(MISFIT_MAX, MISFIT_RATIO * usual))] = _MISFIT
     good = (outcome == _KEPT) & np.isfinite(noise).all(axis=(1, 2, 3))
     if not rough and good.sum() >= _MANY:
         variances = np.maximum(_effective(noise[good].sum(axis=0), gains), 1.0 / 12.0)
