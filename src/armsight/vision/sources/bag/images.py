@@ -139,9 +139,9 @@ class BagSource(Source):
                     name, None, None, planned.t_s, "an image cannot be read a second time: has the file changed?"
                 )
             else:
-                pair_ = [held.pop(key) for key in needed]
-                size -= sum(len(each.data) for each in pair_)
-                yield _shot(name, planned.t_s, pair_)
+                size -= sum(len(held[key].data) for key in needed)
+                # Kept here no longer than the reader keeps it: new memory for each image takes longer than to read it.
+                yield _shot(name, planned.t_s, [held.pop(key) for key in needed])
 
 
 def _plan(pairing: Pairing, stamps: tuple[Stamps, Stamps]) -> list[_Planned]:

@@ -309,44 +309,22 @@ class _McapFiles:
     ) -> Iterator[tuple[_McapRecord, _McapRecord, _McapRecord, dict[int, Callable[[bytes], Decoded]]]]:
         """Yield schema, channel and message of a file's messages, all where no topics are named."""
         from mcap import records
-        from mcap.stream_reader import StreamReader, breakup_chunk
 
         schemas: dict[int, _McapRecord] = {0: None}
         channels: dict[int, _McapRecord] = {}
         decoders: dict[int, Callable[[bytes], Decoded]] = {}
-        chunks = 0
-
-        def found(record: _McapRecord) -> _McapRecord:
-            if isinstance(record, records.Schema):
-                schemas[record.id] = record
-            elif isinstance(record, records.Channel):
-                channels[record.id] = record
-            elif isinstance(record, records.Metadata) and note:
-                self._metadata[record.name] = dict(record.metadata)
-            elif isinstance(record, records.Message):
-                channel = channels[record.channel_id]
-                if not topics or channel.topic in topics:
-                    return schemas[channel.schema_id], channel, record, decoders
-            return None
-
         try:
-            with opened(file) as stream:
-                for record in StreamReader(stream, emit_chunks=True, record_size_limit=_CHUNK_MB * 1_000_000).records:
-                    if not isinstance(record, records.Chunk):
-                        if (one := found(record)) is not None:
-                            yield one
-                        continue
-                    if not note and chunks == self._chunks[file]:
-                        return
-                    if record.compression not in _COMPRESSIONS:
-                        raise InputError(
-                            f"{self._path}: its chunks are compressed with {record.compression!r}; lz4 and zstd are read: "
-                            f"mcap compress --compression zstd {file} -o OUT.mcap"
-                        )
-                    for inner in breakup_chunk(_decompressed(record), validate_crc=note):  # once
-                        if (one := found(inner)) is not None:
-                            yield one
-                    chunks += 1
+            for record in self._unpacked(file, note=note):
+                if isinstance(record, records.Schema):
+                    schemas[record.id] = record
+                elif isinstance(record, records.Channel):
+                    channels[record.id] = record
+                elif isinstance(record, records.Metadata) and note:
+                    self._metadata[record.name] = dict(record.metadata)
+                elif isinstance(record, records.Message):
+                    channel = channels[record.channel_id]
+                    if not topics or channel.topic in topics:
+                        yield schemas[channel.schema_id], channel, record, decoders
         except InputError:
             raise
         except OSError as error:
@@ -355,6 +333,28 @@ class _McapFiles:
             if note:
                 text = " ".join(str(error).split()) or type(error).__name__
                 self._notes.append(f"{file}: cut short or damaged ({text}): what was before is read")
+
+    def _unpacked(self, file: Path, *, note: bool) -> Iterator[_McapRecord]:
+        """Yield the records of a file, those in its chunks too; again, as far as the first time."""
+        from mcap.records import Chunk
+        from mcap.stream_reader import StreamReader, breakup_chunk
+
+        chunks = 0
+        try:
+            with opened(file) as stream:
+                for record in StreamReader(stream, emit_chunks=True, record_size_limit=_CHUNK_MB * 1_000_000).records:
+                    if not isinstance(record, Chunk):
+                        yield record
+                        continue
+                    if not note and chunks == self._chunks[file]:
+                        return
+                    if record.compression not in _COMPRESSIONS:
+                        raise InputError(
+                            f"{self._path}: its chunks are compressed with {record.compression!r}; lz4 and zstd are read: "
+                            f"mcap compress --compression zstd {file} -o OUT.mcap"
+                        )
+                    yield from breakup_chunk(_decompressed(record), validate_crc=note)  # once
+                    chunks += 1
         finally:
             if note:
                 self._chunks[file] = chunks
