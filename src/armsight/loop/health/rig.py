@@ -77,8 +77,7 @@ MOST_POINTS = 24
 #: translation over distance, and rotation, rad.
 _SAME = 0.01
 _SAME_COSINE = float(np.cos(_SAME))
-#: While nothing is suspected, shots closer in time than this are left out, s, and those that hardly differ from the newest:
-#: they would cost time and add little.
+#: Shots closer in time than this are left out, s, and those that hardly differ from the newest: they would add little.
 _LEAST_S, _LIKE_S = 0.025, 0.1
 #: One of so many shots, those that fit worst, is no usual one.
 _ODD = 4
@@ -314,7 +313,7 @@ class RigWatch:
         self.alarm = self.alarmed = False
         self._alarms = 0  # in a row
         self.suspected: RigChange | None = None
-        self.noise, self._unrest = np.zeros((6, 6)), Unrest(4)
+        self.noise, self._unrest, self._newest_added = np.zeros((6, 6)), Unrest(4), np.zeros((6, 6))
         self._images: dict[bytes, None] = {}  # detections of shots that were summed, the newest last
 
     def take(self, estimate: PoseEstimate, t_s: float | None) -> Array:
@@ -335,7 +334,7 @@ class RigWatch:
         self._track.append((now_s, estimate.T_left_body))
         if self._redundant(estimate.T_left_body, now_s):
             self._last = (now_s, estimate.T_left_body)
-            return np.zeros((6, 6))
+            return self._newest_added
         self._taken_s = now_s
         found = self._residuals(estimate, now_s)
         self._last = (now_s, estimate.T_left_body)
@@ -349,6 +348,7 @@ class RigWatch:
         if added.any():  # of a body that is far off more than what is linear
             off = log_se3(inverse(estimate.T_left_body) @ self._linear_about(estimate)[1])
             added += np.outer(off, off)
+        self._newest_added = added
         return added
 
     def _expose(self, cov: Array) -> None:
@@ -444,18 +444,9 @@ class RigWatch:
         return added
 
     def _redundant(self, T: Array, now_s: float) -> bool:
-        """Return whether a shot adds too little to what was taken just before it."""
+        """Return whether a shot adds too little to what was taken just before it, whose errors are its own, too."""
         passed_s = now_s - self._taken_s
-        if (
-            self.suspected is not None
-            or self.lens is not None
-            or self._shape.found is not None
-            or self._shape.doubt is not None
-            or self._unrest.shows
-            or self.passing.now
-            or not self._timed
-            or not 0.0 <= passed_s < _LIKE_S
-        ):
+        if not self._timed or not 0.0 <= passed_s < _LIKE_S:
             return False
         return passed_s < _LEAST_S or (self._began is not None and not differ(self._began, T))
 
