@@ -45,7 +45,7 @@ from armsight.app.run.motion_file import MotionPlan, read_motions
 from armsight.app.run.tracks import require_pyarrow
 from armsight.app.setup.finding import check_arm, check_model, find_board
 from armsight.app.show.plotting import require_matplotlib
-from armsight.app.source_kinds import SIM
+from armsight.app.source_kinds import LOGGED, SIM
 from armsight.data import Array, Missed, PoseEstimate, Shot
 from armsight.errors import ArmsightError, DeviceError, InputError
 from armsight.files import read_text, unused
@@ -67,8 +67,6 @@ from armsight.robot.trajectories import point_to_point
 from armsight.vision.markers.targets import Composite, open_target
 from armsight.vision.rig import StereoRig
 
-#: Joint angles that another program logged: ``--board poses:FILE``.
-LOGGED = "poses:"
 _IDLE_S, _ASK_S = 0.004, 0.002
 #: A pose of the hand-eye calibration is the mean of so long, s; joints, rad, and body, m, that move more do not rest.
 _REST_S, _REST_RAD, _REST_M = 0.6, float(np.radians(0.3)), 1.5e-3

@@ -12,6 +12,7 @@ import click
 
 from armsight.app.options import PATH, output
 from armsight.app.show.messages import UNTRUSTED, require
+from armsight.app.source_kinds import LOGGED, SIM
 from armsight.app.stream_option import stream_option
 from armsight.errors import InputError
 from armsight.files import read_text, write_text
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
 _HANDEYE_POSES = 30
 #: Of motions that are planned here: cycles, and the speed on lines, m/s, which five poses do not use.
 _CYCLES, _SPEED_M_S = 3, 0.1
-_POSES = "poses:"
 
 
 @click.command("run")
@@ -106,14 +106,14 @@ def command(
     With --board poses:FILE nothing is commanded: FILE is a CSV of joint angles (q1_deg ..) that another program logged, by
     name of the shot or by time, for shots of a recording. Exit code 3: the result must not be trusted.
     """
-    if board_spec.startswith(_POSES):
+    if board_spec.startswith(LOGGED):
         if motion is not None or open_loop or fixed or follow_rig or sync_led:
             raise InputError(
                 f"--board {board_spec} commands no motion: leave out --motion, --open-loop, --fixed, --follow-rig and "
                 "--sync-led"
             )
         _run_logged(
-            source_spec, Path(board_spec.removeprefix(_POSES)), rig_path, target_spec, arm_spec, output, as_json
+            source_spec, Path(board_spec.removeprefix(LOGGED)), rig_path, target_spec, arm_spec, output, as_json
         )
         return
 
@@ -139,7 +139,7 @@ def command(
         raise InputError(
             f"{target_spec}: {target.body.name} cannot be followed: a body of three discs or more is needed"
         )
-    text = read_text(motion) if motion is not None else _motion_text(arm, simulated=source_spec.startswith("sim:"))
+    text = read_text(motion) if motion is not None else _motion_text(arm, simulated=source_spec.startswith(SIM))
     with tempfile.TemporaryDirectory() as name:
         if motion is None:
             write_text(motion := Path(name) / "motion.toml", text)
@@ -206,7 +206,7 @@ def _run_logged(
     with contextlib.closing(open_source(source_spec)) as source, steps() as progress:
         result = run_logged(source, rig, target, arm, angles, progress)
         progress("writing and plotting")
-        summary = write_logged(folder, result, {"arm": arm_spec, "board": f"{_POSES}{path}"})
+        summary = write_logged(folder, result, {"arm": arm_spec, "board": f"{LOGGED}{path}"})
     click.echo(json.dumps(summary) if as_json else "\n".join(summary_lines(summary, folder)))
     for line in result.weak:
         click.echo(weak(line), err=True, color=colour())

@@ -10,6 +10,7 @@ from typing import Any
 
 import click
 
+from armsight.app.source_kinds import SIM
 from armsight.errors import InputError
 
 
@@ -34,7 +35,7 @@ def command(arm: str, source: str | None, board: str | None, begin: int | None, 
         raise InputError(
             f"{arm}: no arm with a page; there are {', '.join(ARMS)}. Another arm: docs/arms/another_arm.md"
         )
-    simulate = (source or "").startswith("sim:")
+    simulate = (source or "").startswith(SIM)
     if simulate != ((board or "").startswith("emulated:")):
         raise InputError("--source sim: and --board emulated: go together: both are simulated")
     steps = ARMS[arm]
