@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from armsight.app.references import command
 from armsight.errors import InputError
 from armsight.geometry.pose import exp_se3, inverse, log_se3
 from armsight.geometry.rotation import quaternion_wxyz
@@ -104,6 +105,24 @@ def test_calibrate_finds_the_sensor_and_writes_what_check_reads(sweep, capsys, t
     (entry,) = read_references(out)
     apart = log_se3(inverse(entry.reference.T_tool_sensor) @ true.T_tool_sensor)
     assert np.degrees(np.linalg.norm(apart[3:])) < 0.2
+
+
+def test_a_sweep_that_rotates_the_tool_little_is_said(sweep, capsys, tmp_path, monkeypatch):
+    folder, _, _ = sweep
+    monkeypatch.setattr(command, "SMALL_DEG", 200.0)
+    run(
+        "references",
+        "calibrate",
+        folder / "references.toml",
+        "--poses",
+        folder / "poses.csv",
+        "-o",
+        tmp_path / "out.toml",
+    )
+    assert re.search(
+        r"the tool rotates by \d+ deg: the lever may be off by more than its sigma; rotate it by 200",
+        "".join(capsys.readouterr()),
+    )
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import pytest
 
 from armsight.errors import InputError
 from armsight.geometry.pose import exp_se3, inverse, log_se3
-from armsight.loop.references.calibrate import calibrate
+from armsight.loop.references.calibrate import PosePath, calibrate
 from armsight.loop.references.inertial import ACCELEROMETER, GYRO, Inertial
 from armsight.loop.references.reference import STANDARD_GRAVITY_M_S2, Reading, ToolMotion
 
@@ -113,3 +113,14 @@ def test_other_units_and_mirrored_axes_are_named(change, said):
     given = [change(r) for r in sweep(some(3), 0, count=60)]
     with pytest.raises(InputError, match=said):
         Inertial.of("imu").begun(given, motion)
+
+
+def test_a_path_between_poses_does_not_cut_the_acceleration_of_a_fast_sweep():
+    """30 poses a second at up to 4.6 rad/s; cubics cut 2 % of the acceleration, and of the lever."""
+    at = np.arange(0.0, 12.0, 1 / 30)
+    path = PosePath(at, np.array([pose(2 * t_s) for t_s in at]))
+    times = np.arange(0.5, 11.5, 0.1)
+    true = np.array([4 * motion(2 * t_s)[2] for t_s in times])
+    off = np.array([path(t_s).acceleration for t_s in times]) - true
+    share = np.linalg.norm(off, axis=0) / np.linalg.norm(true, axis=0)
+    assert share.max() < 0.005

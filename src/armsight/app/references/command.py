@@ -24,8 +24,12 @@ RATE = 0.05
 UNIT = 0.2
 #: A rest is so long at least, s.
 REST_S = 0.5
-#: Readings are averaged over so long for a calibration, s.
-AVERAGED_S = 0.05
+#: Readings are averaged over so long for a calibration, s; half: it takes twice as long, double: fast sweeps are cut, by
+#: 0.5 mm of a lever of 60 mm at 4.6 rad/s.
+AVERAGED_S = 0.02
+#: A sweep that rotates the tool by less is said to be small, deg; half: levers that are off by 10 mm pass, double: good
+#: sweeps are blamed.
+SMALL_DEG = 60.0
 #: Stamps of a sensor may be so late against those of the poses, s; half: a phone's are not found, double: more is cut off.
 DELAY_S = 0.5
 #: Errors of times left out, over their sigma, up to which a calibration is good; half: chance is a fault, double: looseness
@@ -261,10 +265,13 @@ def _check(entry: Entry) -> tuple[dict[str, Any], list[str], list[str]]:
 
 def _calibrated(entries: list[Entry], poses: Path) -> tuple[Report, list[Entry]]:
     """Return the report, and the references as calibrated."""
+    import numpy as np
+
     from armsight.app.show.messages import Note
     from armsight.app.show.report import Fact, Report
     from armsight.app.show.table import TextTable
     from armsight.errors import InputError
+    from armsight.geometry.rotation import log_so3
     from armsight.loop.references.calibrate import PosePath
     from armsight.loop.references.calibrate import calibrate as fit
     from armsight.tables.poses import read_pose_table
@@ -275,6 +282,10 @@ def _calibrated(entries: list[Entry], poses: Path) -> tuple[Report, list[Entry]]
     path = PosePath(table.t_s, table.Ts)
     found, blocks, done = list[dict[str, Any]](), list[Fact | TextTable](), list["Entry"]()
     notes = [Note("note", text) for text in table.notes]
+    angle_deg = float(np.degrees(np.linalg.norm(log_so3(table.Ts[0, :3, :3].T @ table.Ts[:, :3, :3]), axis=1).max()))
+    if angle_deg < SMALL_DEG:
+        text = f"{poses}: the tool rotates by {angle_deg:.0f} deg: the lever may be off by more than its sigma"
+        notes.append(Note("weak", f"{text}; rotate it by {SMALL_DEG:.0f} deg and more, about two axes"))
     for entry in entries:
         readings = _averaged(entry, path)
         click.echo(f"{entry.reference.name}: fitting its parameters to {len(readings)} readings", err=True)

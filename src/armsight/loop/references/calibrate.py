@@ -43,10 +43,11 @@ OPEN = 0.9
 #: The noise of a channel may be this many times less, or more, than was said.
 LEAST, MOST = 1e-3, 1e3
 
-#: Degree of the polynomial; half: corners are cut, double: noise of the acceleration four times as large.
-DEGREE = 3
+#: Degree of the polynomial; half: corners are cut, by 2 % of the acceleration at 4.6 rad/s and 30 poses a second, double:
+#: noise of the acceleration ten times as large.
+DEGREE = 5
 #: Poses that one is laid through at least, on both sides together, and the least span, s.
-LEAST_POSES, SPAN_S = 6, 0.08
+LEAST_POSES, SPAN_S = 10, 0.08
 #: Longest gap between poses that is bridged, s.
 GAP_S = 0.5
 
