@@ -35,8 +35,8 @@ KEPT_SHARE = 0.5
 #: A board is larger than its spec if at least this share of a further row consists of corners too.
 MORE_SHARE = 0.7
 #: A residual this many times the median residual of the board's corners, both relative to the contrast, marks a
-#: disturbed corner: a glint, a finger, a staple. Never below the floor, for a clean image has a tiny median.
-MISFIT_RATIO, MISFIT_FLOOR = 4.0, 0.08
+#: disturbed corner: a glint, a finger, a staple.
+MISFIT_RATIO = 4.0
 COPY_BLUR_PX = 0.75  # in a smaller copy; half: few images are reduced, double: sharp ones are
 #: The four outermost lines of a grid (rows, columns), each with the one next to it.
 _ENDS = ((np.s_[0], np.s_[1]), (np.s_[-1], np.s_[-2]), (np.s_[:, 0], np.s_[:, 1]), (np.s_[:, -1], np.s_[:, -2]))
@@ -247,7 +247,7 @@ def misfits(fits: CornerFits) -> NDArray[np.bool_]:
     relative = fits.residual / np.maximum(np.abs(fits.contrast), 1e-9)
     good = np.sort(relative[fits.kept])
     usual = float(good[len(good) // 2]) if len(good) else 0.0
-    return np.asarray(relative > max(MISFIT_RATIO * usual, MISFIT_FLOOR))
+    return np.asarray(relative > MISFIT_RATIO * usual)
 
 
 def _why_not(fits: CornerFits, kept: int) -> str:
