@@ -9,9 +9,8 @@ from pathlib import Path
 
 import click
 
-from armsight.app.options import PATH, output
+from armsight.app.options import DETECTIONS, PATH, output
 from armsight.app.show.messages import UNTRUSTED
-from armsight.app.source_kinds import DETECTIONS
 from armsight.errors import InputError
 from armsight.files import check_folder, check_outputs, check_writable
 from armsight.vision.calibrate import FOLDS, MODELS

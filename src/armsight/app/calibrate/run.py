@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.app.calibrate.command import CalibrateOptions
+from armsight.app.options import DETECTIONS, SIM
 from armsight.app.progress import bar, steps
 from armsight.app.record.recording import record
-from armsight.app.source_kinds import DETECTIONS, SIM
 from armsight.data import SIDES, Detections, Shot
 from armsight.errors import CalibrationError, InputError
 from armsight.files import unused

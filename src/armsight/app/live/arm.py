@@ -29,6 +29,7 @@ from armsight.app.live.handeye import (
 from armsight.app.live.measuring import MeasureStep
 from armsight.app.live.records import asked
 from armsight.app.live.step import PageStep, Shared, why
+from armsight.app.options import LOGGED, SIM
 from armsight.app.run.angles import LoggedAngles, read_angles
 from armsight.app.run.devices import require_joints, setup_of
 from armsight.app.run.experiment import (
@@ -45,7 +46,6 @@ from armsight.app.run.motion_file import MotionPlan, read_motions
 from armsight.app.run.tracks import require_pyarrow
 from armsight.app.setup.finding import check_arm, check_model, find_board
 from armsight.app.show.plotting import require_matplotlib
-from armsight.app.source_kinds import LOGGED, SIM
 from armsight.data import Array, Missed, PoseEstimate, Shot
 from armsight.errors import ArmsightError, DeviceError, InputError
 from armsight.files import read_text, unused

@@ -14,9 +14,9 @@ import numpy as np
 from armsight.app.live.capture import CameraCapture, LiveShot
 from armsight.app.live.records import asked
 from armsight.app.live.step import PageStep, Shared
+from armsight.app.options import SIM
 from armsight.app.setup.finding import COVERED, NOT_COVERED
 from armsight.app.show.messages import Level, Note
-from armsight.app.source_kinds import SIM
 from armsight.errors import DeviceError, InputError
 from armsight.sim.workcell.person import ACTIONS
 from armsight.vision.image import grey

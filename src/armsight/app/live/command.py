@@ -9,9 +9,8 @@ from typing import Any
 
 import click
 
-from armsight.app.options import PATH, output
+from armsight.app.options import CELL, PATH, output, stream_option
 from armsight.app.show.messages import require
-from armsight.app.stream_option import CELL, stream_option
 
 _HERE = ("127.0.0.1", "localhost", "::1")
 
@@ -70,8 +69,8 @@ def command(http: str, sync_ms: float, as_json: bool, **given: Any) -> None:  # 
     from armsight.app.live.server import LiveServer
     from armsight.app.live.session import LiveSession
     from armsight.app.live.step import SessionOptions
+    from armsight.app.options import SIM
     from armsight.app.show.http import host_and_port
-    from armsight.app.source_kinds import SIM
     from armsight.app.stream.datum import Published
     from armsight.app.stream.streams import open_streams
     from armsight.vision.sources import check_source

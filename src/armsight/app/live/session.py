@@ -27,9 +27,9 @@ from armsight.app.live.measuring import MeasureState, MeasureStep
 from armsight.app.live.recorded import RecordedStep
 from armsight.app.live.records import STEPS, Event, PageCommand, asked
 from armsight.app.live.step import SessionOptions, Shared, why
+from armsight.app.options import SIM
 from armsight.app.run.motion_file import DEFAULT_MOTION, QUICK
 from armsight.app.show.messages import Level, Note
-from armsight.app.source_kinds import SIM
 from armsight.errors import ArmsightError, InputError
 from armsight.files import check_folder, read_json, require_version, unused, write_text
 from armsight.robot.arm_file import open_arm

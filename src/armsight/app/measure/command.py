@@ -8,10 +8,8 @@ from pathlib import Path
 
 import click
 
-from armsight.app.options import PATH, output
+from armsight.app.options import DETECTIONS, PATH, output, stream_option
 from armsight.app.show.messages import UNTRUSTED
-from armsight.app.source_kinds import DETECTIONS
-from armsight.app.stream_option import stream_option
 
 
 @dataclass(frozen=True)

@@ -17,9 +17,9 @@ from armsight.app.measure.moving import Requested, requested_shutters
 from armsight.app.measure.picture import SINGULAR
 from armsight.app.measure.shots import NAMED, DetectedShots, ImageShots, Result, named, open_shots
 from armsight.app.measure.view import CHART, PictureFolder, view_folder
+from armsight.app.options import DETECTIONS
 from armsight.app.progress import bar
 from armsight.app.show.messages import colour, weak
-from armsight.app.source_kinds import DETECTIONS
 from armsight.app.stream.datum import Published
 from armsight.data import Body, Dropped, Missed, PoseEstimate, Shot
 from armsight.errors import ArmsightError, InputError

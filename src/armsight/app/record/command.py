@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from armsight.app.options import output
-from armsight.app.stream_option import stream_option
+from armsight.app.options import output, stream_option
 from armsight.errors import ArmsightError
 
 if TYPE_CHECKING:

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from armsight.app.options import PATH, output
-from armsight.app.stream_option import stream_option
+from armsight.app.options import PATH, output, stream_option
 
 if TYPE_CHECKING:
     from armsight.app.replay.run import Replayed

@@ -10,10 +10,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from armsight.app.options import PATH, output
+from armsight.app.options import LOGGED, PATH, SIM, output, stream_option
 from armsight.app.show.messages import UNTRUSTED, require
-from armsight.app.source_kinds import LOGGED, SIM
-from armsight.app.stream_option import stream_option
 from armsight.errors import InputError
 from armsight.files import read_text, write_text
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from armsight.app.source_kinds import SIM
+from armsight.app.options import SIM
 from armsight.errors import InputError
 from armsight.loop.running.setup import HostClock, LiveShots, Setup
 from armsight.robot.board_registry import EMULATED, emulator_name, open_motion_board, slowed

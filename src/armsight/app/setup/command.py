@@ -10,7 +10,7 @@ from typing import Any
 
 import click
 
-from armsight.app.source_kinds import SIM
+from armsight.app.options import SIM
 from armsight.errors import InputError
 
 
