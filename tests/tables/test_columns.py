@@ -6,7 +6,7 @@ import pytest
 from armsight.errors import InputError
 from armsight.tables.cells import read_columns
 from armsight.tables.columns import Columns
-from armsight.tables.number import number
+from armsight.tables.lengths import number
 
 
 def test_columns_are_read_under_other_names(tmp_path):

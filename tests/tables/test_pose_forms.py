@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from armsight.errors import InputError
 from armsight.robot.arm_file import open_arm
+from armsight.tables.lengths import number
 from armsight.tables.nested import has_both
-from armsight.tables.number import number
 from armsight.tables.poses import read_pose_table
 
 N = 6

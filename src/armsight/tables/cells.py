@@ -15,8 +15,8 @@ import numpy as np
 
 from armsight.errors import InputError
 from armsight.files import DECIMAL_COMMA, TABLE_MB, read_table, read_text
+from armsight.tables.lengths import NUMBER, number
 from armsight.tables.nested import BY_COUNT, PACKED, document_rows, is_document, is_packed
-from armsight.tables.number import NUMBER, number
 from armsight.tables.programs import program_rows
 
 Rows = list[tuple[int, list[str]]]

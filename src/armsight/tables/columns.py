@@ -18,7 +18,7 @@ from armsight.errors import InputError
 from armsight.files import read_table
 from armsight.geometry.rotation import nearest_rotation
 from armsight.tables.cells import Rows, renamed
-from armsight.tables.number import number
+from armsight.tables.lengths import number
 from armsight.tables.rotations import QUATERNION_OFF, rotations_by
 
 NAMES = ("image", "name", "shot")  # columns whose cells name the rows

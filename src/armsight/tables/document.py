@@ -28,7 +28,7 @@ import yaml
 
 from armsight.errors import InputError
 from armsight.files import DOCUMENT_MB, parsed_json, read_bytes, read_text
-from armsight.tables.number import number
+from armsight.tables.lengths import number
 
 #: A value of a file of another program: a number, a text, a list or a mapping, unknown until checked.
 Foreign: TypeAlias = Any

@@ -1,4 +1,6 @@
-"""Whether a length can be one: the unit of a file is its author's, and a wrong one is a factor of 1000 in every result.
+"""Numbers as any program writes them, and whether a length can be one.
+
+The unit of a file is its author's, and a wrong one is a factor of 1000 in every result.
 
 In: a length, the unit it was read in, and what it is of. Out: nothing, or an error that names the unit in which it would
 be an ordinary one.
@@ -6,6 +8,7 @@ be an ordinary one.
 
 from __future__ import annotations
 
+import re
 from typing import NamedTuple
 
 from armsight.errors import InputError
@@ -76,3 +79,22 @@ def check_length(length_m: float, unit_m: float, usual: Usual, advice: str = "--
 def metric(length_m: float) -> str:
     """Return a length for people: mm below a metre, else m."""
     return f"{1e3 * length_m:.4g} mm" if length_m < 1 else f"{length_m:.4g} m"
+
+
+#: A number in a pattern; Fortran's 1D-3 and the minus of a typesetter among them.
+NUMBER = r"[+\-\u2212]?(?:\d+\.?\d*|\.\d+)(?:[eEdD][+\-\u2212]?\d+)?"
+_NUMBER = re.compile(NUMBER)
+
+
+def number(text: str) -> float | None:
+    """Return a number; NaN and infinities too; None where it is none."""
+    try:
+        return float(text) if text.isascii() and "_" not in text else _unusual(text)
+    except ValueError:
+        return _unusual(text)
+
+
+def _unusual(text: str) -> float | None:
+    """Return a number that is not Python's."""
+    text = text.strip()
+    return float(re.sub("[dD]", "e", text.replace("\u2212", "-"))) if _NUMBER.fullmatch(text) else None

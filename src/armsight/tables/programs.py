@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from armsight.errors import InputError
-from armsight.tables.number import NUMBER
+from armsight.tables.lengths import NUMBER
 
 _MM, _ANGLES, _QUATERNION = ("x_mm", "y_mm", "z_mm"), ("rx_deg", "ry_deg", "rz_deg"), ("qw", "qx", "qy", "qz")
 _ROTATED, _FIXED = "XYZ", "xyz"

@@ -18,7 +18,7 @@ import numpy as np
 from armsight.data import SIDES, Array, Body, Correspondences, Ids, Record
 from armsight.errors import InputError
 from armsight.files import read_table
-from armsight.tables.number import number
+from armsight.tables.lengths import number
 
 COLUMNS = ("shot", "camera", "marker", "u_px", "v_px")
 #: How many lines with the same mistake are named before the rest is counted.

@@ -16,7 +16,7 @@ from armsight.data import Array
 from armsight.errors import InputError
 from armsight.files import write_text
 from armsight.tables.columns import Columns
-from armsight.tables.number import number
+from armsight.tables.lengths import number
 from armsight.vision.pose.shot_pose import UPPER, rows_of
 
 POSES, LIVE = "poses.csv", "live.csv"

@@ -24,7 +24,7 @@ from armsight.robot.kinematics.table import FEWEST_JOINTS, MOST_JOINTS
 from armsight.tables.cells import Cells, Rows, read_cells, read_columns
 from armsight.tables.columns import COLUMNS as _COLUMNS
 from armsight.tables.columns import NAMES, Columns
-from armsight.tables.number import number
+from armsight.tables.lengths import number
 from armsight.tables.poses import ArmJoints, PoseTable, columns_in, read_pose_table
 from armsight.tables.rotations import ROTATIONS
 

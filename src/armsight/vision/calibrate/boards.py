@@ -29,9 +29,13 @@ from armsight.data import Array, Body, Detections, Ids, Missed, Record
 from armsight.errors import CalibrationError
 from armsight.geometry.pose import inverse
 from armsight.vision.calibrate import FOLDS, MODELS
-from armsight.vision.calibrate.adjust import ROUGHLY, STEPS, adjusted, concluded, freed
 from armsight.vision.calibrate.heldout import (
+    ROUGHLY,
+    STEPS,
+    adjusted,
+    concluded,
     cross_validate,
+    freed,
     require_choice,
     rig_of,
     summary,

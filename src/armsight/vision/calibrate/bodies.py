@@ -18,8 +18,9 @@ from armsight.data import Array, Body, Correspondences
 from armsight.errors import CalibrationError
 from armsight.geometry.pose import inverse, log_se3
 from armsight.vision.calibrate import FOLDS
-from armsight.vision.calibrate.adjust import adjusted, concluded
 from armsight.vision.calibrate.heldout import (
+    adjusted,
+    concluded,
     cross_validate,
     require_choice,
     rig_of,

@@ -25,8 +25,7 @@ from armsight.geometry.check import checked
 from armsight.geometry.near import pairs_within
 from armsight.geometry.pose import pose
 from armsight.geometry.rotation import from_euler_zyx, from_quaternion_wxyz
-from armsight.tables.lengths import BODY, check_length
-from armsight.tables.number import number
+from armsight.tables.lengths import BODY, check_length, number
 
 #: The version of the format that is documented; a file without the key ``version`` has version 1.
 VERSION = 2
