@@ -197,6 +197,18 @@ def _sine(cycles: float) -> float:
     return a * (1 - x / 6 * (1 - x / 20 * (1 - x / 42 * (1 - x / 72 * (1 - x / 110 * (1 - x / 156))))))
 
 
+@kernel
+def _spring(q: float, qd: float, link: float, linkd: float, between: Array, half: float) -> tuple[float, float]:
+    """Return the drum's ratio at a motor's angle, and the torque, N m, by which its spring pulls what it drives."""
+    cycles = between[6] / 6.283185307179586 * q + between[7]
+    ratio = 1 + between[5] * between[6] * _sine(cycles + 0.25)
+    twist = q + between[5] * _sine(cycles) - link
+    twist = twist - half if twist > half else (twist + half if twist < -half else 0.0)
+    stiff = between[0] * (1 + between[3] * link) * (between[4] if twist < 0 else 1.0)
+    damped = between[1] * (ratio * qd - linkd) if twist != 0 or half == 0 else 0.0
+    return ratio, stiff * twist + damped
+
+
 @kernel(
     "f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], f8[::1], b1, b1, f8, b1[::1]"
 )
@@ -236,13 +248,7 @@ def _move(
         for _ in range(_SUBSTEPS):
             torque = 0.0
             if stiffness > 0:
-                cycles = cycles_per_rad * q[i] + between[7, i]
-                ratio = 1 + drum * between[6, i] * _sine(cycles + 0.25)
-                twist = q[i] + drum * _sine(cycles) - link[i]
-                twist = twist - half if twist > half else (twist + half if twist < -half else 0.0)
-                stiff = stiffness * (1 + between[3, i] * link[i]) * (between[4, i] if twist < 0 else 1.0)
-                damped = between[1, i] * (ratio * qd[i] - linkd[i]) if twist != 0 or half == 0 else 0.0
-                pull = stiff * twist + damped
+                ratio, pull = _spring(q[i], qd[i], link[i], linkd[i], between[:, i], half)
                 torque = ratio * pull
                 linkd[i] = 0.0 if blocked[i] else linkd[i] + h * (pull + load) / (own - mass)
                 link[i] += h * linkd[i]

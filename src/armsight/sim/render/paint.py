@@ -497,6 +497,68 @@ def _reach(rays: Array, Ms: Array, tile: Box, corner: tuple[int, int], grid: Gri
     return True, (i0, i1, j0, j1)
 
 
+Scratch = tuple[Array, Array, Slots, Slots, Array, Array, Slots]
+
+
+@kernel(nogil=True)
+def _paint_cells(
+    rays: Array,
+    Ms: Array,
+    tile: Box,
+    corner: tuple[int, int],
+    grid: Grid,
+    scratch: Scratch,
+    coarse: Array,
+    slot: Slots,
+    fine: Array,
+    count: int,
+) -> tuple[Array, int]:
+    """Paint a tile of pixels in which several edges meet; see :func:`paint`."""
+    xe, ye, values = grid
+    u0, v0, u1, v1 = tile
+    top, bottom, top_cells, bottom_cells, buffer, fan, fan_cells = scratch
+    flat, ahead, columns, span = values.reshape(-1), False, xe.size + 1, (0, 0, 0, 0)
+    n = u1 - u0
+    for v in range(v0, v1):
+        M = Ms[min(v, Ms.shape[0] - 1)]
+        if v == v0 or Ms.shape[0] > 1:  # each row of a rolling shutter sees its own plane
+            ahead = plane_row(rays, M, v + corner[1], u0 + corner[0], n + 1, bottom)
+            cells_of(bottom, xe, ye, n + 1, bottom_cells)
+        top, bottom, top_cells, bottom_cells = bottom, top, bottom_cells, top_cells
+        all_ahead = ahead
+        ahead = plane_row(rays, M, v + 1 + corner[1], u0 + corner[0], n + 1, bottom)
+        cells_of(bottom, xe, ye, n + 1, bottom_cells)
+        all_ahead = all_ahead and ahead
+        for k in range(n):
+            if not all_ahead and not ahead_of(top, bottom, k):
+                continue
+            cell = top_cells[k]
+            whole = top_cells[k + 1] == cell and bottom_cells[k] == cell and bottom_cells[k + 1] == cell
+            if not whole:
+                span = span_of(top_cells, bottom_cells, k, columns)
+                whole = uniform(values, span)
+            if whole:
+                value = flat[cell]
+                if value >= 0.0:
+                    coarse[v, u0 + k] = value
+                    slot[v, u0 + k] = -1
+                continue
+            fine, s, count = open_parts(v, u0 + k, coarse, slot, fine, count)
+            if span[1] - span[0] + span[3] - span[2] == 1:
+                axis, edge = (0, xe[span[0]]) if span[1] > span[0] else (1, ye[span[2]])
+                past = (
+                    top[axis, k] - edge * top[2, k],
+                    top[axis, k + 1] - edge * top[2, k + 1],
+                    bottom[axis, k] - edge * bottom[2, k],
+                    bottom[axis, k + 1] - edge * bottom[2, k + 1],
+                )
+                _cut(past, values[span[2], span[0]], values[span[3], span[1]], fine[s])
+            else:
+                part_corners(top, bottom, k, fan)
+                clip_parts(fan, fan_cells, grid, fine[s], buffer)
+    return fine, count
+
+
 @kernel(
     "f8[:, :, ::1], f8[:, :, ::1], (i8, i8, i8, i8), (i8, i8), (f8[::1], f8[::1], f8[:, ::1]), f8[:, ::1], "
     "i4[:, ::1], f8[:, :, ::1], i8",
@@ -530,12 +592,15 @@ def paint(
         ``fine`` (a larger one where it was full) and the new count.
     """
     xe, ye, values = grid
-    flat = values.reshape(-1)
-    top, bottom = np.empty((3, _TILE + 1)), np.empty((3, _TILE + 1))
-    top_cells, bottom_cells = np.zeros(_TILE + 1, np.int32), np.zeros(_TILE + 1, np.int32)
-    buffer = np.empty((6, VERTICES, 5))
-    fan, fan_cells = np.empty((SUB + 1, 3, SUB + 1)), np.zeros((SUB + 1, SUB + 1), np.int32)
-    ahead, columns = False, xe.size + 1
+    scratch = (
+        np.empty((3, _TILE + 1)),
+        np.empty((3, _TILE + 1)),
+        np.zeros(_TILE + 1, np.int32),
+        np.zeros(_TILE + 1, np.int32),
+        np.empty((6, VERTICES, 5)),
+        np.empty((SUB + 1, 3, SUB + 1)),
+        np.zeros((SUB + 1, SUB + 1), np.int32),
+    )
     across, lines = (box[2] - box[0] + _TILE - 1) // _TILE, (box[3] - box[1] + _TILE - 1) // _TILE
     for tile in range(max(across, 0) * max(lines, 0)):
         u0, v0 = box[0] + tile % across * _TILE, box[1] + tile // across * _TILE
@@ -553,42 +618,5 @@ def paint(
         if all_ahead and cuts == 1:
             fine, count = _paint_edge(rays, Ms, (u0, v0, u1, v1), corner, grid, span, coarse, slot, fine, count)
             continue
-        n = u1 - u0
-        for v in range(v0, v1):
-            M = Ms[min(v, Ms.shape[0] - 1)]
-            if v == v0 or Ms.shape[0] > 1:  # each row of a rolling shutter sees its own plane
-                ahead = plane_row(rays, M, v + corner[1], u0 + corner[0], n + 1, bottom)
-                cells_of(bottom, xe, ye, n + 1, bottom_cells)
-            top, bottom, top_cells, bottom_cells = bottom, top, bottom_cells, top_cells
-            all_ahead = ahead
-            ahead = plane_row(rays, M, v + 1 + corner[1], u0 + corner[0], n + 1, bottom)
-            cells_of(bottom, xe, ye, n + 1, bottom_cells)
-            all_ahead = all_ahead and ahead
-            for k in range(n):
-                if not all_ahead and not ahead_of(top, bottom, k):
-                    continue
-                cell = top_cells[k]
-                whole = top_cells[k + 1] == cell and bottom_cells[k] == cell and bottom_cells[k + 1] == cell
-                if not whole:
-                    span = span_of(top_cells, bottom_cells, k, columns)
-                    whole = uniform(values, span)
-                if whole:
-                    value = flat[cell]
-                    if value >= 0.0:
-                        coarse[v, u0 + k] = value
-                        slot[v, u0 + k] = -1
-                    continue
-                fine, s, count = open_parts(v, u0 + k, coarse, slot, fine, count)
-                if span[1] - span[0] + span[3] - span[2] == 1:
-                    axis, edge = (0, xe[span[0]]) if span[1] > span[0] else (1, ye[span[2]])
-                    past = (
-                        top[axis, k] - edge * top[2, k],
-                        top[axis, k + 1] - edge * top[2, k + 1],
-                        bottom[axis, k] - edge * bottom[2, k],
-                        bottom[axis, k + 1] - edge * bottom[2, k + 1],
-                    )
-                    _cut(past, values[span[2], span[0]], values[span[3], span[1]], fine[s])
-                else:
-                    part_corners(top, bottom, k, fan)
-                    clip_parts(fan, fan_cells, grid, fine[s], buffer)
+        fine, count = _paint_cells(rays, Ms, (u0, v0, u1, v1), corner, grid, scratch, coarse, slot, fine, count)
     return fine, count
