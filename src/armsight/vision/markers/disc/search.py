@@ -409,6 +409,25 @@ def _note(n: int, starts: Array, cells: NDArray[np.int16]) -> None:
 
 
 @kernel
+def _strongest(image: Grey, y: int, i: int, sign: int, left: np.uint64) -> tuple[np.uint64, int, int]:
+    """Take the first run of marked pixels of word i of a row, which is one candidate.
+
+    Returns:
+        The marks that are left; the column where the two pixels, eight apart, differ most, and by how many levels.
+    """
+    byte, best, x = 0, -1, 0
+    while (left >> np.uint64(8 * byte)) & _MARK == _EMPTY:
+        byte += 1
+    while byte < 8 and (left >> np.uint64(8 * byte)) & _MARK != _EMPTY:
+        left &= ~(_MARK << np.uint64(8 * byte))
+        gap = sign * (int(image[y, 8 * i + byte + 8]) - int(image[y, 8 * i + byte]))
+        if gap > best:
+            best, x = gap, 8 * i + byte + 8
+        byte += 1
+    return left, x, best
+
+
+@kernel
 def search(
     image: Grey, words: Words64, noise: float, bright: bool, dark: bool, starts: Array, codes: NDArray[np.int64],
     signs: NDArray[np.int64], room: Room,
@@ -451,17 +470,8 @@ def search(
                 left = _marks(row[i], row[i + 1], t) if sign > 0 else _marks(row[i + 1], row[i], t)
                 mine = cells[(1 - sign) // 2]
                 while left != _EMPTY:
-                    # A run of marked pixels is one candidate: where the two differ most.
-                    byte, best, x = 0, -1, 0
-                    while (left >> np.uint64(8 * byte)) & _MARK == _EMPTY:
-                        byte += 1
-                    while byte < 8 and (left >> np.uint64(8 * byte)) & _MARK != _EMPTY:
-                        left &= ~(_MARK << np.uint64(8 * byte))
-                        gap = sign * (int(image[y, 8 * i + byte + 8]) - int(image[y, 8 * i + byte]))
-                        if gap > best:
-                            best, x = gap, 8 * i + byte + 8
-                        byte += 1
-                    if _known(x, y, best, starts, codes, mine):
+                    left, x, gap = _strongest(image, y, i, sign, left)
+                    if _known(x, y, gap, starts, codes, mine):
                         continue
                     if n == len(starts):
                         return n, True  # the rest was not looked at
