@@ -627,11 +627,15 @@ class RigWatch:
         if nodded and self._unrest_began(nodded):  # newest sums do not have it in their noise
             self._take_back([each.begin_s for each in self._history[-TOGETHER:]])
             return
-        due = 0 < self._alarms <= _FRESH or self._tests % _LENS_TESTS == 0
-        if due and self._tests < _LENS_KEPT and self._poses >= _LENS_POSES:
+        if self._lens_is_due():
             self.lens = self._lens()
         if len(self._history) >= _MOST_KEPT:
             self._merge()
+
+    def _lens_is_due(self) -> bool:
+        """Return whether the lenses are looked at with the newest test."""
+        due = 0 < self._alarms <= _FRESH or self._tests % _LENS_TESTS == 0
+        return due and self._tests < _LENS_KEPT and self._poses >= _LENS_POSES
 
     def _keep(self, newest: _Newest, change: RigChange, alarm: bool) -> None:
         """Keep the newest test, and what it says of the rig."""

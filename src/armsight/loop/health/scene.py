@@ -303,11 +303,7 @@ class SceneWatch:
                 self._find_depths(images)
             return
         motions = [spots.moved(image) for spots, image in zip(self._spots, images, strict=True)]
-        for side, motion in enumerate(motions):
-            alarm = motion is not None and motion.chi_square > _LIMIT
-            if motion is not None:
-                self._since[side] = (t_s if self._alarms[side] == 0 else self._since[side]) if alarm else None
-                self._alarms[side] = self._alarms[side] + 1 if alarm else 0
+        self._count(motions, t_s)
         certain = [count >= _AGAIN for count in self._alarms]
         self._quiet = 0 if any(self._alarms) else self._quiet + 1
         if self._quiet == _BACK:
@@ -315,6 +311,15 @@ class SceneWatch:
         if any(certain):
             at = np.array([0.0, 0.0, 1.0]) if p_left is None else p_left
             self._found = self._said(motions, certain, at)
+
+    def _count(self, motions: Sequence[CameraMotion | None], t_s: float) -> None:
+        """Count looks in a row at which a camera seems to have moved, and note when the first was, s."""
+        for side, motion in enumerate(motions):
+            if motion is None:
+                continue
+            alarm = motion.chi_square > _LIMIT
+            self._since[side] = (t_s if self._alarms[side] == 0 else self._since[side]) if alarm else None
+            self._alarms[side] = self._alarms[side] + 1 if alarm else 0
 
     def findings(self) -> tuple[HealthFinding, ...]:
         """Return what was found so far; nothing while all is well."""
