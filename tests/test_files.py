@@ -14,6 +14,7 @@ import pytest
 from armsight import files
 from armsight.errors import InputError
 from armsight.files import (
+    alone_in,
     check_readable,
     check_writable,
     read_json,
@@ -319,3 +320,11 @@ def test_tables_of_spreadsheets_are_read(tmp_path, mark):
         read_table(path)
     path.write_text(f"x,a{mark}b\n1,2\n")
     assert read_table(path) == [["x", f"a{mark}b"], ["1", "2"]]
+
+
+def test_a_folder_is_for_one_process_of_a_command(tmp_path):
+    with alone_in(tmp_path / "live", "live"):
+        with pytest.raises(InputError, match="another live uses it: give this one another folder, -o FOLDER"):
+            alone_in(tmp_path / "live", "live").__enter__()
+        alone_in(tmp_path / "live", "hub").__enter__()
+    alone_in(tmp_path / "live", "live").__enter__()

@@ -454,6 +454,24 @@ def check_outputs(outputs: Iterable[str | Path | None], inputs: Iterable[str | P
             taken.append(path)
 
 
+@contextlib.contextmanager
+def alone_in(folder: Path, command: str) -> Iterator[None]:
+    """Keep a folder, which is made, to one process of a command.
+
+    Raises:
+        InputError: another one uses it.
+    """
+    import fcntl  # POSIX
+
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / f"{command}.lock").open("w", encoding="utf-8") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise InputError(f"{folder}: another {command} uses it: give this one another folder, -o FOLDER") from None
+        yield
+
+
 def check_folder(
     path: str | Path,
     *,

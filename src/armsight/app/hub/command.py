@@ -51,12 +51,14 @@ def command(ctx: click.Context, listen: str, http: str, keys: Path | None, outpu
     import threading
 
     from armsight.app.hub.service import Hub
+    from armsight.app.show.http import host_and_port
     from armsight.app.show.messages import require
     from armsight.app.stream.cell_file import endpoint
     from armsight.files import check_folder
 
     require("a hub", "cells", "zenoh", "pyarrow")
     check_folder(output, problem="no hub can be kept here")
+    host_and_port(http, "--http")
     hub = Hub(output, endpoint(listen, "--listen"), http, keys, lambda line: click.echo(f"note: {line}", err=True))
     try:
         if as_json:

@@ -6,7 +6,6 @@ by DuckDB in one line (docs/howto/cells.md).
 
 from __future__ import annotations
 
-import fcntl
 import json
 import sqlite3
 import threading
@@ -19,7 +18,7 @@ from typing import Any
 
 from armsight.app.hub.cells import NUMBERS, CellView, number
 from armsight.errors import InputError
-from armsight.files import replacing
+from armsight.files import alone_in, replacing
 
 #: s between two files of states of a cell; half: twice as many files, double: a crash loses twice as much history.
 FLUSH_S = 600.0
@@ -51,9 +50,7 @@ class Store:
         self.problem = ""
         with ExitStack() as opened:
             try:
-                folder.mkdir(parents=True, exist_ok=True)
-                alone = opened.enter_context((folder / "hub.lock").open("w"))
-                fcntl.flock(alone, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                opened.enter_context(alone_in(folder, "hub"))
                 self._db = sqlite3.connect(folder / "events.sqlite", timeout=5.0, check_same_thread=False)
                 opened.callback(self._db.close)
                 self._db.execute("PRAGMA journal_mode = WAL")  # who reads does not wait, other programs too
@@ -61,8 +58,7 @@ class Store:
                     self._db.execute(table)
                 self._db.commit()
             except (sqlite3.Error, OSError) as error:
-                why = "another hub uses it" if isinstance(error, BlockingIOError) else str(error)
-                raise InputError(f"{folder}: nothing can be kept here: {why}") from None
+                raise InputError(f"{folder}: nothing can be kept here: {error}") from None
             self._opened = opened.pop_all()
 
     def add_events(self, site: str, cell: str, message: Any, arrived_s: float) -> int:  # noqa: ANN401 - whatever JSON holds

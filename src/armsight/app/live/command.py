@@ -73,6 +73,7 @@ def command(http: str, sync_ms: float, as_json: bool, **given: Any) -> None:  # 
     from armsight.app.show.http import host_and_port
     from armsight.app.stream.datum import Published
     from armsight.app.stream.streams import open_streams
+    from armsight.files import alone_in
     from armsight.vision.sources import check_source
     from armsight.vision.sources.usb import is_one, parsed_usb
 
@@ -86,22 +87,23 @@ def command(http: str, sync_ms: float, as_json: bool, **given: Any) -> None:  # 
     tried = [each for each in options.streams if not each.startswith(CELL)]  # a mistake is said now; a cell's was
     open_streams(tried, Published(), lambda line: click.echo(line, err=True)).close()
     session = LiveSession(options)
-    server = LiveServer(session, host, port, None if host in _HERE else secrets.token_urlsafe(18))
-    try:
-        server.start()
-        session.start()
-        if as_json:
-            click.echo(json.dumps({"address": server.address, "directory": str(session.folder)}))
-        else:
-            click.echo(
-                f"open {server.address} in a browser; everything is stored in {session.folder}; Ctrl-C ends the session"
-            )
-        shown = 0
-        while True:
-            for event in session.events(shown):
-                shown = event.number
-                click.echo(f"{event.at} {event.text}", err=True)
-            time.sleep(0.2)
-    finally:
-        server.close()
-        session.close()
+    with alone_in(session.folder, "live"):
+        server = LiveServer(session, host, port, None if host in _HERE else secrets.token_urlsafe(18))
+        try:
+            server.start()
+            session.start()
+            if as_json:
+                click.echo(json.dumps({"address": server.address, "directory": str(session.folder)}))
+            else:
+                click.echo(
+                    f"open {server.address} in a browser; everything is stored in {session.folder}; Ctrl-C ends the session"
+                )
+            shown = 0
+            while True:
+                for event in session.events(shown):
+                    shown = event.number
+                    click.echo(f"{event.at} {event.text}", err=True)
+                time.sleep(0.2)
+        finally:
+            server.close()
+            session.close()
