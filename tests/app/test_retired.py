@@ -49,13 +49,28 @@ def test_a_command_line_of_before_is_one_of_today(before, now):
 
 def test_each_is_said_in_a_line_and_none_is_an_option_any_more(armsight):
     said = armsight("measure", "none.json", "--target", "chessboard:9x6:25mm", "--left", "a", "--right", "b")
-    first, second, error = said.err.splitlines()
-    assert first == "note: --left is retired: write --source pairs:LEFT,RIGHT"
-    assert second.startswith("note: --right is retired")
+    note, error = said.err.splitlines()
+    assert note == "note: --left, --right are retired: write --source pairs:a,b"
     assert "none.json" in error
     for each in RETIRED:
         for name in each.commands:
             assert each.option not in [o for p in group.get_command(None, name).params for o in p.opts]
+
+
+@pytest.mark.parametrize(
+    ("before", "notes"),
+    [
+        ("identify --rotation zyx", ["--rotation is retired: write --columns rotation=zyx"]),
+        ("handeye --units m --detect-units", ["--units is retired: write --columns units=m",
+                                              "--detect-units is retired: write --columns units=detect"]),
+        ("measure r --left l*.png --right r*.png", ["--left, --right are retired: write --source 'pairs:l*.png,r*.png'"]),
+        ("run --tool-link t --arm a.urdf", ["--tool-link is retired: write 'a.urdf#t'"]),
+        ("run --rate 30", ["--rate is retired: the rate of the cameras is measured"]),
+        ("board monitor --baud 9600 --board serial:p", ["--baud is retired: write --board serial:p,baud=9600"]),
+    ],
+)  # fmt: skip
+def test_what_is_said_can_be_copied(before, notes):
+    assert in_todays_options(before.split())[1] == notes
 
 
 def test_half_a_pair_is_rejected(armsight):

@@ -16,7 +16,7 @@ import click
 
 from armsight.app.interrupts import terminate_as_interrupt
 from armsight.app.retired import in_todays_options
-from armsight.app.show.messages import colour, print_error, print_notes
+from armsight.app.show.messages import colour, print_error, print_notes, silence_stdout
 from armsight.errors import ArmsightError
 
 #: What a person is about -> the commands, each with the first sentence of its help; each has a folder of its name, whose
@@ -112,7 +112,7 @@ class _Sections(click.Group):
         except KeyboardInterrupt:
             raise click.exceptions.Abort from None
         except BrokenPipeError:  # click would exit with 1
-            _silence_stdout()
+            silence_stdout()
             raise click.exceptions.Exit(0) from None
 
 
@@ -147,10 +147,10 @@ def run(arguments: list[str]) -> int:
     except ArmsightError as error:
         print_error(str(error))
     except BrokenPipeError:
-        _silence_stdout()
+        silence_stdout()
         return 0
     except OSError as error:  # errors of files and devices are ArmsightErrors: only the output is left
-        _silence_stdout()
+        silence_stdout()
         print_error(f"{error.filename or 'the output'}: cannot be written: {error.strerror or error}")
     return 2
 
@@ -200,8 +200,3 @@ def _meant_option(name: str, context: click.Context) -> str:
     alike = difflib.get_close_matches(name.lstrip("-"), [each.lstrip("-") for each in known], 1)
     near = [*also, *(f"--{each}" for each in alike)]
     return f": did you mean {near[0]}?" if near else ""
-
-
-def _silence_stdout() -> None:
-    """Discard what is still buffered, so that the interpreter does not fail on it at its end."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

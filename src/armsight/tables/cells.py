@@ -67,8 +67,10 @@ def said_columns(text: str | None, known: Collection[str] = ("units", "rotation"
             names.append(part)
             continue
         key = "detect" if (key, value) == ("units", "detect") else key
-        if key in said or (key == "units" and value not in ("m", "mm")):
-            raise InputError(f"--columns {text}: {part} is said twice, or is none of units=m, units=mm, units=detect")
+        if key in said:
+            raise InputError(f"--columns {text}: {key} is given twice")
+        if key == "units" and value not in ("m", "mm"):
+            raise InputError(f"--columns {text}: {part} is none of units=m, units=mm, units=detect")
         said[key] = value
     columns = ",".join(names) or None
     return Said(columns, said.get("units"), "detect" in said, said.get("rotation"), said.get("frames"))

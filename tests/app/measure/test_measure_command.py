@@ -55,6 +55,20 @@ def measured(rendered, tmp_path_factory):
         return records, list(csv.DictReader(file)), done.stderr
 
 
+def test_a_reader_that_leaves_does_not_cut_the_file(rendered, measured, tmp_path):
+    """As with ``| head``: what is printed goes nowhere, the file has every shot."""
+    script, out = "from armsight.app.main import main; main()", tmp_path / "poses.csv"
+    arguments = ["measure", rendered.rig, "--target", rendered.plate, "--source", rendered.folder / "arm", "-o", out]
+    process = subprocess.Popen(
+        [sys.executable, "-c", script, *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    process.stdout.close()
+    _, said = process.communicate()
+    assert process.returncode == 0, said
+    with open(out, newline="", encoding="utf-8") as file:
+        assert len(list(csv.DictReader(file))) == len(measured[1]) > 3
+
+
 #: What no pair needs, and a process that measures one would wait for.
 SLOW = ("scipy", "numpy.ma", "matplotlib", "pyarrow", "zenoh", "yaml", "sqlite3", "tempfile", "hashlib", "html")
 SLOW_OURS = ("sim", "robot.kinematics.arm", "loop.estimators.kalman", "loop.references", "app.stream.cell_file")

@@ -118,7 +118,8 @@ def _compared(alternatives: Sequence[Alternative]) -> list[TextTable]:
 def _answer(found: RigBudget) -> tuple[Grade, str]:
     """Return the answer in two sentences, and its colour."""
     move, rest, requested = found.moving, found.at_rest, found.plan.requested
-    said = f"95 % within {move.mm:.2g} mm in motion, {rest.mm:.2g} mm at rest, {move.deg:.2g} and {rest.deg:.2g} deg"
+    said = f"95 % within {move.mm:.2g} mm at {found.plan.speed}, {rest.mm:.2g} mm at rest"
+    said += f", {move.deg:.2g} and {rest.deg:.2g} deg"
     if loop := found.states.get("closed_loop_at_rest"):
         said += f"; the loop brings the arm to {loop.mm:.2g} mm at rest"
     first = found.causes[0].cause

@@ -19,7 +19,7 @@ from armsight.app.measure.shots import NAMED, DetectedShots, ImageShots, Result,
 from armsight.app.measure.view import CHART, PictureFolder, view_folder
 from armsight.app.options import DETECTIONS
 from armsight.app.progress import bar
-from armsight.app.show.messages import colour, weak
+from armsight.app.show.messages import colour, silence_stdout, weak
 from armsight.app.stream.datum import Published
 from armsight.data import Body, Dropped, Missed, PoseEstimate, Shot
 from armsight.errors import ArmsightError, InputError
@@ -162,16 +162,25 @@ class MeasureRun:
                             click.echo(f"note: {note.text}", err=True)
                         publisher.put(note)
                 if self.options.as_json:
-                    click.echo(json.dumps(record.to_json()))
+                    self._print(json.dumps(record.to_json()))
                 else:
                     width = width or max(4, len(record.shot))
                     if record.ok and not headed:
                         headed = True
-                        click.echo(f"{'shot':<{width}}" + "".join(f"{name:>{wide}}" for name, wide, _ in _TABLE))
-                    click.echo(_line(record, width))
+                        self._print(f"{'shot':<{width}}" + "".join(f"{name:>{wide}}" for name, wide, _ in _TABLE))
+                    self._print(_line(record, width))
                 if self.view is not None:
                     self.view.add(shot, result, record)
                 advance()
+
+    def _print(self, line: str) -> None:
+        """Print a line; where nobody reads on (``| head``), go on for what is written and sent elsewhere."""
+        try:
+            click.echo(line)
+        except BrokenPipeError:
+            if self.options.output is None and self.view is None and not self.options.stream:
+                raise
+            silence_stdout()
 
     def _keep(self, record: ShotPose) -> None:
         """Keep a record; once there are many that no file needs, forget the older half."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import logging
 import os
+import sys
 from dataclasses import dataclass
 from typing import Literal
 
@@ -70,3 +71,8 @@ def require(what: str, extra: str, *modules: str) -> None:
     if missing:
         names, verb = " and ".join(missing), "is" if len(missing) == 1 else "are"
         raise InputError(f'{what} needs {names}, which {verb} not installed: pip install "armsight[{extra}]"')
+
+
+def silence_stdout() -> None:
+    """Discard what is printed from here on, and what is still buffered: nobody reads it any more."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
