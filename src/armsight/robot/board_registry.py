@@ -16,6 +16,7 @@ from armsight import firmware
 from armsight.errors import InputError
 from armsight.robot.boards.ar4 import board as ar4_board
 from armsight.robot.boards.ar4.board import Ar4Board
+from armsight.robot.boards.ar4.models import ar4_model
 from armsight.robot.boards.board import Board
 from armsight.robot.boards.configuration import Configuration, lab_configuration
 from armsight.robot.boards.contract import MotionBoard
@@ -28,7 +29,7 @@ from armsight.robot.boards.feetech.calibration import read_calibration
 from armsight.robot.boards.host import HostEmulator
 from armsight.robot.boards.link import Emulator, Plant
 from armsight.robot.boards.qemu import QemuEmulator
-from armsight.robot.boards.serial import BAUD, SerialLink
+from armsight.robot.boards.serial import BAUD, SerialLink, require_port
 from armsight.robot.boards.unicorn import UnicornEmulator
 from armsight.robot.kinematics.arm import Arm
 
@@ -91,6 +92,24 @@ def open_motion_board(
     return open_board(name, plant, config=config)
 
 
+def check_board(name: str) -> None:
+    """Reject the name of a board that cannot be right, without opening it.
+
+    Raises:
+        InputError: there is no such kind of board, or something is behind its port that it does not take.
+        DeviceError: there is no such port.
+    """
+    if not is_real(name):
+        emulator_name(name)
+        return
+    port, baud, other = serial_port(name, BAUD)
+    if name.startswith(FEETECH) and other:
+        read_calibration(Path(other))
+    if name.startswith(AR4) and other:
+        ar4_model(other)
+    require_port(port, baud)
+
+
 def serial_port(name: str, baud: int) -> tuple[str, int, str]:
     """Return the port of a board's name, its baud rate, and what else stands behind it."""
     port, *given = name.partition(":")[2].split(",")
@@ -98,6 +117,10 @@ def serial_port(name: str, baud: int) -> tuple[str, int, str]:
     others = [each for each in given if not each.startswith("baud=")]
     if len(rates) > 1 or len(others) > 1 or not all(each.isdecimal() and int(each) > 0 for each in rates):
         raise InputError(f"{name}: expected {name.partition(':')[0]}:PORT[,..][,baud=N], such as baud=115200")
+    if others and name.startswith(SERIAL):
+        raise InputError(
+            f"{name}: {others[0]} belongs to {FEETECH}PORT or {AR4}PORT; this board has armsight's firmware"
+        )
     return port, int(rates[0]) if rates else baud, others[0] if others else ""
 
 
@@ -121,11 +144,7 @@ def open_board(name: str, plant: Plant | None = None, *, config: Configuration |
         DeviceError: it does not answer, or is of another version.
     """
     if name.startswith(SERIAL):
-        port, baud, other = serial_port(name, BAUD)
-        if other:
-            raise InputError(
-                f"{name}: {other} belongs to {FEETECH}PORT or {AR4}PORT; this board has armsight's firmware"
-            )
+        port, baud, _ = serial_port(name, BAUD)
         return Board.connect(SerialLink.open(port, baud), name=port)
     emulator = emulator_name(name)
     if plant is None:

@@ -3,14 +3,11 @@
 import json
 import os
 import signal
-import time
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from armsight.app.progress import steps
-from armsight.data import Shot
 from armsight.sim.workcell.workcell import Workcell
 from cli_runs import assert_rejected
 
@@ -57,11 +54,18 @@ def test_workcell_and_devices_do_not_mix(armsight, files, tmp_path, source, boar
         ({"source": "sim:big"}, ("big", "WIDTHxHEIGHT@HZ")),
         ({"source": "usb:0,1", "board": "serial:/dev/ttyNONE"}, ("/dev/ttyNONE", "no such port")),
         ({"source": "usb:0,1", "board": "can:0"}, ("can:0", "serial:PORT")),
+        ({"source": "usb:0,1", "board": "serial:/dev/none,baud=abc"}, ("serial:/dev/none,baud=abc", "baud=N")),
+        ({"source": "usb:0,1", "board": "serial:/dev/null,mk2"}, ("serial:/dev/null,mk2", "ar4:PORT")),
+        ({"source": "usb:0,1", "board": "feetech:/dev/null,none.json"}, ("none.json", "no such file")),
+        ({"source": "usb:0,1", "board": "ar4:/dev/null,mk9"}, ("mk9", "mk1, mk2, mk3")),
+        ({"source": "recorded", "board": "serial:/dev/none"}, ("/dev/none", "no such port")),
     ],
 )
 def test_what_is_not_there_is_named(armsight, files, tmp_path, monkeypatch, given, said):
-    cameras = SimpleNamespace(read=lambda: time.sleep(0.002) or Shot("shot", None, None), close=lambda: None)
-    monkeypatch.setattr("armsight.app.run.devices.open_source", lambda spec: cameras)
+    def opened(spec):
+        raise AssertionError("a mistake is said before cameras are opened")
+
+    monkeypatch.setattr("armsight.app.run.devices.open_source", opened)
     assert_rejected(armsight(*arguments(files, tmp_path / "run", **given)), *said)
 
 

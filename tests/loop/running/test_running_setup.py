@@ -91,7 +91,7 @@ class Reads:
 
     def read(self):
         if self.left:
-            return self.left.pop()
+            return self.left.pop(0)
         self.taken.wait(10.0)
         if self.end is not None:
             raise self.end
@@ -157,3 +157,40 @@ def test_the_rate_of_cameras_is_that_of_their_stamps_whatever_a_stall_does(monke
     with pytest.raises(DeviceError, match="2 shots came"):
         slow.rate_hz()
     source.taken.set()
+
+
+def rate_of(*stamps_s):
+    """Return the rate of a source of shots with these stamps, s, which then ends."""
+    source = Reads(None)
+    source.left = [Shot("shot", None, None, t_s) for t_s in stamps_s]
+    source.taken.set()
+    shots = LiveShots(source)
+    shots.start()
+    return shots.rate_hz()
+
+
+@pytest.mark.parametrize("count", [3, 5, 12, 40])
+def test_a_source_that_ends_has_the_rate_of_the_shots_that_it_had(count):
+    assert rate_of(*(0.04 * np.arange(count))) == pytest.approx(25.0)
+
+
+@pytest.mark.parametrize("count", [0, 2])
+def test_a_source_that_ends_too_early_says_so(count):
+    with pytest.raises(DeviceError, match="the source of images has ended"):
+        rate_of(*range(count))
+
+
+@pytest.mark.parametrize(
+    ("stamps_s", "rate_hz"),
+    [
+        ([1.0] * 12, None),
+        ([None] * 12, None),
+        ([np.nan] * 12, None),
+        ([*np.arange(12.0, 0.0, -1.0)], None),
+        ([*(1e-6 * np.arange(12))], None),
+        ([*(10.0 * np.arange(12))], None),
+        ([0.0, None, 0.1, 0.2, np.nan, 0.3, 0.4, 0.4, 0.3, 0.4], 10.0),
+    ],
+)
+def test_times_that_are_missing_or_do_not_rise_are_no_rate(stamps_s, rate_hz):
+    assert rate_of(*stamps_s) == (None if rate_hz is None else pytest.approx(rate_hz))

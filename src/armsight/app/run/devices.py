@@ -7,12 +7,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+import click
 import numpy as np
 
 from armsight.app.options import SIM
 from armsight.errors import InputError
 from armsight.loop.running.setup import HostClock, LiveShots, Setup
-from armsight.robot.board_registry import EMULATED, emulator_name, open_motion_board, slowed
+from armsight.robot.board_registry import EMULATED, check_board, emulator_name, open_motion_board, slowed
 from armsight.robot.boards.board import Board
 from armsight.robot.boards.contract import MotionBoard
 from armsight.robot.kinematics.arm import Arm
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 
 #: The workcell's arm and cameras where ``sim:`` names none: those of ``armsight demo``.
 _SIM_ARM, _SIM_CAMERAS = "worn", "1280x720@60"
+_RATE_HZ = 60.0  # of cameras whose times show none; half: the loop expects shots late, double: early
 
 
 def setup_of(workcell: Workcell) -> Setup:
@@ -111,10 +113,13 @@ def open_devices(devices: Devices) -> Iterator[Setup]:
             )
             yield replace(setup_of(workcell), target=devices.target)
             return
+        check_board(board)  # a mistake is said before the cameras are waited for
         shots = LiveShots(open_source(source))
         stack.callback(shots.close)
         shots.start()
         rate_hz = shots.rate_hz()  # before the board is opened: what it says meanwhile would pile up
+        if rate_hz is None:
+            click.echo(f"note: the times of the shots show no rate of the cameras: {_RATE_HZ:g} Hz is taken", err=True)
         opened = stack.enter_context(open_motion_board(board))
         require_joints(opened, board, devices.arm)
         bit_s = sync_led_bit_s(opened, f"--board {board}") if devices.sync_led else None
@@ -124,7 +129,7 @@ def open_devices(devices: Devices) -> Iterator[Setup]:
             shots.poll,
             devices.target,
             np.zeros_like,
-            rate_hz,
+            rate_hz or _RATE_HZ,
             devices.sync_s,
             HostClock(),
             sync_led_bit_s=bit_s,

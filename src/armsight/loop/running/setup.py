@@ -30,6 +30,7 @@ RATE_SHOTS = 12  # that show the cameras' rate; half: a stall at the start count
 RATE_S = (
     10.0  # they are waited for so long, s; half: slow cameras are rejected, double: one that is gone is noticed late
 )
+_FEWEST_SHOTS, _RATES_HZ = 3, (0.5, 1000.0)  # that show a rate, and what it can be
 #: The clocks' rate is that of so many seconds; the least transmission times of two seconds differ by about this, s.
 _WINDOW_S, _SCATTER_S = 60, 1e-3
 
@@ -159,10 +160,12 @@ class LiveShots:
                 return
             with self._lock:
                 self._newest = shot
-            self._times.append(time.monotonic() if shot.t_s is None else shot.t_s)
+            self._times.append(np.nan if shot.t_s is None else shot.t_s)
 
-    def rate_hz(self) -> float:
+    def rate_hz(self) -> float | None:
         """Wait for the first shots, and return how many come a second, by the median of the times between them.
+
+        Times that are missing or do not rise are not used; None where the others show no rate that cameras have.
 
         Raises:
             DeviceError: a camera was disconnected, or hardly a shot comes.
@@ -170,12 +173,14 @@ class LiveShots:
         end = time.monotonic() + RATE_S
         while len(self._times) < RATE_SHOTS and self._failure is None and time.monotonic() < end:
             time.sleep(0.01)
-        if self._failure is not None:
-            raise self._failure
-        apart_s = np.diff(list(self._times))
-        if len(apart_s) < 2 or np.median(apart_s) <= 0:
-            raise DeviceError(f"{len(self._times)} shots came in {RATE_S:g} s: are both cameras there, and uncovered?")
-        return 1.0 / float(np.median(apart_s))
+        if len(times := list(self._times)) < _FEWEST_SHOTS:
+            raise self._failure or DeviceError(
+                f"{len(times)} shots came in {RATE_S:g} s: are both cameras there, and uncovered?"
+            )
+        apart_s = np.diff(times)
+        rising = apart_s[np.isfinite(apart_s) & (apart_s > 0)]
+        rate = 1.0 / float(np.median(rising)) if len(rising) >= _FEWEST_SHOTS - 1 else 0.0
+        return rate if _RATES_HZ[0] <= rate <= _RATES_HZ[1] else None
 
     def poll(self) -> Shot | None:
         """Return the newest shot not returned yet, or None.

@@ -6,6 +6,7 @@ An error of a port is one line: which port, what is wrong with it, what to do.
 from __future__ import annotations
 
 import errno
+import os
 import time
 from typing import Any, Self
 
@@ -81,6 +82,12 @@ class SerialLink:
         if not self._serial.is_open:
             return DeviceError(f"{self._port} is closed")
         return DeviceError(f"{self._port} is gone: was the cable pulled, or the board switched off? ({error})")
+
+
+def require_port(port: str, baud: int) -> None:
+    """Raise a DeviceError if there is no such port; only where ports are files."""
+    if os.name == "posix" and not os.path.exists(port):
+        raise DeviceError(_why_not_opened(port, baud, FileNotFoundError(errno.ENOENT, port)))
 
 
 def list_ports() -> list[str]:

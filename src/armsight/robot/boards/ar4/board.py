@@ -29,6 +29,7 @@ from armsight.robot.boards.ar4.models import (
     MOST_SPEED_DEG_S,
     SENSE,
     Ar4Model,
+    ar4_model,
 )
 from armsight.robot.boards.codes import Alarm, BoardState, Command
 from armsight.robot.boards.contract import Abilities, PolledBoard
@@ -109,9 +110,7 @@ class Ar4Board(PolledBoard):
             DeviceError: nothing answers, or a firmware of another kind.
         """
         try:
-            if model not in MODELS:
-                raise InputError(f"no AR4 {model!r}; there are {', '.join(MODELS)}")
-            board = cls(link, name, MODELS[model], now)
+            board = cls(link, name, ar4_model(model), now)
             board._start(VERSION)
             board._read_positions()
             board._goal = board._q()

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from armsight.data import Array, Record
+from armsight.errors import InputError
 
 ENCODER_DIRECTION = np.array([-1, 1, 1, 1, 1, 1])  # sense of the encoders
 #: Sense of the driver's joints in armsight's ``ar4``.
@@ -64,3 +65,14 @@ MODELS = {
     "mk2": _model("mk2", 49.77777777, *_NARROW),
     "mk3": _model("mk3", 49.77777777, *_WIDE),
 }
+
+
+def ar4_model(name: str) -> Ar4Model:
+    """Return a model by its name.
+
+    Raises:
+        InputError: there is none of this name.
+    """
+    if name not in MODELS:
+        raise InputError(f"no AR4 {name!r}; there are {', '.join(MODELS)}")
+    return MODELS[name]
