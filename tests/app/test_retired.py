@@ -24,7 +24,12 @@ from cli_runs import assert_rejected
         ("arm show six_r --tool-link=hand", "arm show six_r#hand"),
         ("identify plan --tool-link t --arm a.toml", "identify plan --arm a.toml#t"),
         ("board monitor --baud 9600 --board serial:p", "board monitor --board serial:p,baud=9600"),
-        ("board monitor --baud 9600", "board monitor --board emulated:unicorn,baud=9600"),
+        ("board monitor --board=serial:p --baud=9600", "board monitor --board serial:p,baud=9600"),
+        ("arm fk --json six_r --tool-link hand 0", "arm fk --json six_r#hand 0"),
+        ("run --rig s.xml --model=a.urdf --tool-link t", "run --rig s.xml --model a.urdf#t"),
+        ("arm urdf --output n.urdf f.urdf --tool-link L", "arm urdf --output n.urdf f.urdf#L"),
+        ("live --http=0.0.0.0:1 --port 80", "live --http 0.0.0.0:80"),
+        ("hub keys s c --hub h.local --port 7000", "hub keys s c --hub h.local:7000"),
         ("run --calibration c.json --board feetech:p", "run --board feetech:p,c.json"),
         ("run --cell a@h:1 --stream igtl:1", "run --stream igtl:1 --stream cell:a@h:1"),
         ("hub push a b --cell a", "hub push a b --cell a"),
@@ -47,14 +52,36 @@ def test_a_command_line_of_before_is_one_of_today(before, now):
     assert bool(notes) == (before != now)
 
 
+def with_commands(command):
+    """A command, and those of its group."""
+    return [command, *(getattr(command, "commands", {}).values())]
+
+
 def test_each_is_said_in_a_line_and_none_is_an_option_any_more(armsight):
     said = armsight("measure", "none.json", "--target", "chessboard:9x6:25mm", "--left", "a", "--right", "b")
     note, error = said.err.splitlines()
     assert note == "note: --left, --right are retired: write --source pairs:a,b"
     assert "none.json" in error
     for each in RETIRED:
-        for name in each.commands:
-            assert each.option not in [o for p in group.get_command(None, name).params for o in p.opts]
+        for name in each.commands or group.list_commands(None):
+            assert each.option not in [
+                o for command in with_commands(group.get_command(None, name)) for p in command.params for o in p.opts
+            ]
+
+
+@pytest.mark.parametrize(
+    ("before", "said"),
+    [
+        ("measure r --source folder:x --left a --right b", "--source folder:x says the same as what is retired"),
+        ("measure r --source usb:0,1 --detections d", "--source usb:0,1 says the same"),
+        ("batch check --workers 4 --scheduler tcp://a:1", "--workers 4 says the same"),
+        ("budget --run r --rig r.json", "--rig r.json says the same"),
+        ("board monitor --baud 9600", "give it behind one, --board BOARD,baud=9600"),
+        ("demo --tool-link t", "give the arm it is a link of, ARM.urdf#t"),
+    ],
+)
+def test_what_contradicts_or_lacks_its_place_is_rejected(armsight, before, said):
+    assert_rejected(armsight(*before.split()), said)
 
 
 @pytest.mark.parametrize(
