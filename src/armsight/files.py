@@ -469,6 +469,8 @@ def alone_in(folder: Path, command: str) -> Iterator[None]:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise InputError(f"{folder}: another {command} uses it: give this one another folder, -o FOLDER") from None
+        except OSError as error:  # a file system without locks
+            raise InputError(f"{folder}: cannot be kept to one {command}: {error.strerror}: give another folder") from None
         yield
 
 

@@ -80,7 +80,7 @@ def test_each_is_said_in_a_line_and_none_is_an_option_any_more(armsight):
         ("demo --tool-link t", "give the arm it is a link of, ARM.urdf#t"),
     ],
 )
-def test_what_contradicts_or_lacks_its_place_is_rejected(armsight, before, said):
+def test_what_contradicts_or_is_incomplete_is_rejected(armsight, before, said):
     assert_rejected(armsight(*before.split()), said)
 
 

@@ -121,7 +121,6 @@ RETIRED = (
     Retired("--seen-units", ("handeye",), _into("--columns", "seen:units={}")),
     Retired("--detect-units", ("handeye",), _into("--columns", "units=detect"), is_flag=True),
     Retired("--rotation", ("handeye", "identify"), _into("--columns", "rotation={}")),
-    Retired("--turns", ("identify",), _into("--columns", "rotation={}")),
     Retired("--seen-rotation", ("handeye",), _into("--columns", "seen:rotation={}")),
     Retired("--frames", ("handeye",), _into("--columns", "frames={}")),
     Retired("--scheduler", ("batch",), _into("--workers", many=False)),

@@ -103,6 +103,17 @@ def test_users_files(files, options, fx, k1, size, T_left_right):
     np.testing.assert_allclose(rig.T_left_right, T_left_right, atol=1e-12)
 
 
+@pytest.mark.parametrize("name", ["translationVector", "Tvec", "transMat", "stereo_translation", "T_lr", "tmtx"])
+@pytest.mark.parametrize("beside", ["tilt_deg", "target_size", "t_ms", "total_error"])
+def test_the_translation_is_known_beside_three_other_numbers(tmp_path, name, beside):
+    document = {
+        **{f"{key}{k}": value for k in (1, 2) for key, value in (("K", K_LEFT.tolist()), ("D", five(D_LEFT).tolist()))},
+        "R": np.eye(3).tolist(), name: [-0.06, 0.0, 0.0], beside: [1.0, 2.0, 3.0], "image_size": list(SIZE),
+    }  # fmt: skip
+    rig = import_rig(None, write(tmp_path, {"c.json": json.dumps(document)}), unit_m=1.0)
+    assert rig.baseline_m == pytest.approx(0.06)
+
+
 def test_a_fisheye_of_multical_is_known_by_the_shape_of_its_coefficients(tmp_path):
     """multical 0.4.0 writes the model "standard" for both lenses; cv2.fisheye.calibrate returns a column."""
     document = json.loads(PROGRAMS["multical"][2]["calibration.json"])

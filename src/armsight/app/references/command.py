@@ -282,7 +282,9 @@ def _calibrated(entries: list[Entry], poses: Path) -> tuple[Report, list[Entry]]
     path = PosePath(table.t_s, table.Ts)
     found, blocks, done = list[dict[str, Any]](), list[Fact | TextTable](), list["Entry"]()
     notes = [Note("note", text) for text in table.notes]
-    angle_deg = float(np.degrees(np.linalg.norm(log_so3(table.Ts[0, :3, :3].T @ table.Ts[:, :3, :3]), axis=1).max()))
+    R = table.Ts[:, :3, :3]
+    far = int(np.argmax(np.linalg.norm(log_so3(R[0].T @ R), axis=1)))  # from the first pose; and from there
+    angle_deg = float(np.degrees(np.linalg.norm(log_so3(R[far].T @ R), axis=1).max()))
     if angle_deg < SMALL_DEG:
         text = f"{poses}: the tool rotates by {angle_deg:.0f} deg: the lever may be off by more than its sigma"
         notes.append(Note("weak", f"{text}; rotate it by {SMALL_DEG:.0f} deg and more, about two axes"))

@@ -46,9 +46,20 @@ RECTIFIES = True
 _SIDES = [pair.split() for pair in ("left right", "l r", "1 2", "0 1", "first second", "a b", "master slave", "01 02")]
 #: Words of matrices that follow from a rectification: they are not the cameras' own.
 _DERIVED = {"new", "opt", "optimal", "rect", "rectified", "rectification", "undistorted", "newcamera", "roi", "ideal"}
-_DISTORTION_WORDS = {"d", "dist", "distortion", "distortions", "coeffs", "coefficients"}
-#: Names of R and T beside others of their shape.
-_ROTATIONS, _TRANSLATIONS = ("r", "rot", "rotation", "om", "rvec", "rotationvector"), ("t", "trans", "translation")
+_DISTORTION_WORDS = {
+    "d", "dist", "distortion", "distortions", "distcoeffs", "coeffs", "kc", "coefficients", "coef", "dc",
+    "distortioncoefficients", "distortioncoeffs",
+}  # fmt: skip
+#: Names of R and T, the likeliest first.
+_ROTATIONS = (
+    "r", "rot", "rotation", "rotationmatrix", "rstereo", "stereor", "rlr", "om", "rvec", "rotationvector", "rmat",
+    "rmtx", "rotmat", "extrinsicsr", "stereorotation", "extrinsicsrotation", "rotationofcamera2",
+)  # fmt: skip
+_TRANSLATIONS = (
+    "t", "trans", "translation", "translationvector", "tstereo", "stereot", "tlr", "tvec", "trnsmtx", "transmat",
+    "tmat", "extrinsicst", "stereotranslation", "extrinsicstranslation", "translationofcamera2", "tmtx", "tvector",
+    "rottrans",
+)  # fmt: skip
 
 
 def recognises(documents: Sequence[Document]) -> bool:
@@ -225,7 +236,7 @@ def _is_rotation(name: str, value: Foreign) -> bool:
 
 def _is_translation(name: str, value: Foreign) -> bool:
     """Say whether a value is three numbers called something with t."""
-    return _numbers(value).size == 3 and any(word.startswith("t") for word in _words(name))
+    return _numbers(value).size == 3 and _stem(name).startswith("t")
 
 
 def _unit_m(flat: Mapping[str, Foreign], length: float, options: ImportOptions) -> float:
