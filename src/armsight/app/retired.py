@@ -108,7 +108,7 @@ _SEEN_BY_TWO = ("calibrate", "measure", "handeye")
 RETIRED = (
     Retired("--tool-link", (), _link),
     Retired("--baud", ("board",), _behind("--board", ",baud={}")),
-    Retired("--calibration", ("board", "run", "live"), _behind("--board", ",{}")),
+    Retired("--calibration", ("board", "run"), _behind("--board", ",{}")),
     Retired("--cell", ("measure", "run", "live", "record", "replay"), _into("--stream", "cell:{}")),
     Retired("--left", _SEEN_BY_TWO, _part("--source", 0, ",", before="pairs:")),
     Retired("--right", _SEEN_BY_TWO, _part("--source", 1, ",", before="pairs:")),

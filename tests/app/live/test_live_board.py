@@ -1,6 +1,8 @@
 """The board for several threads: a stop goes before whoever drives it, and loses no reading."""
 
 import threading
+from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -19,6 +21,7 @@ from armsight.robot.boards.stoppable import StoppableBoard
 from armsight.robot.models import MODELS
 from armsight.sim.boards.device import SteppedLink
 from armsight.sim.boards.so101 import So101Bus
+from cli_runs import assert_rejected
 
 pytestmark = pytest.mark.real_time
 
@@ -202,3 +205,31 @@ def test_what_is_shown_waits_for_the_command_of_a_shot(tmp_path, monkeypatch):
         loop.log.shots = 2
         loop.on_period()
     thread.join()
+
+
+@pytest.mark.parametrize(("found", "opened"), [("feetech:P", "feetech:P,so.json"), ("ar4:P", "ar4:P")])
+def test_a_bus_that_is_found_has_the_calibration_that_was_given(tmp_path, monkeypatch, found, opened):
+    names = []
+
+    def opening(name):
+        names.append(name)
+        raise DeviceError("no more of it is needed")
+
+    step = arm_step(tmp_path, None)
+    step.shared.options = replace(step.shared.options, servo_calibration=Path("so.json"))
+    monkeypatch.setattr(arm, "find_board", lambda say, ports: found)
+    monkeypatch.setattr(arm, "check_model", lambda name, model: None)
+    monkeypatch.setattr(arm, "check_arm", lambda name: None)
+    monkeypatch.setattr(arm, "open_motion_board", opening)
+    with pytest.raises(DeviceError, match="no more"):
+        step._find()
+    assert names == [opened]
+    step.close()
+
+
+def test_a_calibration_that_belongs_to_no_bus_is_one_line(tmp_path, armsight, monkeypatch):
+    given = ("live", "-o", tmp_path / "live", "--calibration", tmp_path / "so.json")
+    assert_rejected(armsight(*given), "so.json", "no such file")
+    monkeypatch.setattr("armsight.robot.boards.feetech.calibration.read_calibration", lambda path: None)
+    assert_rejected(armsight(*given, "--board", "serial:P"), "so.json", "feetech:PORT, not to serial:P")
+    assert_rejected(armsight(*given, "--board", "feetech:P,a.json"), "feetech:P,a.json has a calibration file already")

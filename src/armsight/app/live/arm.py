@@ -57,7 +57,7 @@ from armsight.loop.running.loop import Loop
 from armsight.loop.running.setup import HostClock, Setup
 from armsight.loop.servo import likely_joint_errors
 from armsight.robot.arm_file import open_arm
-from armsight.robot.board_registry import emulator_name, is_real, open_motion_board, slowed
+from armsight.robot.board_registry import FEETECH, emulator_name, is_real, open_motion_board, slowed
 from armsight.robot.boards.codes import STATE_TEXTS, BoardState, Fault
 from armsight.robot.boards.serial import list_ports
 from armsight.robot.boards.stoppable import StoppableBoard
@@ -227,6 +227,8 @@ class ArmStep(PageStep[ArmState]):
         finally:
             self.show(finding="")
         self.say("good", f"the arm is at {name}")
+        if name.startswith(FEETECH) and (file := self.shared.options.servo_calibration) is not None:
+            name = f"{name},{file}"
         self.shared.options = replace(self.shared.options, board=name)
         self.open_arm()
 

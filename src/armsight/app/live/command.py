@@ -5,14 +5,17 @@ from __future__ import annotations
 import json
 import secrets
 import time
-from typing import Any
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from armsight.app.options import CELL, PATH, output, stream_option
 from armsight.app.show.messages import require
+from armsight.errors import InputError
 
-_HERE = ("127.0.0.1", "localhost", "::1")
+if TYPE_CHECKING:
+    from armsight.app.live.step import SessionOptions
 
 
 @click.command("live")
@@ -31,6 +34,12 @@ _HERE = ("127.0.0.1", "localhost", "::1")
     show_default=True,
     help="The arm: a name (armsight arm list), a .toml or a .urdf file.",
     metavar="ARM",
+)
+@click.option(
+    "--calibration",
+    "servo_calibration",
+    type=PATH,
+    help="LeRobot's calibration file of a servo bus, whose port the page finds.",
 )
 @click.option("--motion", type=PATH, help="The motions (TOML, docs/howto/run.md).")
 @click.option(
@@ -70,7 +79,7 @@ def command(http: str, sync_ms: float, as_json: bool, **given: Any) -> None:  # 
     from armsight.app.live.session import LiveSession
     from armsight.app.live.step import SessionOptions
     from armsight.app.options import SIM
-    from armsight.app.show.http import host_and_port
+    from armsight.app.show.http import HERE, host_and_port
     from armsight.app.stream.datum import Published
     from armsight.app.stream.streams import open_streams
     from armsight.files import alone_in
@@ -78,7 +87,7 @@ def command(http: str, sync_ms: float, as_json: bool, **given: Any) -> None:  # 
     from armsight.vision.sources.usb import is_one, parsed_usb
 
     host, port = host_and_port(http, "--http")
-    options = SessionOptions(**given, sync_s=1e-3 * sync_ms)
+    options = _with_calibration(SessionOptions(**given, sync_s=1e-3 * sync_ms))
     source = options.source or ""
     if options.source is not None and not source.startswith(SIM):
         check_source(source)
@@ -88,7 +97,7 @@ def command(http: str, sync_ms: float, as_json: bool, **given: Any) -> None:  # 
     open_streams(tried, Published(), lambda line: click.echo(line, err=True)).close()
     session = LiveSession(options)
     with alone_in(session.folder, "live"):
-        server = LiveServer(session, host, port, None if host in _HERE else secrets.token_urlsafe(18))
+        server = LiveServer(session, host, port, None if host in HERE else secrets.token_urlsafe(18))
         try:
             server.start()
             session.start()
@@ -107,3 +116,25 @@ def command(http: str, sync_ms: float, as_json: bool, **given: Any) -> None:  # 
         finally:
             server.close()
             session.close()
+
+
+def _with_calibration(options: SessionOptions) -> SessionOptions:
+    """Return options whose servo bus, where --board names one, has the file of --calibration.
+
+    Raises:
+        InputError: it is no such file, or the board takes none.
+    """
+    from armsight.robot.board_registry import FEETECH, calibration_of
+    from armsight.robot.boards.feetech.calibration import read_calibration
+
+    file, board = options.servo_calibration, options.board
+    if file is None:
+        return options
+    read_calibration(file)
+    if board is None:
+        return options
+    if not board.startswith(FEETECH):
+        raise InputError(f"--calibration {file}: belongs to a servo bus, --board {FEETECH}PORT, not to {board}")
+    if calibration_of(board) is not None:
+        raise InputError(f"--calibration {file}: --board {board} has a calibration file already; give one of them")
+    return replace(options, board=f"{board},{file}")

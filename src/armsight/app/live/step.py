@@ -37,6 +37,7 @@ class SessionOptions:
     motion: Path | None = None
     sync_s: float = 1e-3  # standard deviation of the time between the two exposures of a shot
     seed: int = 0
+    servo_calibration: Path | None = None  # of a servo bus that the page finds
     streams: tuple[str, ...] = ()
     follow_rig: bool = False
 

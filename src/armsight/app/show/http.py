@@ -18,7 +18,7 @@ from urllib.parse import parse_qs, urlsplit
 from armsight.errors import InputError
 
 #: Names and addresses of this computer alone.
-HERE = ("127.0.0.1", "localhost", "[::1]")
+HERE = ("127.0.0.1", "localhost", "::1")
 #: Code, type and content.
 Answer = tuple[int, str, bytes]
 #: Path -> what answers it; it is given the first value of each key of the query.
@@ -33,16 +33,21 @@ _HEADERS = {
 }
 
 
-def host_and_port(address: str, what: str) -> tuple[str, int]:
-    """Return the two parts of HOST:PORT; ``what`` names the option or key it is given by.
+def host_and_port(address: str, what: str, *, least: int = 0) -> tuple[str, int]:
+    """Return the two parts of HOST:PORT, an IPv6 host without its brackets.
+
+    Args:
+        address: HOST:PORT.
+        what: names the option or key it is given by.
+        least: lowest port; 0 is any that is free.
 
     Raises:
         InputError: it is no address.
     """
     host, _, port = address.rpartition(":")
-    if not host or not port.isdecimal() or int(port) > 65535:
+    if not host or not port.isdecimal() or not least <= int(port) <= 65535:
         raise InputError(f"{what} is {address!r}: expected HOST:PORT, such as 127.0.0.1:9110")
-    return host, int(port)
+    return host.strip("[]"), int(port)
 
 
 class Pages:
@@ -70,7 +75,7 @@ class Pages:
             def do_GET(self) -> None:
                 url = urlsplit(self.path)
                 query = {key: values[0] for key, values in parse_qs(url.query).items()}
-                named = not here or self.headers.get("Host", "").rpartition(":")[0] in HERE
+                named = not here or self.headers.get("Host", "").rpartition(":")[0].strip("[]") in HERE
                 if not named or not pages._knows(query.get("token", "")):
                     self._answer(403, "text/plain", b"open the address that was printed, with its token\n")
                 elif (answer := routes.get(url.path)) is None:
@@ -99,12 +104,12 @@ class Pages:
             address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
 
         try:
-            self._server = Server((host.strip("[]"), port), Handler)
+            self._server = Server((host, port), Handler)
         except OSError as error:
             raise InputError(
                 f"{what} {address}: cannot listen there ({error.strerror}): does another one run?"
             ) from None
-        self._host = host
+        self._host = f"[{host}]" if ":" in host else host
         self._server.daemon_threads = True
         threading.Thread(target=self._server.serve_forever, daemon=True).start()
 
