@@ -32,6 +32,18 @@ from strategies import ordinary_rig
         (("demo", "--rigg", "r.json"), ["no such option: --rigg; the usage is in: armsight demo -h"]),
         (("measure",), ["RIG.json", "armsight measure -h"]),
         (("live", "images"), ["argument (images): images follow an option, --source images", "armsight live -h"]),
+        (
+            ("calibrate", "-o", "r", "--target", "b", "--source", "a1.png", "a2.png", "a3.png"),
+            ["(a2.png a3.png); quote a glob, --source 'pairs:DIR/"],
+        ),
+        (
+            ("calibrate", "-o", "r", "--target", "b", "--source", "pairs:a1,b1", "a2", "b2"),
+            ["quote a glob, --source 'pairs:DIR/"],
+        ),
+        (
+            ("measure", "r.json", "--target", "b", "--source", "im1.png", "im2.png"),
+            ["quote a glob, --source 'pairs:DIR/"],
+        ),
         (("rig", "export", "r.json", "-o", "a"), ["--format", "opencv, ros, kalibr", "armsight rig export -h"]),
         (("check", "plan"), ["--arm", "armsight check plan -h"]),
         (("check",), ["RUN|POSES.csv", "armsight check -h"]),
@@ -169,3 +181,9 @@ def test_the_list_of_commands_has_the_first_sentences_of_their_help():
     for names in SECTIONS.values():
         for name, text in names.items():
             assert group.get_command(context, name).get_short_help_str(1000) == text
+
+
+def test_a_glob_that_the_shell_expanded_is_said_with_retired_options_too(armsight):
+    said = armsight("calibrate", "-o", "r", "--target", "b", "--left", "a1", "a2", "--right", "b1", "b2")
+    assert said.code == 2
+    assert "quote a glob" in said.err

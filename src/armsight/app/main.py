@@ -163,8 +163,8 @@ def _usage_text(error: click.ClickException) -> str:
     context = error.ctx if isinstance(error, click.UsageError) else None
     if context is not None and isinstance(error, click.NoSuchOption):
         text = f"no such option: {error.option_name}{_meant_option(error.option_name, context)}"
-    if context is not None and (extra := re.search(r"unexpected extra arguments? \((\S+).*\)$", text)):
-        text += "" if _option(context, "--source") is None else f": images follow an option, --source {extra[1]}"
+    if context is not None and (extra := re.search(r"unexpected extra arguments? \((.+)\)$", text)):
+        text += _meant_extra(extra[1].split(), context)
     if context is not None and (unknown := re.match(r"no such command '(.*?)'", text)):
         text = unknown[0] + _meant(unknown[1], context)
     return text if context is None else f"{text}; the usage is in: {' '.join(context.command_path.split())} -h"
@@ -180,6 +180,19 @@ def _meant(name: str, context: click.Context) -> str:
     options = [option.opts[0] for option in context.command.params if isinstance(option.type, click.Path)]
     if options and ("." in name or os.sep in name):
         return f": a file follows an option, {options[0]} {name}"
+    return ""
+
+
+def _meant_extra(extra: list[str], context: click.Context) -> str:
+    """Return what was likely meant by arguments too many: images without an option, or a glob that the shell expanded."""
+    source = _option(context, "--source")
+    if source is None:
+        return ""
+    given = str(context.params.get(source.name or "") or "")
+    if not given:
+        return f": images follow an option, --source {extra[0]}"
+    if {os.path.splitext(each)[1] for each in extra} == {os.path.splitext(given)[1]}:
+        return "; quote a glob, --source 'pairs:DIR/left*.png,DIR/right*.png', or the shell puts every file name there"
     return ""
 
 

@@ -412,6 +412,7 @@ def test_figures_that_look_like_contradictions_are_explained(data_dir, armsight,
     (share,) = re.findall(r"weak: (\d+%) of the left image never saw the board \(counted in 8 x 8 cells\)", said.out)
     rig = StereoRig.load(tmp_path / "rig.json")
     assert rig.provenance["board"] == "rig.board.toml"
+    assert (rig.provenance["left"], rig.provenance["right"]) == (f"{folder}/left*.jpg", f"{folder}/right*.jpg")
     page = (tmp_path / "report.html").read_text()
     assert f"{share} of the left image never saw the board" in page
     assert "The percentages are counted in 8 x 8 cells, larger than those of the map." in page

@@ -46,6 +46,7 @@ def test_a_rectified_pair(dense, flat, tmp_path, method):
     out = tmp_path / "out"
     said = dense("--max-disparity", 32, left, right, "--method", method, "-o", out, "--json")
     assert said.code == 0, said.err
+    assert said.err.count("note: no RIG.json: the images were taken as rectified") == 1
     (record,) = said.lines
     disparity, valid = read_pfm(out / "disparity.pfm"), cv2.imread(str(out / "valid.png"), cv2.IMREAD_UNCHANGED)
     assert disparity.shape == valid.shape == truth.shape

@@ -265,6 +265,9 @@ def test_the_hub_says_what_is_wrong(tmp_path, armsight):
         armsight("hub", "--keys", tmp_path, "--listen", "tls/0.0.0.0:7", "-o", tmp_path / "h"), "no keys of a site"
     )
     assert_rejected(armsight("hub", "--http", "nowhere", "-o", tmp_path / "h"), "expected HOST:PORT")
+    for address in ("hub.local:0", "hub.local:65536"):
+        keys = armsight("hub", "keys", "lab", "--hub", address, "-o", tmp_path / "k")
+        assert_rejected(keys, f"--hub is '{address}'", "expected HOST:PORT")
     assert_rejected(armsight("hub", "keys", "my lab", "-o", tmp_path / "k"), "expected up to 31 letters")
     assert_rejected(armsight("hub", "hold", "a", "why", "--keys", tmp_path), "no keys of a site are here")
     (tmp_path / "file").write_text("")

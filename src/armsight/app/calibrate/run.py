@@ -37,7 +37,7 @@ from armsight.vision.markers.calibrated_board import save_board_file
 from armsight.vision.markers.marker import CalibrationBoard
 from armsight.vision.rig import CONTRADICTED
 from armsight.vision.sources import LIVE, Source, notes_of, open_source
-from armsight.vision.sources.pairs import StoredSource, image_files, natural_key, no_files
+from armsight.vision.sources.pairs import StoredSource, image_files, natural_key, no_files, two_globs
 
 #: Fewest markers of a family by which it is named as the one in view; in families of few cells less are chance.
 _LEAST_CODES = 4
@@ -134,6 +134,9 @@ class GivenImages:
             raise InputError(f"--alone {options.alone}: two globs are needed, LEFT,RIGHT; one of them may be empty")
         self._alone = [(side, file) for side, pattern in enumerate(alone) for file in _files_of(pattern)]
         self._source, self.named["source"] = _open(spec, options.output.with_suffix(".board")), spec
+        kind, _, rest = spec.partition(":")
+        if kind == "pairs":
+            self.named |= zip(SIDES, two_globs(rest), strict=True)
         self.board_file = options.output.parent / f"{options.output.stem}.board.toml"
         self.named |= {"target": self._spec, "board": self.board_file.name}
         self.named |= {f"{side}_intrinsics": each for side, each in zip(SIDES, alone, strict=True) if each}

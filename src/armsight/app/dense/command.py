@@ -95,19 +95,21 @@ def match(
 
     if pair is not None:
         run(read_pair(*pair), output)
-        return
-    done, total = 0, 0
-    with contextlib.closing(open_source(str(source))) as opened, bar("matching", None) as advance:
-        while (shot := opened.read()) is not None:
-            total += 1
-            if shot.problem is not None:
-                problem = {"shot": shot.name, "problem": shot.problem}
-                click.echo(json.dumps(problem) if as_json else problem_line(shot.name, shot.problem))
-            else:
-                done += run(shot, output / shot.name).summary.problem is None
-            advance()
-    if not done:
-        raise ArmsightError(f"{source}: none of {total} shots could be matched; their lines say why")
+    else:
+        done, total = 0, 0
+        with contextlib.closing(open_source(str(source))) as opened, bar("matching", None) as advance:
+            while (shot := opened.read()) is not None:
+                total += 1
+                if shot.problem is not None:
+                    problem = {"shot": shot.name, "problem": shot.problem}
+                    click.echo(json.dumps(problem) if as_json else problem_line(shot.name, shot.problem))
+                else:
+                    done += run(shot, output / shot.name).summary.problem is None
+                advance()
+        if not done:
+            raise ArmsightError(f"{source}: none of {total} shots could be matched; their lines say why")
+    if form is None:
+        click.echo("note: no RIG.json: the images were taken as rectified", err=True)
 
 
 def _arguments(

@@ -86,7 +86,7 @@ def keys_command(site: str, cells: tuple[str, ...], output: Path, address: str, 
     from armsight.app.show.http import host_and_port
     from armsight.files import check_folder
 
-    host, port = host_and_port(address if ":" in address else f"{address}:7447", "--hub")
+    host, port = host_and_port(address if ":" in address.rpartition("]")[2] else f"{address}:7447", "--hub", least=1)
     made = make_keys(check_folder(output, problem="no keys can be made here"), site, cells, host, port)
     if as_json:
         click.echo(json.dumps({"directory": str(output), "cells": [str(each) for each in made]}))

@@ -136,16 +136,25 @@ class PairsSource(StoredSource):
 
     @staticmethod
     def of(text: str) -> PairsSource:
-        """Open LEFT,RIGHT; a glob may have commas of its own, as many on either side.
+        """Open LEFT,RIGHT, as :func:`two_globs` reads it.
 
         Raises:
             InputError: not two globs, no files, or files that do not pair up.
         """
-        parts = text.split(",")
-        left, right = (",".join(half) for half in (parts[: len(parts) // 2], parts[len(parts) // 2 :]))
-        if len(parts) % 2 or not left or not right:
-            raise InputError(f"pairs:{text}: two globs are needed: --source 'pairs:DIR/left*.png,DIR/right*.png'")
-        return PairsSource.open(left, right)
+        return PairsSource.open(*two_globs(text))
+
+
+def two_globs(text: str) -> tuple[str, str]:
+    """Return the globs of LEFT,RIGHT; one may have commas of its own, as many on either side.
+
+    Raises:
+        InputError: not two globs.
+    """
+    parts = text.split(",")
+    left, right = (",".join(half) for half in (parts[: len(parts) // 2], parts[len(parts) // 2 :]))
+    if len(parts) % 2 or not left or not right:
+        raise InputError(f"pairs:{text}: two globs are needed: --source 'pairs:DIR/left*.png,DIR/right*.png'")
+    return left, right
 
 
 def natural_key(path: Path) -> tuple[tuple[int, str] | tuple[int, int], ...]:
