@@ -11,7 +11,7 @@ from armsight.geometry.pose import inverse, log_se3, pose
 from armsight.geometry.rotation import exp_so3
 from armsight.loop.health import HealthMonitor
 from armsight.loop.health.rig import RigWatch
-from armsight.loop.health.shape import ResidualSums, ramped
+from armsight.loop.health.shape import ResidualSums, Since
 from armsight.vision.pose.locate import locate
 from armsight.vision.triangulate import triangulate
 from views import both_pixels
@@ -187,4 +187,13 @@ def test_sums_of_what_grows_are_those_of_its_own_columns():
         tests[-1].take(each, 9.0)
         scaled = each * np.append(np.ones(4), np.full(2, (begin_s - 2.0) / 5.0))
         slow += scaled.T @ scaled
-    np.testing.assert_allclose(ramped(tests, 3).M, slow, rtol=1e-12)
+    np.testing.assert_allclose(Since(tests, 3).ramped(0).M, slow, rtol=1e-12)
+    np.testing.assert_array_equal(Since(tests, 3).ramped(4).M, tests[4].M)  # one test: a step
+
+
+def test_a_focal_length_that_grew_and_stands_still_is_as_large_as_it_is():
+    (found,) = faults.ended(71, focal=lambda t: (min(t, 10.0) * 1e-4, 0.0), at_s=5.0, seconds=22.0)
+    assert (found.cause, found.unit) == ("lens", "%")
+    assert "goes on" not in found.what
+    assert found.size == pytest.approx(0.1, abs=3.0 * found.sigma)
+    assert found.sigma < 0.02

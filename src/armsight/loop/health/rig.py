@@ -62,7 +62,18 @@ from armsight.loop.health.passing import (
     noisier,
     velocity,
 )
-from armsight.loop.health.shape import FURTHEST_M, SMOOTH, STEPS, ResidualSums, ShapeWatch, eliminated, ramped, total
+from armsight.loop.health.shape import (
+    FURTHEST_M,
+    SMOOTH,
+    STEPS,
+    ResidualSums,
+    ShapeWatch,
+    Since,
+    eliminated,
+    grows,
+    lined,
+    total,
+)
 from armsight.vision.camera import pair_arguments
 from armsight.vision.pose.posefit import differentiate
 from armsight.vision.rig import StereoRig
@@ -148,7 +159,7 @@ class RigChange(Record):
         without: the same of the others.
         gained: sum of squares that the seven explain.
         left: sum of squares that nothing explains.
-        slow: whether it goes on, and is as large as it was in the newest test.
+        slow: whether the newest tests show that it grows.
     """
 
     f: Array
@@ -307,6 +318,7 @@ class RigWatch:
         self.lens: LensError | None = None
         self._tests, self._history = 0, list[ResidualSums]()
         self._plain = list[ResidualSums]()  # the same with what images leave beyond noise
+        self._divided: tuple[list[ResidualSums], tuple[ResidualSums, RigChange]] | None = None  # tests and their split
         self._timed = False
         self._doubted: ResidualSums | None = None  # what the alarm of the test before would have rested on
         self._poses = 0  # that differ
@@ -647,7 +659,8 @@ class RigWatch:
         self._history.append(newest.test)
         self._alarms = self._alarms + 1 if alarm else 0
         if alarm:
-            self._window, change, _ = self._split(self._history)
+            since, change = self._newest_split()
+            self._window = since.of(len(since.b))
         matters = alarm or (change.chi_square > _SUSPECTED and self._matters(change, slice(None)))
         self.suspected = change if matters else None
         self.alarm, self.alarmed = alarm, self.alarmed or alarm
@@ -896,23 +909,30 @@ class RigWatch:
 
         It is the beginning that leaves least unexplained: with the seven numbers zero before it, and estimated after it.
         """
-        sums, change, _ = self._split(self._history)
+        sums, change = self._newest_split()
         return sums.begin_s, change
+
+    def _newest_split(self) -> tuple[ResidualSums, RigChange]:
+        """Return the sums since the beginning of a change, and the change; of the same tests they are the same."""
+        if self._divided is None or self._divided[0] != self._history:
+            self._divided = self._history.copy(), self._split(self._history)[:2]
+        return self._divided[1]
 
     def _split(self, tests: Sequence[ResidualSums]) -> tuple[ResidualSums, RigChange, float]:
         """Return the sums of the tests after the beginning of a change, the change that they show, and what is left.
 
-        The test before its beginning may be of both times: it is left out, and counts as noise. A change that goes on is as
-        large as it was in the newest test.
+        The test before its beginning may be of both times: it is left out, and counts as noise. One that grew is as large
+        as a line through the newest tests says.
         """
-        every = total(tests)
+        since = Since(tests, self._size)
+        every = since.plain(0)
 
         def begun(k: int) -> tuple[float, int, bool, ResidualSums]:
-            after, mixed = total(tests[k:]), ResidualSums(len(every.b), tests[0].begin_s)
+            after, mixed = since.plain(k), ResidualSums(len(every.b), tests[0].begin_s)
             if k:
                 mixed.add(tests[k - 1], 1.0)
             without = sum(self._gained(every.less(after).less(mixed))) + mixed.freedom
-            shapes = (after, ramped(tests[k:], self._size)) if len(tests) - k > STEPS else (after,)
+            shapes = (after, since.ramped(k)) if len(tests) - k > STEPS else (after,)
             lefts = [self._gained(each)[1] + without for each in shapes]
             best = int(np.argmin(lefts))
             return lefts[best], k, best > 0, shapes[best]
@@ -921,8 +941,16 @@ class RigWatch:
         k = min((begun(int(each)) for each in coarse), key=lambda each: each[0])[1]
         between = range(max(coarse[coarse < k], default=k), min(coarse[coarse > k], default=k) + 1)
         least, k, slow, found = min(map(begun, between), key=lambda each: each[0])
-        found.begin_s = tests[max(k - 1, 0)].begin_s
-        return found, replace(self._estimated(found), slow=slow), least
+        found.begin_s, change = tests[max(k - 1, 0)].begin_s, self._estimated(found)
+        return found, self._now(change, tests[k:], found.freedom) if slow else change, least
+
+    def _now(self, change: RigChange, tests: Sequence[ResidualSums], freedom: float) -> RigChange:
+        """Return a change that grew in some tests, as large as it is now."""
+        count, before = len(_WIDE), np.zeros((1 + self._size, 1 + self._size))
+        line, spread = lined(tests, before, self._size + np.arange(count))
+        spread *= max(change.left / max(freedom, 1.0), 1.0)
+        cov = spread[:count, :count] * np.outer(_WIDE, _WIDE)
+        return replace(change, f=_WIDE * line[:count], cov=cov, slow=grows(line, spread))
 
     def _gained(self, sums: ResidualSums) -> tuple[float, float]:
         """Return what the seven numbers explain of a sum of squares, and what nothing does."""

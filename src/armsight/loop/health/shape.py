@@ -12,7 +12,8 @@ r^T S^-1 r of the sum of squares, with
 where H and b are the sums, J selects the point, and M has the standard deviations of everything else as its columns. The
 point that explains most is taken, then the next one besides it, while one explains more than chance: a body that is bent.
 
-A change is a step, or a ramp that goes on: then what it did at a test is its share of what it does at the newest one.
+A change is a step, or a ramp that goes on: then what it did at a test is its share of what it does at the newest one. Few
+changes are exact ramps: how large one is now, and whether it still grows, a line through the newest tests alone says.
 
 What the sums from before a change say of everything else (M) is added to those from after it: a body may be off by its
 tolerance, but by the same all the time, so a point that moves is found where it moved by less than that.
@@ -72,6 +73,9 @@ _STRAINS = (1e-3, 4e-3)
 _AFTER, _BENT_M = (1, 2, 4, 8, 16), (2e-4, 1e-3)
 #: A change that goes on is looked for in more tests than this; half: steps are taken for it, double: it is found later.
 STEPS = 4
+#: What goes on is as large as a line through so many of the newest tests says; half: its sigma is 1.4 times as large,
+#: double: what came to rest, or bends, is off by more for longer.
+_NEWEST = 8
 #: Tests that are not kept are forgotten with this time constant, in tests.
 _SETTLED = 30.0
 #: The seven numbers are expected to change by such shares of their priors, which are wide.
@@ -182,7 +186,8 @@ class ShapeError(Record):
         seven: by how much the seven numbers explain more than they all do.
         alike: what explains nearly as much as the first.
         begin_s: since when, s.
-        slow: whether it goes on; it is as large as it was in the newest test.
+        slow: whether it grew; it is as large as a line through the newest tests says.
+        goes_on: whether these alone show that it grows.
     """
 
     chosen: tuple[int, ...]
@@ -193,6 +198,7 @@ class ShapeError(Record):
     alike: tuple[int, ...]
     begin_s: float
     slow: bool = False
+    goes_on: bool = False
 
     @property
     def seven_needed(self) -> bool:
@@ -332,6 +338,7 @@ class ShapeWatch:
         # Of older tests, of all shots and of the usual ones; of those before what is suspected to have changed.
         self._settled = ResidualSums(every - 1, 0.0), ResidualSums(every - 1, 0.0)
         self._all = ResidualSums(every - 1, 0.0), ResidualSums(every - 1, 0.0)  # of both, with the tests that are kept
+        self._kept = tuple[Since, ...]()  # sums since each test that is kept, of all shots and of the usual ones
         self._tests = 0
         self._shots: deque[Array] = deque(maxlen=_ASKED)  # rows, as they were taken
         # The response of the newest poses to the parameters, and the covariances of these poses.
@@ -374,6 +381,7 @@ class ShapeWatch:
         self._keep(_ShapeTest(sums, usual, self._views))
         self._views = []
         tests, before = list(self._history), self._suspect
+        self._kept = tuple(Since(each, self._size) for each in zip(*(each[:2] for each in tests), strict=True))
         doubted_s, self.doubt = self._doubted(every=ends or self.doubt is not None)
         # What is not doubtful is not certain.
         self._suspect = None if before is None and self.doubt is None else self._suspected(tests, before)
@@ -390,6 +398,7 @@ class ShapeWatch:
             self.doubt = self._tolerated()
         elif self._changed_s is None:
             self._changed_s = doubted_s
+        self._kept = ()  # some MB
 
     def _keep(self, newest: _ShapeTest) -> None:
         """Keep a test; the oldest one settles, but where it is of the time after a change.
@@ -439,12 +448,18 @@ class ShapeWatch:
 
         The test before may be of both times: it is left out.
         """
-        tests = [each.usual if usual else each.sums for each in self._history]
-        after = total(tests[begin:])
+        since = self._kept[usual]
+        after = since.plain(begin)
+        before = self._before(begin, after, usual=usual)
+        return (since.ramped(begin) if slow else after).besides(before, self._size)
+
+    def _before(self, begin: int, after: ResidualSums, *, usual: bool) -> ResidualSums:
+        """Return the sums of the tests before one, of those after which the sums are given."""
         before = self._all[usual].less(after)
         if begin:
-            before.add(tests[begin - 1], -1.0)
-        return (ramped(tests[begin:], self._size) if slow else after).besides(before, self._size)
+            mixed = self._history[begin - 1]
+            before.add(mixed.usual if usual else mixed.sums, -1.0)
+        return before
 
     def _doubted(self, *, every: bool) -> tuple[float, Array | None]:
         """Return since when something may have changed, s, and its second moment (7 + C, 7 + C).
@@ -545,7 +560,26 @@ class ShapeWatch:
         error = self._focal_alone(found, sums.begin_s)
         if error is None or not _one_is_enough(self._reduced(tests[-1].sums)):
             error = self._deformed(sums) or self._displaced(found, sums.begin_s)
-        return None if error is None else replace(error, slow=slow)
+        return self._now(error, found, begin) if error is not None and slow else error
+
+    def _now(self, error: ShapeError, found: _Reduced, begin: int) -> ShapeError:
+        """Return what grew since a test, as sums show that, as large as it is now: a focal length or a point alone."""
+        if len(error.chosen) > 1 or error.chosen == (SMOOTH,):
+            return replace(error, slow=True)
+        of_focal, columns = error.chosen == (FOCAL,), _columns(error.chosen)
+        size, sums = self._size + (0 if of_focal else 7), found.without if of_focal else found.whole
+        tests = [each.sums for each in self._history][begin:]
+        before = self._before(begin, total(tests), usual=False).M
+        before[1 + self._size :] = before[:, 1 + self._size :] = 0.0
+        line, spread = lined(tests, before[: 1 + size, : 1 + size], self._size + 7 + columns)
+        spread *= sums.excess(sums.gain(columns))
+        value, cov, count = error.value.copy(), error.cov.copy(), len(columns)
+        wide = self._wide[columns]
+        value[columns] = wide * line[:count]
+        cov[np.ix_(columns, columns)] = spread[:count, :count] * np.outer(wide, wide)
+        if of_focal:
+            cov[1, 1] = (value[0] / 2.0) ** 2
+        return replace(error, value=value, cov=cov, slow=True, goes_on=grows(line, spread))
 
     def _deformed(self, sums: ResidualSums) -> ShapeError | None:
         """Return a smooth deformation of the body that tests show for certain, beside any change of the seven numbers.
@@ -840,16 +874,71 @@ def total(tests: Sequence[ResidualSums]) -> ResidualSums:
     return found
 
 
-def ramped(tests: Sequence[ResidualSums], size: int) -> ResidualSums:
-    """Return the sums of tests in which all but the first parameters grow with time, from zero to what they are now."""
-    begin_s, last_s = tests[0].begin_s, tests[-1].begin_s
-    found = ResidualSums(len(tests[0].b), begin_s)
-    for each in tests:
-        by = np.ones(len(each.M))
-        by[1 + size :] = (each.begin_s - begin_s) / (last_s - begin_s)
-        found.M += each.M * by * by[:, None]
-        found.freedom += each.freedom
-    return found
+class Since:
+    """The sums of some tests since each one of them, all added up in one pass.
+
+    Args:
+        tests: in the order of time.
+        size: count of the first parameters, which never grow.
+    """
+
+    def __init__(self, tests: Sequence[ResidualSums], size: int) -> None:
+        self._begins_s, self._size = np.array([each.begin_s for each in tests]), size
+        M = np.array([each.M for each in tests])
+        ages_s = (self._begins_s - self._begins_s[-1])[:, None, None]
+        by_age = ages_s * M[:, 1 + size :]
+        self._M, self._once, self._twice, self._freedom = (
+            np.cumsum(each[::-1], axis=0)[::-1]
+            for each in (M, by_age, ages_s * by_age[:, :, 1 + size :], np.array([each.freedom for each in tests]))
+        )
+
+    def plain(self, k: int) -> ResidualSums:
+        """Return the sums of the tests from one on."""
+        found = ResidualSums(self._M.shape[1] - 1, float(self._begins_s[k]))
+        found.M, found.freedom = self._M[k].copy(), float(self._freedom[k])
+        return found
+
+    def ramped(self, k: int) -> ResidualSums:
+        """Return the same where all but the first parameters grow with time, from zero to what they are now."""
+        found, rest = self.plain(k), slice(1 + self._size, None)
+        span_s = float(self._begins_s[-1] - self._begins_s[k])
+        if span_s > 0.0:  # else all are of now
+            once, twice = self._once[k] / span_s, self._twice[k] / span_s**2
+            found.M[rest] += once
+            found.M[:, rest] += once.T
+            found.M[rest, rest] += twice
+        return found
+
+
+def lined(tests: Sequence[ResidualSums], before: Array, columns: Ids) -> tuple[Array, Array]:
+    """Return what the newest tests say of parameters that are on a line in time, and the covariance (2 C, 2 C).
+
+    Args:
+        tests: since these began to change, in units of the priors.
+        before: (1 + K, 1 + K) what those before say of the first parameters, which are constant.
+        columns: (C,) rows of the others.
+
+    Returns:
+        (2 C,) what they are at the newest test, and by how much they grew since the first of the newest; covariance.
+    """
+    newest = tests[-_NEWEST:]
+    size, count, last_s = len(before), len(columns), newest[-1].begin_s
+    span_s, kept = max(last_s - newest[0].begin_s, 1e-9), np.append(np.arange(size), 1 + columns)
+    M, by = np.zeros((size + 2 * count, size + 2 * count)), np.eye(size + count, size + 2 * count)
+    M[:size, :size] = before
+    for each in newest:
+        by[size:, size + count :] = np.eye(count) * (each.begin_s - last_s) / span_s
+        M += by.T @ each.M[np.ix_(kept, kept)] @ by
+    M = eliminated(M, slice(1, size))
+    cov = np.asarray(np.linalg.inv(M[1:, 1:] + np.eye(2 * count)))
+    return cov @ M[1:, 0], cov
+
+
+def grows(line: Array, cov: Array) -> bool:
+    """Return whether a line of :func:`lined` grew by more than chance, its covariance (2 C, 2 C) that of the noise."""
+    count = len(line) // 2
+    by = line[count:]
+    return float(by @ np.linalg.solve(cov[count:, count:], by)) > chi_square_limit(count, _UNLIKE)
 
 
 def _differ(views: Array) -> bool:
@@ -861,7 +950,7 @@ def _differ(views: Array) -> bool:
 def _focal_finding(error: ShapeError, since_s: float | None) -> HealthFinding:
     """Return the finding of a focal length that changed."""
     share, sigma = 100.0 * float(error.value[0]), 100.0 * float(np.sqrt(error.cov[0, 0]))
-    goes_on = " so far, and it goes on" if error.slow else ""
+    goes_on = " so far, and it goes on" if error.goes_on else ""
     longer, shorter = ("left", "right") if share > 0 else ("right", "left")
     return HealthFinding(
         "lens",
