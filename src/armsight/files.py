@@ -470,7 +470,9 @@ def alone_in(folder: Path, command: str) -> Iterator[None]:
         except BlockingIOError:
             raise InputError(f"{folder}: another {command} uses it: give this one another folder, -o FOLDER") from None
         except OSError as error:  # a file system without locks
-            raise InputError(f"{folder}: cannot be kept to one {command}: {error.strerror}: give another folder") from None
+            raise InputError(
+                f"{folder}: cannot be kept to one {command}: {error.strerror}: give another folder"
+            ) from None
         yield
 
 

@@ -70,7 +70,8 @@ def test_once_the_rate_is_known_a_busy_host_moves_the_clock_by_less_than_clocks_
 
 
 @pytest.mark.parametrize(
-    ("t_s", "said"), [(None, "has no time"), (3.0, "was taken 12343 s ago"), (1.7e9, "was taken -")]
+    ("t_s", "said"),
+    [(None, "has no time"), (np.nan, "has no time"), (3.0, "was taken 12343 s ago"), (1.7e9, "was taken -")],
 )
 def test_shots_of_a_recording_are_rejected(t_s, said):
     now = Clock()

@@ -46,7 +46,7 @@ def host_and_port(address: str, what: str, *, least: int = 0) -> tuple[str, int]
     """
     host, _, port = address.rpartition(":")
     if not host or not port.isdecimal() or not least <= int(port) <= 65535:
-        raise InputError(f"{what} is {address!r}: expected HOST:PORT, such as 127.0.0.1:9110")
+        raise InputError(f"{what} is {address!r}: expected HOST:PORT, such as 127.0.0.1:9110; PORT is {least} to 65535")
     return host.strip("[]"), int(port)
 
 

@@ -90,16 +90,15 @@ class HostClock:
         assert self._least_s is not None
         if shot.t_s is None and shot.problem is not None:
             return shot
+        t_s = shot.t_s if shot.t_s is not None and math.isfinite(shot.t_s) else None
         # The clock of cameras that were live may jump.
-        if shot.t_s is None or (abs(self._now() - shot.t_s) > LIVE_S and not self._live):
-            problem = (
-                "has no time" if shot.t_s is None else f"was taken {self._now() - shot.t_s:.0f} s ago by its own time"
-            )
+        if t_s is None or (abs(self._now() - t_s) > LIVE_S and not self._live):
+            problem = "has no time" if t_s is None else f"was taken {self._now() - t_s:.0f} s ago by its own time"
             raise DeviceError(
                 f"shot {shot.name} {problem}: is it of a recording? A run needs live cameras (usb:..., url:...)"
             )
         self._live = True
-        return replace(shot, t_s=shot.t_s - self._least_s)
+        return replace(shot, t_s=t_s - self._least_s)
 
 
 @dataclass(frozen=True)
