@@ -70,9 +70,9 @@ def first_measurement(folder: Path, *, alone: bool) -> None:
     pairs = DATA / "stereo" / "opencv-480p"
     rig, target = str(folder / "rig.json"), ("--target", "chessboard:9x6:25mm")
     many = ("--source", f"pairs:{pairs}/left*.jpg,{pairs}/right*.jpg")
-    one = ("--source", f"pairs:{pairs}/left01.jpg,{pairs}/right01.jpg")
+    images = f"{pairs}/left01.jpg", f"{pairs}/right01.jpg"
     seconds(ARMSIGHT, "calibrate", *many, *target, "-o", rig)
-    measure = (ARMSIGHT, "measure", rig, *target, *one)
+    measure = (ARMSIGHT, "measure", rig, *target, "--source", f"pairs:{','.join(images)}")
     opencv = (sys.executable, "-c", "import cv2")
     starts = () if alone else (("cold", forget_pages, 1), ("warm", lambda: None, REPEATS))
     for name, prepare, repeats in starts:
@@ -82,7 +82,7 @@ def first_measurement(folder: Path, *, alone: bool) -> None:
             times.append(float(np.median([seconds(*command) for _ in range(repeats)])))
         report(f"import cv2, {name}", times[0], None)
         report(f"measure one pair, beyond import cv2, {name}", times[1] - times[0], 2.0)
-    beside_opencv(measure, (one[1], one[3]))
+    beside_opencv(measure, images)
 
 
 #: What a user of OpenCV writes for it: corners, triangulation without distortion, a rigid fit.
