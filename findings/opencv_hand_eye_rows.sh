@@ -7,8 +7,7 @@
 # Daniilidis gives NaN. Where only the target's are rows, as aruco's are, and the gripper's columns, the translation looks
 # plausible and is wrong by 0.4 m. Shapes (3,) and (3, 1) are right.
 #
-# 5.1 has the hand-eye functions again, which 5.0 does not have. calibrateRobotWorldHandEye of 4.14 takes (3,), that of 5.1
-# raises for it.
+# calibrateRobotWorldHandEye of 4.14 takes (3,), that of 5.1 raises for it.
 #
 # Seen, 4.14.0 and 5.1.0, a gripper's camera 391 mm away along its longest axis: (3,) and (3, 1) right, (1, 3) [0 0 0],
 # rows of the target alone [0.049 0.105 -0.018] m; world and hand eye with (3,): 4.14 right, 5.1 error.
@@ -45,7 +44,7 @@ mixed = (*parts(Ts_base_gripper, (3, 1)), *parts(Ts_camera_target, (1, 3)))
 R, t = cv2.calibrateHandEye(*mixed)
 print(f"{cv2.__version__} rows of the target alone: translation is {np.round(t.ravel(), 3)}")
 assert np.allclose(R, T_gripper_camera[:3, :3], atol=1e-6)
-assert np.abs(t.ravel() - T_gripper_camera[:3, 3]).max() > 0.1
+assert np.abs(t.ravel() - T_gripper_camera[:3, 3]).max() > 0.4
 for method in ("TSAI", "PARK", "HORAUD", "DANIILIDIS"):
     for shape in ((3,), (3, 1), (1, 3)):
         given = (*parts(Ts_base_gripper, shape), *parts(Ts_camera_target, shape))

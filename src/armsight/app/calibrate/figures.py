@@ -57,7 +57,10 @@ def volume_figure(calibration: Calibration) -> Figure:
         low, high = _range(1e3 * sigma)
         for column, share in enumerate(SHARES):
             axes, masked = panels[row, column], np.ma.masked_invalid(np.maximum(1e3 * sigma[column], low))
-            filled = axes.pcolormesh(x, z, masked, cmap="viridis_r", norm=LogNorm(low, high), shading="nearest")
+            colours = {"cmap": "viridis_r", "norm": LogNorm(low, high)}
+            filled = axes.pcolormesh(
+                x, z, masked, shading="nearest", rasterized=True, **colours
+            )  # as paths 12 MB of SVG
             if inside := [level for level in round_steps(low, high) if masked.min() < level < masked.max()]:
                 lines = axes.contour(x, z, masked, levels=inside, colors="white", linewidths=0.9)
                 for text in axes.clabel(lines, fmt="%g", fontsize=8, colors="white"):

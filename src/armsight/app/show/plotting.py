@@ -114,7 +114,7 @@ def svg(figure: Figure) -> bytes:
     """Render a figure as lines that stay sharp however far one zooms in; within :func:`drawing`."""
     _lay_out(figure)
     data = io.BytesIO()
-    figure.savefig(data, format="svg", metadata={"Date": None, "Creator": None})
+    figure.savefig(data, format="svg", dpi=DPI, metadata={"Date": None, "Creator": None})
     return data.getvalue()
 
 

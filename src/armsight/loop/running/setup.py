@@ -27,9 +27,7 @@ from armsight.vision.sources import Source
 #: Bound on the relative drift of the two clocks: 50 ppm for each crystal, and the slewing of the host's clock.
 DRIFT = 2e-4
 RATE_SHOTS = 12  # that show the cameras' rate; half: a stall at the start counts, double: a run begins later
-RATE_S = (
-    10.0  # they are waited for so long, s; half: slow cameras are rejected, double: one that is gone is noticed late
-)
+RATE_S = 10.0  # they are waited for so long, s; half: slow cameras are rejected, double: a lost one is noticed late
 _FEWEST_SHOTS, _RATES_HZ = 3, (0.5, 1000.0)  # that show a rate, and what it can be
 #: The clocks' rate is that of so many seconds; the least transmission times of two seconds differ by about this, s.
 _WINDOW_S, _SCATTER_S = 60, 1e-3
