@@ -17,7 +17,7 @@ from armsight.errors import InputError
 from armsight.files import replacing, try_writing
 
 #: A number, with its sigma or its unit.
-_NUMBER = re.compile(r"[-+\u2212]?\d[\d.,]*(?: \u00b1 [\d.,]+)?(?: ?[%a-z\u00b0]{1,3})?")
+_NUMBER = re.compile(r"[-+\u2212]?\d[\d.,]*(?: \u00b1 [\d.,]+)?(?: ?[%a-z\u00b0/]{1,5})?")
 #: Before a sigma, and what keeps the two in one line.
 PLUS_MINUS, NEVER_APART = "\u00b1 ", "\u00b1\u00a0"
 #: Name of the page in the folder of every report.
@@ -58,12 +58,14 @@ summary { cursor: pointer; color: var(--link); margin: .6rem 0; }
 figure { margin: 0 0 1rem; } figure img { width: 100%; height: auto; display: block; background: #fff; }
 figcaption { background: var(--soft); padding: .6rem 1.1rem; margin-top: .6rem; font-size: .95rem; }
 figcaption p { margin: .3rem 0; }
-@media (max-width: 48rem) { table { display: block; overflow-x: auto; }
+@media screen and (max-width: 48rem) { table { display: block; overflow-x: auto; }
   th, td { overflow-wrap: break-word; } td:not(.number) { min-width: 7rem; }
   td:last-child:not(.number):not(:empty) { min-width: 20rem; }
   table.numbers tbody th, table.headline th { white-space: normal; } }
 @media print { body { max-width: none; padding: 0; } nav { display: none; } table { font-size: .7rem; }
-  th, td { padding: .25rem .5rem .25rem 0; } figure { break-inside: avoid; } }
+  th, td { padding: .25rem .5rem .25rem 0; } figure { break-inside: avoid; }
+  h2, h3, summary { break-after: avoid; } tr { break-inside: avoid; }
+  details::details-content { content-visibility: visible; block-size: auto; } }  /* paper is not unfolded */
 """
 
 

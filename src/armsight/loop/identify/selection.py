@@ -279,4 +279,5 @@ def _common(names: Sequence[str]) -> str:
 def _not_improving(losses_with: Array, folds: Folds, rms: float) -> str:
     change = folds.rms(losses_with) / rms - 1
     text = f"falls by {-100 * change:.2g} %, no more than chance" if change < 0 else f"rises by {100 * change:.2g} %"
+    text = text if abs(change) > 1e-6 else "stays as it is"
     return f"not selected: with it the held-out error {text}"
