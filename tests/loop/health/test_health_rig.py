@@ -150,7 +150,8 @@ def test_the_rows_of_a_shot_are_those_of_a_dense_elimination(moved):
         estimate = replace(estimate, exposures=ExposureErrors(own, np.zeros((2, 2))))
     watch = RigWatch(rig, replace(BODY, points=np.asfortranarray(BODY.points)), sync_s := 2e-3)
     watch.take(before, t)
-    found, velocity = watch._residuals(estimate, now_s), watch._velocity(estimate.T_left_body, now_s)
+    watch.reader.track.append((now_s, estimate.T_left_body))
+    found, velocity = watch.reader.read(estimate, now_s), watch.reader.velocity()
     seen, points = PixelObservations.of(estimate.points.seen, rig.sigma_px), BODY.points
     fit = fit_pose(rig.cameras, rig.T_left_right, points, seen, estimate.T_left_body, robust=False, steps=0)
     W, A, B = whitened(rig.cameras, rig.T_left_right, points, seen, estimate.T_left_body)

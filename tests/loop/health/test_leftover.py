@@ -5,7 +5,7 @@ import pytest
 from faults import watched_body
 
 from armsight.loop.health.passing import Leftover
-from armsight.loop.health.shape import ResidualSums
+from armsight.loop.health.residuals import ResidualSums
 
 OTHERS, LENS, ROWS, SEVEN = 9, 20, 400, slice(3, 10)  # of the rows, the residual is the first
 

@@ -10,8 +10,8 @@ from faults import BODY, RATE_HZ, SIGMA_PX, SIGMAS, SYNC_S, TRUE, measured, watc
 from armsight.geometry.pose import inverse, log_se3, pose
 from armsight.geometry.rotation import exp_so3
 from armsight.loop.health import HealthMonitor
+from armsight.loop.health.residuals import ResidualSums, Since
 from armsight.loop.health.rig import RigWatch
-from armsight.loop.health.shape import ResidualSums, Since
 from armsight.vision.pose.locate import locate
 from armsight.vision.triangulate import triangulate
 from views import both_pixels
@@ -160,7 +160,7 @@ def test_points_that_do_not_fit_change_nothing_of_the_other_tests():
     estimate = locate(rig, BODY, triangulate(rig, BODY, measured(rig, BODY, T, uv).points.seen))
     assert DISC not in estimate.points.ids
     watch = RigWatch(rig, BODY, SYNC_S)
-    found = watch._residuals(estimate, 0.0)
+    found = watch.reader.read(estimate, 0.0)
     column = 1 + rig.parameter_count + 1 + 3 * DISC
     assert not found.rows[:, column : column + 3].any()
     assert found.every[:, column : column + 3].any()

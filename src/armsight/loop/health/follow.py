@@ -23,7 +23,8 @@ from armsight.loop.estimators import Mounting
 from armsight.loop.finding import Cause
 from armsight.loop.health.base_motion import BaseMotion, KeptMeasurement, Moved
 from armsight.loop.health.change import Change
-from armsight.loop.health.rig import TEST_S, RigWatch, differ
+from armsight.loop.health.residuals import differ
+from armsight.loop.health.rig import TEST_S, RigWatch
 from armsight.loop.health.update import LEAST_STAYS, RigUpdate, updated_rig
 from armsight.vision.detections import SeenShot
 from armsight.vision.match import gate

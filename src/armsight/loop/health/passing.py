@@ -35,22 +35,16 @@ from dataclasses import dataclass, field, replace
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from armsight.data import Array
 from armsight.loop.finding import HealthFinding, displacement_m
-from armsight.loop.health.shape import ResidualSums, eliminated, total
+from armsight.loop.health.residuals import UNKNOWN_SHARE, ExposedShot, ResidualSums, eliminated, total
 
 #: Standard deviations that are tried of the times that each shot has of its own, s, and that of the times that all share.
 _APART_S, _SHARED_S = (0.0, *(1e-3 * 2.0**k for k in range(-2, 7))), 0.03
 #: Standard deviations that are tried of what is anew in each shot: rotations about an axis, rad, a focal length's share.
 #: Half: a nod of 0.1 deg counts for less against times, double: one of 0.3 deg counts, too, in which poses are not linear.
 _NOD_RAD = tuple(1e-5 * 2.0**k for k in range(9))
-#: The velocity of measured poses is off by this share of the speed in any direction; half: rig and body are blamed for what
-#: is left of late images, double: less of them is seen.
-_UNKNOWN_SHARE = 0.2
-#: The body's motion at a shot is that of so many newest ones, if these are of so short a time, s.
-TRACK, _LONGEST_S = 5, 1.0
 #: Log-evidence by which a hypothesis must be ahead of all others to be taken; half: chance takes one of 100 tests for it.
 _AHEAD = math.log(1e4)
 #: And by this share of the log-evidence of what stays: its residuals are linear, and those of the test in which it began
@@ -64,8 +58,6 @@ _CONSTANT = 0.4
 _LEAST = 2
 #: Of the columns of a shot those of times: of the right camera, of the rows of the right and of the left one; acceleration.
 _TIMES = [0, 7, 8, 9]
-#: An acceleration moves the body like so many seconds of it, where times are of a second.
-_BENT_S = 0.1
 #: Standard deviation of the focal length of a test, as a share: so wide that it decides nothing beside the column's own.
 #: It stands so many rows after the parameters; against what stays its variance is this share of that.
 _FOCAL, _FOCAL_ROW, _FOCAL_VARIANCE = 0.05, 7, 0.01
@@ -90,88 +82,6 @@ Passes = Literal["time", "lens"]
 _PASSES: tuple[Passes, ...] = ("time", "lens")
 #: Returns the log-evidence of what stays, of sums and a variance of the noise, and whether with a skew; 0 of nothing.
 Staying = Callable[[ResidualSums, float, bool], float]
-
-
-def velocity(before: Array, after: Array, seconds: float) -> Array:
-    """Return the velocity (6,) in the body's axes, 1/s, that takes a pose (4, 4) to another, by a small angle."""
-    R = before[:3, :3].T @ after[:3, :3]
-    rotation = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    shift = after[:3, :3].T @ (after[:3, 3] - before[:3, 3])
-    return np.asarray(np.concatenate([shift, rotation]) / seconds)
-
-
-def moved_by(A: Array, own: Array) -> Array:
-    """Return what (4 N, K) errors of exposures (N, 2, 6, K) do to residuals of derivatives A (4 N, 6) by the pose."""
-    return np.asarray(A.reshape(-1, 2, 2, 6) @ own).reshape(len(A), -1)
-
-
-def noisier(rows: Array, J: Array) -> Array:
-    """Return rows (n, M) with more errors in their noise, J (n, K) by a sigma each: (I + J J^T)^-1/2 times them."""
-    squares, axes = np.linalg.eigh(J.T @ J)
-    squares = np.maximum(squares, 1e-12)
-    J = J @ axes
-    return np.asarray(rows - J @ (((1.0 - 1.0 / np.sqrt(1.0 + squares)) / squares)[:, None] * (J.T @ rows)))
-
-
-class ExposedShot(NamedTuple):
-    """By how much the times of exposure move the residuals of a shot.
-
-    Attributes:
-        A: (n, 6) derivative of the residuals by the pose, in standard deviations; rows u, v of the left image and of the
-            right one, point by point.
-        roll: (n,) the row of the image, from -1 at its top to 1.
-        track: times, s, and poses T_left_body (4, 4) of the newest shots up to this one.
-        own: (n, K) what is not known of these times, where the detections were moved to one, does to the residuals, by a
-            sigma each; K is 0 else.
-    """
-
-    A: Array
-    roll: Array
-    track: tuple[tuple[float, Array], ...]
-    own: Array
-
-    def of(self, rows: NDArray[np.bool_]) -> ExposedShot:
-        """Return that of some rows."""
-        return self._replace(A=self.A[rows], roll=self.roll[rows], own=self.own[rows])
-
-    def motion(self) -> tuple[Array, Array]:
-        """Return velocity and acceleration (6,) of the body in its axes, 1/s and 1/s^2; zero where they are unknown.
-
-        They are those of each second shot: what a shot has of its own and the next one not leaves them right.
-        """
-        if len(self.track) < TRACK:
-            return np.zeros(6), np.zeros(6)
-        (first_s, first), (middle_s, middle), (last_s, last) = self.track[0], self.track[TRACK // 2], self.track[-1]
-        if not first_s < middle_s < last_s < first_s + _LONGEST_S:
-            return np.zeros(6), np.zeros(6)
-        early, late = velocity(first, middle, middle_s - first_s), velocity(middle, last, last_s - middle_s)
-        return 1.5 * late - 0.5 * early, (late - early) * 2.0 / (last_s - first_s)
-
-    def moved(self) -> Array:
-        """Return what (n, 10) moves the residuals.
-
-        1 s later in the right image, other motions there (6), 1 s at the edge of the right and of the left one; and what
-        the first lacks of a body that accelerates.
-        """
-        right = np.arange(len(self.A)) % 4 >= 2
-        by_right, (along, acceleration) = self.A * right[:, None], self.motion()
-        speeds = np.repeat(np.linalg.norm(along.reshape(2, 3), axis=1) / math.sqrt(3.0), 3)
-        rolled = self.roll * (self.A @ along)
-        skew, bent = by_right @ along, _BENT_S * (by_right @ acceleration)
-        return np.column_stack([skew, _UNKNOWN_SHARE * speeds * by_right, rolled * right, rolled * ~right, bent])
-
-    def without_pose(self, moved: Array) -> Array:
-        """Return what moves the residuals (n, K) with the pose eliminated."""
-        Q = np.linalg.qr(self.A)[0]
-        return np.asarray(moved - Q @ (Q.T @ moved))
-
-    def whitened(self) -> Array:
-        """Return the same (n, 10) with the pose eliminated, and with what is not known of the times in the noise."""
-        return noisier(self.without_pose(self.moved()), self.without_pose(self.own))
-
-    def response(self) -> Array:
-        """Return what (6, 10) these do to the pose."""
-        return np.asarray(np.linalg.lstsq(self.A, self.moved(), rcond=None)[0])
 
 
 @dataclass(frozen=True)
@@ -520,7 +430,7 @@ class Passing:
         # What the velocity lacks is lacking in all shots alike.
         size, sigma = (
             1e3 * float(mean_s[k]),
-            1e3 * math.hypot(float(sigmas_s[k]), 0.5 * _UNKNOWN_SHARE * float(mean_s[k])),
+            1e3 * math.hypot(float(sigmas_s[k]), 0.5 * UNKNOWN_SHARE * float(mean_s[k])),
         )
         if own_s > _CONSTANT * abs(mean_s[k]):
             size = 1e3 * math.sqrt(float(np.mean([each.rms_s**2 for each in tests])))

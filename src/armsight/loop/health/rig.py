@@ -38,69 +38,40 @@ from statistics import median
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from armsight.data import Array, Body, Ids, PoseEstimate, Record
 from armsight.estimate.chance import chi_square_limit
-from armsight.geometry.matrix import product, solved
-from armsight.geometry.pose import adjoint, inverse, log_se3, pose
-from armsight.kernels import kernel
+from armsight.geometry.pose import adjoint, inverse, log_se3
 from armsight.loop.finding import COSTS_M, SUSPECTED, HealthFinding, alarm_limit, displacement_m
 from armsight.loop.health.fixed import Unrest
-from armsight.loop.health.passing import (
-    TOGETHER,
-    TRACK,
-    Apart,
-    ExposedShot,
-    Leftover,
-    Passing,
-    Times,
-    apart,
-    eliminate,
-    moved_by,
-    nodding,
-    noisier,
-    velocity,
-)
-from armsight.loop.health.shape import (
-    FURTHEST_M,
-    SMOOTH,
+from armsight.loop.health.passing import TOGETHER, Apart, Leftover, Passing, Times, apart, eliminate, nodding
+from armsight.loop.health.residuals import (
     STEPS,
     ResidualSums,
-    ShapeWatch,
+    ShotReader,
+    ShotResiduals,
     Since,
+    differ,
     eliminated,
     grows,
     lined,
+    noisier,
     total,
 )
-from armsight.vision.camera import pair_arguments
-from armsight.vision.pose.posefit import differentiate
+from armsight.loop.health.rows import LENS
+from armsight.loop.health.shape import SMOOTH, ShapeWatch
 from armsight.vision.rig import StereoRig
 
 Part = Literal["rig", "body", "time"]
 
 #: Tolerance of a body that was built and measured with care: of each point, m, and of its scale.
 SHAPE_M, SCALE = 5e-5, 3e-4
-#: Points of a body that are used, at most: those of a large board would cost more than they say.
-MOST_POINTS = 24
-#: Shots that differ less than this share their errors (where a point is within its pixels, how it is lit) and count as one:
-#: translation over distance, and rotation, rad.
-_SAME = 0.01
-_SAME_COSINE = float(np.cos(_SAME))
 #: Shots closer in time than this are left out, s, and those that hardly differ from the newest: they would add little.
 _LEAST_S, _LIKE_S = 0.025, 0.1
 #: One of so many shots, those that fit worst, is no usual one.
 _ODD = 4
-#: A point that a pose was measured without is another thing also where its two detections disagree by more than chance
-#: explains once in so many shots.
-_PAIRED = chi_square_limit(1, 1e-4)
-#: Fewer points than this say nothing of these numbers; shots further apart in time than this give no speed, s.
-_LEAST_POINTS, _APART_S = 4, 0.5
 #: The test is made after so long, s, or so many shots, and the past is forgotten with this time constant, in tests.
 TEST_S, TEST_SHOTS, FORGET_TESTS = 1.0, 60, 30.0
-#: Residuals are not linear in the size of a body that is off by more than this share of it.
-_LINEAR = 0.005
 #: In so many tests after an alarm the lenses are tested each time; a test counts for what images leave after so many more.
 _FRESH, _BEFORE = 6, 3
 #: Beginnings that are tried; half: an old change is dated to a half of its age, double: twice the time after a fault.
@@ -131,18 +102,13 @@ _ALARM, _ALARMS = (
 _POSES = 60
 #: Chi-square from which on a change that matters widens the poses.
 _SUSPECTED = chi_square_limit(len(_WIDE), SUSPECTED)
-#: The polynomials of the position in an image are all products of x and y up to this degree; their count.
-_DEGREE = 4
-_POLYNOMIALS = (_DEGREE + 1) * (_DEGREE + 2) // 2
-#: Numbers of what the camera models lack: of two cameras, along u and v; their prior is 1 px wide.
-_LENS = 4 * _POLYNOMIALS
 #: Standard deviations of its prior that are tried: the one of the largest evidence is taken (MacKay, 1992).
 _LENS_SCALES_PX = tuple(2.0**k for k in range(-6, 2))
 #: It is tested in every so many tests, from so many poses that differ; its chi-square of an alarm.
 _LENS_TESTS, _LENS_POSES = 4, 8
 #: It is named where it explains so much more than a change of the seven numbers, as a share of what that explains.
 _LENS_SHARE = 0.5
-_LENS_ALARM = alarm_limit(_LENS, 1.0 / (TEST_S * _LENS_TESTS))
+_LENS_ALARM = alarm_limit(LENS, 1.0 / (TEST_S * _LENS_TESTS))
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,26 +157,6 @@ class LensError(Record):
     needed: tuple[Part, ...]
 
 
-class _ShotResiduals(NamedTuple):
-    """What a shot says, its pose eliminated, of K parameters and M coefficients of what the camera models lack.
-
-    Attributes:
-        t_s: its time.
-        rows: (n, 1 + K + M) residuals and their derivatives, in standard deviations.
-        response: (6, K + M) of its pose to these.
-        every: as ``rows``, with points that do not fit, which may be displaced.
-        response_with_all: (6, K + M) of a pose measured with these.
-        exposed: by how much the times of the exposures would move each row of ``rows``, and of ``every``.
-    """
-
-    t_s: float
-    rows: Array
-    response: Array
-    every: Array
-    response_with_all: Array
-    exposed: tuple[ExposedShot, ExposedShot]
-
-
 class _Newest(NamedTuple):
     """The newest test.
 
@@ -253,20 +199,19 @@ class RigWatch:
     """
 
     def __init__(self, rig: StereoRig, body: Body, sync_s: float, *, printed: bool = False) -> None:
-        self.rig, self._body, self._sync_s = rig, body, sync_s
-        held = len(body.points)
-        self._points = np.linspace(0, held - 1, min(held, MOST_POINTS)).astype(int)
-        count, shape = rig.parameter_count, 3 * len(self._points)
-        self._size = count + 1 + shape + 2
+        self.rig, self._body = rig, body
+        self.reader = ShotReader(rig, body, sync_s)
+        self._size, rows = self.reader.size, self.reader.points
+        count, shape = rig.parameter_count, 3 * len(rows)
         self.prior = np.zeros((self._size, self._size))
         values, vectors = np.linalg.eigh(rig.cov)
         self.prior[:count, :count] = vectors * np.sqrt(np.maximum(values, 0.0))
         rest = np.arange(count, self._size - 2)
         self.prior[rest, rest] = np.append(SCALE, np.full(shape, SHAPE_M))
         self._by_fault = _fault_directions(rig, self._size)
-        names = tuple(body.point_names[k] for k in self._points)
-        many = held > MOST_POINTS
-        points = np.asarray(body.points, float)[self._points]
+        names = tuple(body.point_names[k] for k in rows)
+        many = len(body.points) > len(rows)
+        points = np.asarray(body.points, float)[rows]
         self._focal = _focal_changes(rig, self._size)
         self._shape = ShapeWatch(
             self._size,
@@ -283,34 +228,23 @@ class RigWatch:
         # units of their priors: a test has sums of these.
         self._scaled = np.hstack([self.prior, self._by_fault * _WIDE, self._shape.by_wide])
         # The same with the coefficients of what the camera models lack, px.
-        self._with_lens = np.zeros((self._size + _LENS, self._scaled.shape[1] + _LENS))
-        self._with_lens[: self._size, :-_LENS] = self._scaled
-        self._with_lens[self._size :, -_LENS:] = np.eye(_LENS)
+        self._with_lens = np.zeros((self._size + LENS, self._scaled.shape[1] + LENS))
+        self._with_lens[: self._size, :-LENS] = self._scaled
+        self._with_lens[self._size :, -LENS:] = np.eye(LENS)
         # What moves to and fro of the parameters: the right camera's rotation (3), rad, a focal length against the other;
         # and what a focal length does of the right camera alone, and of the left one.
         last, (apart_f, both_f) = rig.parameter_count, self._focal.T
         self._to_and_fro = np.column_stack([np.eye(self._size)[:, last - 3 : last], apart_f])
         self._alone = np.column_stack([apart_f - 0.5 * both_f, apart_f + 0.5 * both_f])
         self._shots = 0
-        self._row_of = np.full(len(body.points), -1)
-        self._row_of[self._points] = np.arange(len(self._points))
-        self._last = (-np.inf, np.eye(4))
-        self._track: deque[tuple[float, Array]] = deque(maxlen=TRACK)
-        self._used_s = np.full(len(self._points), -np.inf)  # when a pose was measured with each point
         self.passing = Passing()
         self._taken_s = -np.inf
         self._began: Array | None = None
         # The response of the newest poses to everything, and the covariances of these poses.
         self._effects: deque[tuple[Array, Array]] = deque(maxlen=_POSES)
-        self._full = self._size + _LENS
-        # What the kernels take of the cameras, and half of the size of their images, px.
-        counts = np.array([camera.distortion.size for camera in rig.cameras])
-        self._pair = (*pair_arguments(rig.cameras), counts, inverse(rig.T_left_right))
-        self._p_body = np.array(body.points, float, order="C")
-        self._half_px = np.array([camera.image_size_px for camera in rig.cameras]) / 2.0
-        self._focal_px = np.array([camera.intrinsics[:2] for camera in rig.cameras])
+        self._full = self._size + LENS
         # Shots of the running test, in stays; sums since the beginning are for what the camera models lack.
-        self._stays: list[list[_ShotResiduals]] = []
+        self._stays: list[list[ShotResiduals]] = []
         self._window = ResidualSums(self._size + len(_WIDE), 0.0)
         self._whole, self._leftover = ResidualSums(self._with_lens.shape[1], 0.0), Leftover()
         self._wholes: deque[ResidualSums] = deque(maxlen=TOGETHER)  # of the newest tests
@@ -343,13 +277,11 @@ class RigWatch:
         if estimate.exposures is not None:
             self._expose(estimate.exposures.cov_shared)
         is_new = self._is_new(estimate)
-        self._track.append((now_s, estimate.T_left_body))
+        self.reader.track.append((now_s, estimate.T_left_body))
         if self._redundant(estimate.T_left_body, now_s):
-            self._last = (now_s, estimate.T_left_body)
             return self._newest_added
         self._taken_s = now_s
-        found = self._residuals(estimate, now_s)
-        self._last = (now_s, estimate.T_left_body)
+        found = self.reader.read(estimate, now_s)
         if found is None:
             return np.zeros((6, 6))
         self._effects.append((found.response, estimate.cov))
@@ -358,7 +290,7 @@ class RigWatch:
         self.noise = self._nodding(found.response, estimate.T_left_body)
         added = self._added(found) + self.noise
         if added.any():  # of a body that is far off more than what is linear
-            off = log_se3(inverse(estimate.T_left_body) @ self._linear_about(estimate)[1])
+            off = log_se3(inverse(estimate.T_left_body) @ self.reader.linear_about(estimate)[1])
             added += np.outer(off, off)
         self._newest_added = added
         return added
@@ -398,7 +330,7 @@ class RigWatch:
         """Return the derivatives (n, 4) of a shot's rows by what moves to and fro."""
         return np.asarray(rows[:, 1 : 1 + self._size] @ self._to_and_fro)
 
-    def _unrest_began(self, stays: Sequence[Sequence[_ShotResiduals]]) -> bool:
+    def _unrest_began(self, stays: Sequence[Sequence[ShotResiduals]]) -> bool:
         """Compare what the shots of a test say of the right camera's rotation and a focal length.
 
         Returns:
@@ -424,7 +356,7 @@ class RigWatch:
         return noisier(given, self._moving(rows) @ (vectors * np.sqrt(np.maximum(values, 0.0))))
 
     def _weighed_parts(
-        self, stays: Sequence[Sequence[_ShotResiduals]], *, every: bool
+        self, stays: Sequence[Sequence[ShotResiduals]], *, every: bool
     ) -> list[tuple[Array, Array, float]]:
         """Return of each shot its rows, what the times of its exposures do to them (n, 10), and its weight."""
         parts = list[tuple[Array, Array, float]]()
@@ -434,7 +366,7 @@ class RigWatch:
                 parts.append((self._unrest_weighed(rows), self._unrest_weighed(rows, moved), 1.0 / len(stay)))
         return parts
 
-    def _added(self, found: _ShotResiduals) -> Array:
+    def _added(self, found: ShotResiduals) -> Array:
         """Return what the suspected errors add to the covariance (6, 6) of a pose."""
         by_parameter, by_lens = found.response[:, : self._size], found.response[:, self._size :]
         added, shape, known = self._shape.added(by_parameter), self._shape.found, 0
@@ -464,10 +396,10 @@ class RigWatch:
 
     def information(self, estimates: Sequence[PoseEstimate]) -> tuple[ResidualSums, int]:
         """Return the sums of measured poses, and how many of these differ: consecutive ones that are alike count as one."""
-        sums, stays = ResidualSums(self._size, 0.0), list[list[_ShotResiduals]]()
+        sums, stays = ResidualSums(self._size, 0.0), list[list[ShotResiduals]]()
         count, began = 0, None
         for k, estimate in enumerate(estimates):
-            found = self._residuals(estimate, float(k))
+            found = self.reader.read(estimate, float(k))
             if found is None:
                 continue
             if began is None or differ(began, estimate.T_left_body):
@@ -491,88 +423,7 @@ class RigWatch:
         body = replace(self._body, points=(1.0 + change.f[_SCALED]) * self._body.points)
         return rig, body, found if self._poses > 1 else _of_one_pose(found)
 
-    def _residuals(self, estimate: PoseEstimate, now_s: float) -> _ShotResiduals | None:
-        """Return what one shot says; None where too few of its points were measured."""
-        seen = estimate.points.seen
-        good = np.zeros(len(self._p_body), bool)
-        good[estimate.points.ids] = True
-        rows = np.flatnonzero(seen.paired & (self._row_of >= 0)[seen.ids])
-        ids = seen.ids[rows]
-        fits = good[ids]
-        if np.count_nonzero(fits) < _LEAST_POINTS:
-            return None
-        A, whole = np.empty((4 * len(ids), 6)), np.zeros((4 * len(ids), 1 + self._full))
-        size, T = self._linear_about(estimate)
-        uv = np.ascontiguousarray(seen.uv[rows])
-        noise_px2 = _differentiate(
-            *self._pair, self._half_px, size * self._p_body, self._row_of, np.asarray(ids, np.int64),
-            uv, np.ascontiguousarray(seen.cov_uv[rows]),
-            max(self.rig.sigma_px, 1e-6), np.array(T, order="C"),
-            self._velocity(estimate.T_left_body, now_s), A, whole,
-        )  # fmt: skip
-        if not np.isfinite(noise_px2):
-            return None
-        if size != 1.0:  # the residuals of a body as its file says, were they linear
-            by_size = 1 + self.rig.parameter_count
-            whole[:, by_size] /= size
-            whole[:, 0] += (size - 1.0) * whole[:, by_size]
-        self._noise_px = float(np.sqrt(noise_px2))
-        self._used_s[self._row_of[ids[fits]]] = now_s
-        roll = (uv[:, :, 1] / self._half_px[:, 1] - 1.0).repeat(2)
-        own = np.zeros((len(A), 0)) if estimate.exposures is None else moved_by(A, estimate.exposures.own[rows])
-        exposed = ExposedShot(A, roll, tuple(self._track), own)
-        if fits.all():
-            response = self._eliminated(exposed, whole)
-            return _ShotResiduals(now_s, whole, response, whole, response, (exposed, exposed))
-        kept, every = np.repeat(fits, 4), np.repeat(fits | self._displaced(A, whole[:, 0]), 4)
-        found, with_all = whole[kept], whole[every]
-        both = exposed.of(kept), exposed.of(every)
-        response, response_with_all = self._eliminated(both[0], found), self._eliminated(both[1], with_all)
-        return _ShotResiduals(now_s, found, response, with_all, response_with_all, both)
-
-    def _linear_about(self, estimate: PoseEstimate) -> tuple[float, Array]:
-        """Return the size of the body over that of its file, and the pose (4, 4), about which residuals are linear.
-
-        Those of the file and of the estimate, unless the triangulated points are of another size (Umeyama, 1991).
-        """
-        p_body, p_left = self._p_body[estimate.points.ids], estimate.points.p_left
-        middle_body, middle_left = p_body.mean(axis=0), p_left.mean(axis=0)
-        from_body, from_left = p_body - middle_body, p_left - middle_left
-        size = float(np.sqrt(np.vdot(from_left, from_left) / np.vdot(from_body, from_body)))
-        if abs(size - 1.0) <= _LINEAR:
-            return 1.0, estimate.T_left_body
-        U, _, Vt = np.linalg.svd(from_left.T @ from_body)
-        R = (U * [1.0, 1.0, np.linalg.det(U) * np.linalg.det(Vt)]) @ Vt
-        return size, pose(R, middle_left - size * (R @ middle_body))
-
-    def _eliminated(self, shot: ExposedShot, rows: Array) -> Array:
-        """Eliminate pose and times of a shot's own from rows (n, 1 + K + M); return the pose's response (6, K + M)."""
-        response, known = np.empty((6, rows.shape[1])), shot.own.size > 0
-        _eliminate(shot.A, rows, self._size, 0.0 if known else self._sync_s, response)
-        if known:
-            rows[:] = noisier(rows, shot.without_pose(shot.own))
-        return response[:, 1:]
-
-    @staticmethod
-    def _displaced(A: Array, residuals: Array) -> NDArray[np.bool_]:
-        """Return (N,) whether a point may be the body's, displaced on it: what its four residuals say of the pose (4 N, 6).
-
-        Not one that is too far off, nor one of which the two cameras see different things.
-        """
-        J, r = A[:, :3].reshape(-1, 4, 3), residuals.reshape(-1, 4)
-        H, b = np.einsum("nki,nkj->nij", J, J), np.einsum("nki,nk->ni", J, r)
-        d = np.linalg.solve(H, b[..., None])[..., 0]
-        left = np.einsum("ni,ni->n", r, r) - np.einsum("ni,ni->n", b, d)
-        return np.asarray((left < _PAIRED) & (np.linalg.norm(d, axis=1) < FURTHEST_M))
-
-    def _velocity(self, T: Array, now_s: float) -> Array:
-        """Return the velocity (6,) of the body between the shot before and this one, 1/s; zero where it is unknown."""
-        before_s, before = self._last
-        if not self._timed or not 0.0 < now_s - before_s < _APART_S:
-            return np.zeros(6)
-        return velocity(before, T, now_s - before_s)
-
-    def _sum(self, shot: _ShotResiduals, estimate: PoseEstimate) -> None:
+    def _sum(self, shot: ShotResiduals, estimate: PoseEstimate) -> None:
         """Add a shot to the stay it belongs to, which counts as one shot; test when it is time."""
         T = estimate.T_left_body
         moved = self._began is None or differ(self._began, T)
@@ -586,7 +437,7 @@ class RigWatch:
             self._decide()
 
     def _summed(
-        self, stays: Sequence[Sequence[_ShotResiduals]], *, every: bool = False, own: Apart | None = None
+        self, stays: Sequence[Sequence[ShotResiduals]], *, every: bool = False, own: Apart | None = None
     ) -> ResidualSums:
         """Return the sums of stays, of each the mean of its shots.
 
@@ -611,7 +462,7 @@ class RigWatch:
         return sums
 
     def _in_units(
-        self, stays: Sequence[Sequence[_ShotResiduals]], *, every: bool = False, own: Apart | None = None
+        self, stays: Sequence[Sequence[ShotResiduals]], *, every: bool = False, own: Apart | None = None
     ) -> ResidualSums:
         """Return the same sums of all that may have changed, in units of its priors, and of the lenses' coefficients."""
         return self._summed(stays, every=every, own=own).by(self._with_lens)
@@ -675,7 +526,7 @@ class RigWatch:
                 for tests in (self._history, self._plain):
                     tests[k : k + 2] = [total(tests[k : k + 2])]
 
-    def _tested(self, stays: Sequence[Sequence[_ShotResiduals]]) -> tuple[_Newest, RigChange]:
+    def _tested(self, stays: Sequence[Sequence[ShotResiduals]]) -> tuple[_Newest, RigChange]:
         """Return the newest test and the change by the window with it; what a passing cause explains is taken off."""
         whole, every = self._sums_of(stays, None)
         newest = self._without_lens(stays, whole, every, whole, None)
@@ -695,7 +546,7 @@ class RigWatch:
         return newest, self._estimated(self._window)
 
     def _sums_of(
-        self, stays: Sequence[Sequence[_ShotResiduals]], own: Apart | None
+        self, stays: Sequence[Sequence[ShotResiduals]], own: Apart | None
     ) -> tuple[ResidualSums, ResidualSums]:
         """Return the sums of the points that fit, and of every point."""
         whole = self._in_units(stays, own=own)
@@ -705,7 +556,7 @@ class RigWatch:
 
     def _without_lens(
         self,
-        stays: Sequence[Sequence[_ShotResiduals]],
+        stays: Sequence[Sequence[ShotResiduals]],
         whole: ResidualSums,
         every: ResidualSums,
         rest: ResidualSums,
@@ -713,26 +564,26 @@ class RigWatch:
     ) -> _Newest:
         """Return the test of what is to be explained, ``rest``, with the lenses' coefficients eliminated."""
         share, seven = len(stays) / sum(map(len, stays)), slice(1 + self._size, 1 + self._size + len(_WIDE))
-        noise, evidence = self._leftover.seen(rest, _LENS, 3 * len(self._points), seven, share)
-        test = self._leftover.without(rest, _LENS, noise).of(len(self._window.b))
+        noise, evidence = self._leftover.seen(rest, LENS, 3 * len(self.reader.points), seven, share)
+        test = self._leftover.without(rest, LENS, noise).of(len(self._window.b))
         return _Newest(whole, every, noise, evidence, test, own)
 
-    def _test_shape(self, stays: Sequence[Sequence[_ShotResiduals]], newest: _Newest, *, ends: bool) -> None:
+    def _test_shape(self, stays: Sequence[Sequence[ShotResiduals]], newest: _Newest, *, ends: bool) -> None:
         """Test for displaced points, with all shots and without those that fit worst."""
         odd = sorted(stays, key=_misfit)[len(stays) - len(stays) // _ODD :]
         every = newest.every
         usual = every.less(self._in_units(odd, every=True, own=newest.own)) if odd else every
-        self._shape.decide(*(self._leftover.without(each, _LENS, newest.noise) for each in (every, usual)), ends=ends)
+        self._shape.decide(*(self._leftover.without(each, LENS, newest.noise) for each in (every, usual)), ends=ends)
 
     def _less_worst(
-        self, moments: list[_ShotResiduals], newest: _Newest, change: RigChange, doubted: ResidualSums | None
+        self, moments: list[ShotResiduals], newest: _Newest, change: RigChange, doubted: ResidualSums | None
     ) -> tuple[_Newest, RigChange, bool]:
         """Return the newest test, the change, and whether it is one, without images that alone say so.
 
         Images that do not belong together are no moved camera; newer shots that agree with them are.
         """
         rest = newest.whole.less(self._worst(moments))
-        left_out = newest.test.less(self._leftover.without(rest, _LENS, newest.noise).of(len(newest.test.b)))
+        left_out = newest.test.less(self._leftover.without(rest, LENS, newest.noise).of(len(newest.test.b)))
         without = self._window.less(left_out)
         estimated = self._estimated(without)
         if self._is_alarm(estimated):
@@ -750,7 +601,7 @@ class RigWatch:
         return _certain(change) and costs and self._matters(change, every)
 
     def _passes(
-        self, stays: Sequence[Sequence[_ShotResiduals]], every: ResidualSums
+        self, stays: Sequence[Sequence[ShotResiduals]], every: ResidualSums
     ) -> tuple[Literal["time", "lens"] | None, Apart | None]:
         """Return what passing cause explains a test of some sums best, and its times of exposure."""
         found: Apart | None = None
@@ -773,13 +624,13 @@ class RigWatch:
 
     def _staying(self, sums: ResidualSums, excess: float, skewed: bool) -> float:
         """Return the log-evidence of what stays: cameras, body, or what the camera models lack; 0 where nothing does."""
-        M = np.delete(np.delete(sums.M, rows := slice(1 + self._size, len(sums.M) - _LENS), axis=0), rows, axis=1)
+        M = np.delete(np.delete(sums.M, rows := slice(1 + self._size, len(sums.M) - LENS), axis=0), rows, axis=1)
         M = eliminated(M, slice(1, 1 + self._size)) / excess
         values, V = np.linalg.eigh(M[1:, 1:])
         variances = np.square(_LENS_SCALES_PX)[:, None]
         ratio = 1.0 + variances * np.maximum(values, 0.0)
         lens = 0.5 * (variances * np.square(V.T @ M[1:, 0]) / ratio - np.log(ratio)).sum(axis=1)
-        return max(self._shape.evidence(sums.of(len(sums.b) - _LENS), excess, skewed), float(lens.max()))
+        return max(self._shape.evidence(sums.of(len(sums.b) - LENS), excess, skewed), float(lens.max()))
 
     def _take_back(self, begins: Sequence[float]) -> None:
         """Take back what was found since tests, by when they began, s, which something explains that passes."""
@@ -801,7 +652,7 @@ class RigWatch:
         """Return sums of the parameters and the seven numbers, in units of their priors, from those of the parameters."""
         return sums.by(self._scaled[:, : self._size + len(_WIDE)])
 
-    def _worst(self, moments: list[_ShotResiduals]) -> ResidualSums:
+    def _worst(self, moments: list[ShotResiduals]) -> ResidualSums:
         """Return the sums of the moments that fit worst: of one, or where shots have no times of a tenth of them."""
         count = 1 if self._timed else max(1, len(moments) // 10)
         worst = sorted(moments, key=lambda each: float(each.rows[:, 0] @ each.rows[:, 0]) - len(each.rows))[-count:]
@@ -810,9 +661,9 @@ class RigWatch:
     def _lens(self) -> LensError | None:
         """Return what the camera models lack; None where a change of the seven explains as much, or it hardly matters."""
         K, sums, faults = self._size, self._whole, len(_WIDE)
-        every = np.arange(K + faults + _LENS)
+        every = np.arange(K + faults + LENS)
         changed, lens = every[K : K + faults], every[K + faults :]
-        rows = np.append(every[: K + faults], len(sums.b) - _LENS + np.arange(_LENS))
+        rows = np.append(every[: K + faults], len(sums.b) - LENS + np.arange(LENS))
         H, b = sums.H[np.ix_(rows, rows)] + np.eye(len(rows)), sums.b[rows]
 
         def gained(*without: Ids) -> float:
@@ -834,8 +685,8 @@ class RigWatch:
             if (most - gained(changed[rows])) / excess > chi_square_limit(rows.stop - rows.start, _NECESSARY)
         )
         explained = (by_lens - gained(changed, lens)) / excess
-        size = self._noise_px * float(np.sqrt(2.0 * excess * explained / max(sums.freedom, 1.0)))
-        sigma = size * float(np.sqrt(_LENS / 2.0 + explained)) / explained
+        size = self.reader.noise_px * float(np.sqrt(2.0 * excess * explained / max(sums.freedom, 1.0)))
+        sigma = size * float(np.sqrt(LENS / 2.0 + explained)) / explained
         beta, cov = max((self._of_lens(sums, scale, excess) for scale in _LENS_SCALES_PX), key=lambda each: each[2])[:2]
         found = LensError(beta, cov, (size, sigma), more, needed)
         responses, covs = map(np.array, zip(*self._effects, strict=True))
@@ -845,14 +696,14 @@ class RigWatch:
 
     def _of_lens(self, sums: ResidualSums, scale_px: float, excess: float) -> tuple[Array, Array, float]:
         """Return the coefficients (M,), px, with a prior of some size, their covariance (M, M), and its log-evidence."""
-        rows = np.append(np.arange(self._size), len(sums.b) - _LENS + np.arange(_LENS))
-        scales = np.append(np.ones(self._size), np.full(_LENS, scale_px))
+        rows = np.append(np.arange(self._size), len(sums.b) - LENS + np.arange(LENS))
+        scales = np.append(np.ones(self._size), np.full(LENS, scale_px))
         inner = sums.H[np.ix_(rows, rows)] * np.outer(scales, scales) / excess + np.eye(len(rows))
         b, spread = scales * sums.b[rows] / excess, np.asarray(np.linalg.inv(inner), float)
         found = spread @ b
         evidence = 0.5 * float(b @ found - np.linalg.slogdet(inner)[1])
-        cov = scale_px**2 * spread[-_LENS:, -_LENS:]
-        return scale_px * found[-_LENS:], cov, evidence
+        cov = scale_px**2 * spread[-LENS:, -LENS:]
+        return scale_px * found[-LENS:], cov, evidence
 
     @property
     def wrong_at_rest(self) -> bool:
@@ -860,7 +711,9 @@ class RigWatch:
         parts = [] if self.suspected is None else self._to_blame(self.suspected)
         shape = self._shape.found
         if shape is not None and (points := [each for each in shape.chosen if each >= 0]):
-            moved = bool((self._used_s[points] > self._last[0] - TEST_S).any())  # else poses are of the other points
+            moved = bool(
+                (self.reader.used_s[points] > self.reader.track[-1][0] - TEST_S).any()
+            )  # else poses are of the other points
         else:
             moved = shape is not None
         return moved or (self.alarm and not set(parts) <= {"time"})
@@ -877,7 +730,7 @@ class RigWatch:
 
     def _of_part(self, change: RigChange, part: slice) -> Array:
         """Return the change of the parameters (K + M,) that a part of the seven numbers makes."""
-        return np.append(self._by_fault[:, part] @ change.f[part], np.zeros(_LENS))
+        return np.append(self._by_fault[:, part] @ change.f[part], np.zeros(LENS))
 
     def _matters(self, change: RigChange, part: slice) -> bool:
         """Return whether a part of the seven numbers moves one of the newest poses by so many of its sigmas."""
@@ -966,7 +819,7 @@ class RigWatch:
     def _stays_changed(self) -> tuple[HealthFinding, ...]:
         """Return what changed and stays, where the running test has ended."""
         shape, lens = self._shape.said, self.lens
-        by_shape = 0.0 if shape is None else self._cost_m(np.append(self._shape.change(shape), np.zeros(_LENS)))
+        by_shape = 0.0 if shape is None else self._cost_m(np.append(self._shape.change(shape), np.zeros(LENS)))
         if shape is not None and shape.chosen == (SMOOTH,) and by_shape < COSTS_M:
             shape = None  # a print as good as any: poses have it in their sigma
         if shape is not None and (lens is None or shape.chi_square > lens.chi_square):
@@ -983,12 +836,13 @@ class RigWatch:
         cov, newest = self._unrest.cov, list(self._effects)[-1:]
         if not cov.any() or not newest:
             return ()
-        covs = self._nodding(newest[0][0], self._last[1])
+        covs = self._nodding(newest[0][0], self.reader.track[-1][1])
         cost_m = float(displacement_m(np.sqrt(np.diag(covs))))
         if cost_m < COSTS_M:
             return ()
         # The one that displaces points in the images by more.
-        seen = np.diag(cov) * np.array([1.0, 1.0, 0.0, np.square(self._half_px / self._focal_px).sum(axis=1).mean()])
+        focal_px = np.array([camera.intrinsics[:2] for camera in self.rig.cameras])
+        seen = np.diag(cov) * np.array([1.0, 1.0, 0.0, np.square(self.reader.half_px / focal_px).sum(axis=1).mean()])
         return (_breathing_finding(cov, cost_m) if seen[3] > seen[:3].sum() else _nod_finding(cov[:3, :3], cost_m),)
 
     def _changed(self) -> tuple[HealthFinding, ...]:
@@ -1057,98 +911,9 @@ class RigWatch:
         return [part for part in _PARTS if self._needed(change, part)] or [max(_PARTS, key=change.alone.__getitem__)]
 
 
-def _misfit(stay: Sequence[_ShotResiduals]) -> float:
+def _misfit(stay: Sequence[ShotResiduals]) -> float:
     """Return by how much the squared residuals of a stay exceed their number, mean of its shots."""
     return sum(float(each.every[:, 0] @ each.every[:, 0]) - len(each.every) for each in stay) / len(stay)
-
-
-@kernel
-def _polynomials(x: float, y: float, values: Array) -> None:
-    """Fill values (P,) of the products of Chebyshev polynomials of a position in an image with edges at -1 and 1."""
-    T = np.empty((2, _DEGREE + 1))
-    T[:, 0], T[0, 1], T[1, 1] = 1.0, min(max(x, -1.0), 1.0), min(max(y, -1.0), 1.0)
-    for i in range(2, _DEGREE + 1):
-        for axis in range(2):
-            T[axis, i] = 2.0 * T[axis, 1] * T[axis, i - 1] - T[axis, i - 2]
-    n = 0
-    for i in range(_DEGREE + 1):
-        for k in range(_DEGREE + 1 - i):
-            values[n] = T[0, i] * T[1, k]
-            n += 1
-
-
-@kernel(
-    "b1[::1], f8[:, ::1], f8[:, ::1], i8[::1], f8[:, ::1], f8[:, ::1], const f8[:, ::1], i8[::1], const i8[::1], "
-    "const f8[:, :, ::1], const f8[:, :, :, ::1], f8, f8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1]"
-)
-def _differentiate(
-    fisheye: NDArray[np.bool_], k: Array, d: Array, counts: Ids, T_right_left: Array, half_px: Array, points: Array,
-    row_of: Ids, ids: Ids, uv: Array, cov: Array, sigma_px: float, T: Array, velocity: Array, A: Array, rows: Array,
-) -> float:  # fmt: skip
-    """Fill the derivatives A (4 N, 6) by the pose, and rows (4 N, 1 + K + M), of N points in both images; they hold zeros.
-
-    Return the mean variance of a coordinate, px^2; NaN where a point is behind a camera.
-    """
-    n, P = 2 * len(ids), 14 + counts[0] + counts[1]
-    p, side, seen, covs = np.empty((n, 3)), np.empty(n, np.int64), np.empty((n, 2)), np.empty((n, 2, 2))
-    variance = 0.0
-    for i in range(n):
-        side[i] = i % 2
-        p[i], seen[i], covs[i] = points[ids[i // 2]], uv[i // 2, i % 2], cov[i // 2, i % 2]
-        for axis in range(2):
-            covs[i, axis, axis] += sigma_px * sigma_px
-            variance += covs[i, axis, axis] / (2.0 * n)
-    W, left, B, values = np.zeros((n, 2, 2)), np.empty((n, 2)), np.zeros((2 * n, P)), np.empty(_POLYNOMIALS)
-    if not differentiate(fisheye, k, d, counts, T_right_left, p, side, seen, covs, T, W, left, A, B):
-        return np.nan
-    lens = rows.shape[1] - _LENS
-    for i in range(n):
-        c, first = side[i], 2 + P + 3 * row_of[ids[i // 2]]
-        _polynomials((seen[i, 0] + 0.5) / half_px[c, 0] - 1.0, (seen[i, 1] + 0.5) / half_px[c, 1] - 1.0, values)
-        for axis in range(2):
-            row, J = rows[2 * i + axis], A[2 * i + axis]
-            row[0] = W[i, axis, 0] * left[i, 0] + W[i, axis, 1] * left[i, 1]
-            row[1 : 1 + P] = B[2 * i + axis]
-            for j in range(3):
-                row[1 + P] += J[j] * p[i, j]
-                row[first + j] = J[j]
-            along = 0.0  # what the body's motion of a second does to this row: one of a later exposure
-            for j in range(6):
-                along += J[j] * velocity[j]
-            row[lens - 2] = ((seen[i, 1] + 0.5) / (2.0 * half_px[c, 1]) - 0.5) * along
-            row[lens - 1] = c * along
-            for uv_axis in range(2):
-                begin = lens + (2 * c + uv_axis) * _POLYNOMIALS
-                for j in range(_POLYNOMIALS):
-                    row[begin + j] = W[i, axis, uv_axis] * values[j]
-    return variance
-
-
-@kernel("f8[:, ::1], f8[:, ::1], i8, f8, f8[:, ::1]")
-def _eliminate(A: Array, rows: Array, skew: int, sync_s: float, response: Array) -> None:
-    """Eliminate the pose, of derivatives A (n, 6), and the shot's own skew from rows (n, K); fill its response (6, K).
-
-    The skew, of column ``skew`` and standard deviation ``sync_s``, s, is eliminated by a symmetric factor of what Sherman
-    and Morrison give: (1 - g u u^T)^2 = 1 - u u^T / (1 / sync_s^2 + u^T u).
-    """
-    gain = solved(product(A.T, A), product(A.T, rows))
-    for i in range(len(rows)):
-        for j in range(6):
-            for c in range(rows.shape[1]):
-                rows[i, c] -= A[i, j] * gain[j, c]
-    response[:, :] = -gain
-    u, square = rows[:, skew].copy(), 0.0
-    for i in range(len(u)):
-        square += u[i] * u[i]
-    share = sync_s * sync_s / (1.0 + sync_s * sync_s * square)
-    along = np.zeros(rows.shape[1])
-    for i in range(len(u)):
-        for c in range(len(along)):
-            along[c] += u[i] * rows[i, c]
-    along *= share / (1.0 + np.sqrt(1.0 - share * square))
-    for i in range(len(u)):
-        for c in range(len(along)):
-            rows[i, c] -= u[i] * along[c]
 
 
 def _certain(change: RigChange) -> bool:
@@ -1178,13 +943,6 @@ def _focal_changes(rig: StereoRig, size: int) -> Array:
     changes, right = np.zeros((size, 2)), rig.left.parameters.size
     changes[:2], changes[right : right + 2] = rig.left.intrinsics[:2, None], rig.right.intrinsics[:2, None]
     return changes * [0.5, 1.0] * np.where(np.arange(size) < right, 1.0, [[-1.0], [1.0]]).T
-
-
-def differ(T: Array, other: Array) -> bool:
-    """Return whether two poses (4, 4) are so far apart that their errors count as independent."""
-    by = T[:3, 3] - other[:3, 3]
-    cosine = (float(np.vdot(T[:3, :3], other[:3, :3])) - 1.0) / 2.0
-    return float(by @ by) > (_SAME * float(T[2, 3])) ** 2 or cosine < _SAME_COSINE
 
 
 def _rig_finding(change: RigChange, since_s: float | None, alone: bool) -> HealthFinding:

@@ -43,9 +43,20 @@ from armsight.data import Array, Ids, Record
 from armsight.estimate.chance import chi_square_limit
 from armsight.geometry.rotation import skew
 from armsight.loop.finding import HealthFinding, alarm_limit
+from armsight.loop.health.residuals import (
+    FURTHEST_M,
+    STEPS,
+    UNLIKE,
+    ResidualSums,
+    Since,
+    eliminated,
+    grows,
+    lined,
+    total,
+)
 
-#: A displacement may be so large, m: what is further off is another thing. So much may a focal length change, as a share.
-FURTHEST_M, _FOCAL = 5e-3, 0.05
+#: A focal length may change so much, as a share.
+_FOCAL = 0.05
 #: Less than this is not reported, m and as a share: paint and glue are not more exact.
 _LEAST_M, _LEAST_FOCAL = 1e-4, 4e-4
 #: Single shots agree with all together if the median of their share of the displacement is between these.
@@ -71,106 +82,10 @@ _CERTAIN = float(np.log(1e3))
 _STRAINS = (1e-3, 4e-3)
 #: So many newest tests, together, may be those after a change, or all; all points may be displaced by about so much, m.
 _AFTER, _BENT_M = (1, 2, 4, 8, 16), (2e-4, 1e-3)
-#: A change that goes on is looked for in more tests than this; half: steps are taken for it, double: it is found later.
-STEPS = 4
-#: What goes on is as large as a line through so many of the newest tests says; half: its sigma is 1.4 times as large,
-#: double: what came to rest, or bends, is off by more for longer.
-_NEWEST = 8
 #: Tests that are not kept are forgotten with this time constant, in tests.
 _SETTLED = 30.0
 #: The seven numbers are expected to change by such shares of their priors, which are wide.
 _SEVEN_SCALES = (1.0, 0.03, 0.003)
-#: The newest test agrees with all together unless chance explains their difference more rarely than this.
-_UNLIKE = 0.01
-
-
-class ResidualSums:
-    """What whitened residuals say of K parameters: sums over their rows, degrees of freedom, and when they began.
-
-    Attributes:
-        M: (1 + K, 1 + K) sum of the outer products of rows [residual; derivatives].
-        freedom: degrees of freedom.
-        begin_s: when the first shot was, s.
-    """
-
-    def __init__(self, size: int, begin_s: float) -> None:
-        self.M, self.freedom, self.begin_s = np.zeros((1 + size, 1 + size)), 0.0, begin_s
-
-    @property
-    def H(self) -> Array:
-        """(K, K) information."""
-        return self.M[1:, 1:]
-
-    @property
-    def b(self) -> Array:
-        """(K,) right side."""
-        return self.M[1:, 0]
-
-    @property
-    def square(self) -> float:
-        """Sum of squares of the residuals."""
-        return float(self.M[0, 0])
-
-    def add(self, other: ResidualSums, weight: float) -> None:
-        """Add another's."""
-        self.M += other.M if weight == 1.0 else weight * other.M
-        self.freedom += weight * other.freedom
-
-    def take(self, rows: Array, freedom: float) -> None:
-        """Add rows (N, 1 + K)."""
-        self.M += rows.T @ rows
-        self.freedom += freedom
-
-    def scale(self, weight: float) -> None:
-        """Weigh down what there is."""
-        self.M *= weight
-        self.freedom *= weight
-
-    def besides(self, before: ResidualSums, size: int) -> ResidualSums:
-        """Return these with what sums from before say of the first parameters, the others being zero then."""
-        found = ResidualSums(len(self.b), self.begin_s)
-        found.M, found.freedom = self.M.copy(), self.freedom + before.freedom
-        found.M[: 1 + size, : 1 + size] += before.M[: 1 + size, : 1 + size]
-        return found
-
-    def of(self, size: int) -> ResidualSums:
-        """Return those of the first parameters alone."""
-        found = ResidualSums(size, self.begin_s)
-        found.M, found.freedom = self.M[: 1 + size, : 1 + size].copy(), self.freedom
-        return found
-
-    def by(self, T: Array) -> ResidualSums:
-        """Return those of P other parameters, of which these K are T (K, P) times."""
-        found = ResidualSums(T.shape[1], self.begin_s)
-        found.M[0, 0], found.M[0, 1:], found.freedom = self.square, self.b @ T, self.freedom
-        found.M[1:, 0], found.M[1:, 1:] = found.M[0, 1:], T.T @ self.H @ T
-        return found
-
-    def over(self, variance: float) -> ResidualSums:
-        """Return these of residuals whose noise has a variance."""
-        found = self.of(len(self.b))
-        found.M /= variance
-        return found
-
-    def without(self, row: int, variance: float = 1.0) -> ResidualSums:
-        """Return these with a parameter eliminated, which has a prior of a variance; its row is of no use."""
-        rest, column = self.of(len(self.b)), self.M[1 + row]
-        rest.M -= np.outer(column, column) * (variance / (1.0 + variance * column[1 + row]))
-        return rest
-
-    def less(self, other: ResidualSums) -> ResidualSums:
-        """Return these sums without another's."""
-        rest = ResidualSums(len(self.b), self.begin_s)
-        rest.add(self, 1.0)
-        rest.add(other, -1.0)
-        return rest
-
-
-def eliminated(M: Array, rows: slice) -> Array:
-    """Return sums M (N, N) with parameters eliminated, of which each has a prior of variance 1."""
-    across = np.delete(M[rows], rows, axis=1)
-    kept = np.delete(np.delete(M, rows, axis=0), rows, axis=1)
-    return np.asarray(kept - across.T @ np.linalg.solve(M[rows, rows] + np.eye(len(across)), across))
 
 
 @dataclass(frozen=True, eq=False)
@@ -685,7 +600,7 @@ class ShapeWatch:
         d, off = d[columns], (now - d)[columns]
         each = (cov + cov_now)[np.ix_(columns, columns)]
         if float(off @ np.linalg.solve(each, off)) > newest.excess(newest.gain(columns)) * chi_square_limit(
-            len(off), _UNLIKE
+            len(off), UNLIKE
         ):
             return False
         first = 1 + self._first + 3 * which
@@ -864,81 +779,6 @@ def _one_is_enough(found: _Reduced) -> bool:
     whole, without = found
     gain, seven = without.gain(_columns([FOCAL])), without.square - whole.square
     return gain >= seven - _ALIKE * without.excess(max(gain, seven))
-
-
-def total(tests: Sequence[ResidualSums]) -> ResidualSums:
-    """Return the sums of tests."""
-    found = tests[0].of(len(tests[0].b))
-    for each in tests[1:]:
-        found.add(each, 1.0)
-    return found
-
-
-class Since:
-    """The sums of some tests since each one of them, all added up in one pass.
-
-    Args:
-        tests: in the order of time.
-        size: count of the first parameters, which never grow.
-    """
-
-    def __init__(self, tests: Sequence[ResidualSums], size: int) -> None:
-        self._begins_s, self._size = np.array([each.begin_s for each in tests]), size
-        M = np.array([each.M for each in tests])
-        ages_s = (self._begins_s - self._begins_s[-1])[:, None, None]
-        by_age = ages_s * M[:, 1 + size :]
-        self._M, self._once, self._twice, self._freedom = (
-            np.cumsum(each[::-1], axis=0)[::-1]
-            for each in (M, by_age, ages_s * by_age[:, :, 1 + size :], np.array([each.freedom for each in tests]))
-        )
-
-    def plain(self, k: int) -> ResidualSums:
-        """Return the sums of the tests from one on."""
-        found = ResidualSums(self._M.shape[1] - 1, float(self._begins_s[k]))
-        found.M, found.freedom = self._M[k].copy(), float(self._freedom[k])
-        return found
-
-    def ramped(self, k: int) -> ResidualSums:
-        """Return the same where all but the first parameters grow with time, from zero to what they are now."""
-        found, rest = self.plain(k), slice(1 + self._size, None)
-        span_s = float(self._begins_s[-1] - self._begins_s[k])
-        if span_s > 0.0:  # else all are of now
-            once, twice = self._once[k] / span_s, self._twice[k] / span_s**2
-            found.M[rest] += once
-            found.M[:, rest] += once.T
-            found.M[rest, rest] += twice
-        return found
-
-
-def lined(tests: Sequence[ResidualSums], before: Array, columns: Ids) -> tuple[Array, Array]:
-    """Return what the newest tests say of parameters that are on a line in time, and the covariance (2 C, 2 C).
-
-    Args:
-        tests: since these began to change, in units of the priors.
-        before: (1 + K, 1 + K) what those before say of the first parameters, which are constant.
-        columns: (C,) rows of the others.
-
-    Returns:
-        (2 C,) what they are at the newest test, and by how much they grew since the first of the newest; covariance.
-    """
-    newest = tests[-_NEWEST:]
-    size, count, last_s = len(before), len(columns), newest[-1].begin_s
-    span_s, kept = max(last_s - newest[0].begin_s, 1e-9), np.append(np.arange(size), 1 + columns)
-    M, by = np.zeros((size + 2 * count, size + 2 * count)), np.eye(size + count, size + 2 * count)
-    M[:size, :size] = before
-    for each in newest:
-        by[size:, size + count :] = np.eye(count) * (each.begin_s - last_s) / span_s
-        M += by.T @ each.M[np.ix_(kept, kept)] @ by
-    M = eliminated(M, slice(1, size))
-    cov = np.asarray(np.linalg.inv(M[1:, 1:] + np.eye(2 * count)))
-    return cov @ M[1:, 0], cov
-
-
-def grows(line: Array, cov: Array) -> bool:
-    """Return whether a line of :func:`lined` grew by more than chance, its covariance (2 C, 2 C) that of the noise."""
-    count = len(line) // 2
-    by = line[count:]
-    return float(by @ np.linalg.solve(cov[count:, count:], by)) > chi_square_limit(count, _UNLIKE)
 
 
 def _differ(views: Array) -> bool:

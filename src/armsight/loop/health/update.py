@@ -25,8 +25,8 @@ import numpy as np
 from armsight.data import Array, Body, Correspondences, Missed, PoseEstimate, Record
 from armsight.geometry.pose import inverse, log_se3
 from armsight.loop.finding import HealthFinding
+from armsight.loop.health.residuals import ResidualSums
 from armsight.loop.health.rig import RigWatch, free_directions
-from armsight.loop.health.shape import ResidualSums
 from armsight.vision.detections import SeenShot
 from armsight.vision.match import epipolar_distances, gate
 from armsight.vision.pose.locate import locate
