@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+import time
 import urllib.error
 import urllib.request
 from datetime import datetime, timedelta
@@ -130,6 +131,14 @@ def test_one_name_is_one_process(cell_at, port, hub_at, wait, monkeypatch, tmp_p
     cell_at(f"a@127.0.0.1:{port}")
     hub = hub_at(port)
     assert wait(lambda: (f := shown(hub).get("a", {})).get("level") == 1 and f)["why"].startswith("2 processes")
+
+
+def test_no_thread_of_a_cell_is_in_zenoh_when_its_command_ends(cell_at, port):
+    """CPython before 3.14 ends such a thread by unwinding it, and Rust aborts the process: exit code 134."""
+    cell = cell_at(f"a@127.0.0.1:{port}")  # where no hub is
+    time.sleep(0.4)  # it begins to connect after 0.25 s, and tries for a second
+    cell.close()
+    assert not cell._post.is_alive()
 
 
 def with_line(path, old, new):

@@ -28,6 +28,8 @@ from armsight.vision.sources.bag.states import read_joints
 from armsight.vision.sources.bag.tags import TAGS, read_tags
 from armsight.vision.sources.folder import INDEX
 
+_PROPERTIES = {"command": "replay"}
+
 
 @dataclass(frozen=True)
 class Request:
@@ -77,7 +79,7 @@ def _of_run(request: Request, recorded: RecordedRun, say: Callable[[str], None])
     if request.references is not None and changed:
         raise InputError("--references goes with the run's own arm and estimator; leave out --arm and --estimator")
     beside = None if request.references is None else Fused.of(request.references)
-    with contextlib.closing(open_streams(request.streams, Published(rig, body, arm), say)) as publisher:
+    with contextlib.closing(open_streams(request.streams, Published(rig, body, arm, _PROPERTIES), say)) as publisher:
         return replay_run(
             recorded,
             arm,
@@ -124,7 +126,7 @@ def _of_source(request: Request, recorded: RecordedRun | None, say: Callable[[st
     shots, notes = read_tags(spec, target)
     for note in notes:
         say(f"note: {note}")
-    with contextlib.closing(open_streams(request.streams, Published(rig, body), say)) as publisher:
+    with contextlib.closing(open_streams(request.streams, Published(rig, body, properties=_PROPERTIES), say)) as publisher:
         replayed = replay_tags(rig, body, shots, pace=Pace(request.rate), publisher=publisher)
     return _with_joints(replayed, bag, say)
 
@@ -135,7 +137,8 @@ def _of_images(request: Request, source: Source, bag: Bag | None, say: Callable[
     for note in notes_of(source):
         say(f"note: {note}")
     target, rig = open_target(request.target), _rig(request, bag, {})
-    with contextlib.closing(open_streams(request.streams, Published(rig, target.body), say)) as publisher:
+    published = Published(rig, target.body, properties=_PROPERTIES)
+    with contextlib.closing(open_streams(request.streams, published, say)) as publisher:
         replayed = replay_source(rig, target, source, pace=Pace(request.rate), publisher=publisher)
     return replayed if bag is None else _with_joints(replayed, bag, say)
 

@@ -140,7 +140,7 @@ class CellSink(Sink):
         self._held, self._began_utc = set[float](), time.time()
         self._session: Any = None
         self._declared: list[Any] = []
-        self._ending = threading.Event()
+        self._ending, self._end_at = threading.Event(), math.inf
         self._post = threading.Thread(target=self._posting, name="cell", daemon=True)
 
     def start(self) -> None:
@@ -200,8 +200,9 @@ class CellSink(Sink):
     def finish(self) -> None:
         """Say that the command ended, send what waits, and leave."""
         self._event("ended", "info", f"armsight {self._mode} ended after {self._shots} shots")
+        self._end_at = time.monotonic() + _END_S
         self._ending.set()
-        self._post.join(2 * _END_S)
+        self._post.join()  # it waits for zenoh a second or two; a thread in a library when Python ends aborts the process
         self._put_state()
         if self._session is not None:
             with suppress(Exception):
@@ -245,7 +246,7 @@ class CellSink(Sink):
 
         while True:
             ending = self._ending.wait(_POST_S)
-            if self._session is None:
+            if self._session is None and not (ending and notes):
                 try:
                     self._open()
                 except Exception:  # noqa: BLE001 - of the library: whatever it is, it is tried again
@@ -275,7 +276,7 @@ class CellSink(Sink):
         self._session = session
 
     def _send_events(self) -> bool:
-        """Have waiting events stored, oldest first, until none waits, or False: the hub does not answer."""
+        """Have waiting events stored, oldest first, while there is time; False: the hub does not answer."""
         while True:
             with self._lock:
                 events = self._outbox.waiting(_BATCH_BYTES)
@@ -292,6 +293,8 @@ class CellSink(Sink):
                 return False
             with self._lock:
                 self._outbox.confirm(stored)
+            if time.monotonic() > self._end_at:
+                return True
 
     def _image(self) -> bytes:
         """Return the newest left image, small, as JPEG; nothing where there is none."""

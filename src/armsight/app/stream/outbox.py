@@ -65,7 +65,7 @@ class Outbox:
                 if "locked" in str(error)
                 else error
             )
-            raise InputError(f"--stream cell:{cell}: {folder}: {why}") from None
+            raise InputError(f"cell {cell}: {folder}: {why}") from None
         self._left = _BURST
         self._at = time.monotonic()
         self.thinned = 0
