@@ -202,9 +202,13 @@ PRISMATIC = (
         ),
         (changed('<parent link="base" />', '<parent link="tool" />'), "hangs on itself|do not follow"),
         (changed('<parent link="link3" />', '<parent link="link1" />'), "do not follow one another"),
-        (changed(RPY, 'rpy="-1.57 0"'), "joint 'joint2': <origin rpy=\"-1.57 0\"> must be three numbers"),
-        (changed(RPY, 'rpy="a b c"'), "must be three numbers"),
-        (changed(RPY, 'rpy="0 0 nan"'), "must be three numbers"),
+        (changed(RPY, 'rpy="-1.57 0"'), "joint 'joint2': <origin rpy=\"-1.57 0\"> must be 3 numbers"),
+        (changed(RPY, 'rpy="a b c"'), "must be 3 numbers"),
+        (changed(RPY, 'rpy="0 0 nan"'), "must be 3 numbers"),
+        (changed(RPY, 'quat_xyzw="0 0 0 1"'), "joint 'joint2': <origin> has quat_xyzw, which needs <robot version"),
+        (changed("<robot", '<robot version="1.1"').replace(RPY, f'{RPY} quat_xyzw="0 0 0 1"'), "and no rpy beside it"),
+        (changed("<robot", '<robot version="1.1"').replace(RPY, 'quat_xyzw="0 0 1"'), "must be 4 numbers"),
+        (changed("<robot", '<robot version="1.1"').replace(RPY, 'quat_xyzw="0 0 0 0"'), "quat_xyzw of length zero"),
         (changed('xyz="0 0 1"', 'xyz="0 0 0"'), "joint 'joint1': <axis> is zero"),
         (changed("<limit", "<boundary"), "not XML|no <limit>"),
         (
@@ -329,6 +333,26 @@ def test_what_plain_urdf_leaves_out_is_filled_in(tmp_path):
     np.testing.assert_allclose(arm.qddd_max, arm.qdd_max / 0.1)
     assert (arm.home == 0).all()
     assert arm.source == "URDF arm.urdf"
+
+
+@pytest.mark.parametrize("version", ["1.1", "1.2"])
+def test_origins_with_quaternions_are_those_with_angles(version, tmp_path):
+    path = tmp_path / "arm.urdf"
+    write_urdf(SIX_R, path)
+    robot = ET.parse(path).getroot()
+    robot.set("version", version)
+    for origin in robot.iterfind("joint/origin"):
+        angles = np.array(origin.attrib.pop("rpy").split(), float)
+        origin.set("quat_xyzw", " ".join(map(repr, (2 * Rotation.from_euler("xyz", angles).as_quat()).tolist())))
+    expected = [chain_pose(path, q) for q in probes(5)]
+    path.write_text(ET.tostring(robot, encoding="unicode"))
+    np.testing.assert_allclose(read_urdf(path).forward(probes(5)), expected, atol=1e-12)
+    pinocchio = pytest.importorskip("pinocchio")
+    peer = pinocchio.buildModelFromUrdf(str(path))
+    data = peer.createData()
+    for q, T in zip(probes(5), expected, strict=True):
+        pinocchio.framesForwardKinematics(peer, data, q)
+        np.testing.assert_allclose(data.oMf[peer.getFrameId("tool")].homogeneous, T, atol=1e-12)
 
 
 def test_nothing_half_written_is_left(tmp_path):

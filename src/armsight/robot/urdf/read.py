@@ -2,8 +2,10 @@
 
 In: a URDF file with four to seven rotary joints (revolute or continuous) in a row, and fixed ones anywhere; which joints of
 its tree are the arm's: :mod:`armsight.robot.urdf.tree`.
-Masses and shapes are ignored. Out: an :class:`Arm` with a standard Denavit-Hartenberg table. What is written, and where
-that goes beyond plain URDF, stands in :mod:`armsight.robot.urdf.write`.
+Masses and shapes are ignored. An origin's rotation is ``rpy``, or from URDF 1.1 on ``quat_xyzw``: urdfdom 6.0.0 reads that
+where ``<robot version>`` is 1.1 or later and ignores it where it is older or missing, so here the latter is rejected.
+Out: an :class:`Arm` with a standard Denavit-Hartenberg table. What is written, and where that goes beyond plain URDF,
+stands in :mod:`armsight.robot.urdf.write`.
 
 From a chain of axes to the table: between two axes in space there is always Rz(beta) Tz(d) Tx(a) Rx(alpha) Tz(e) Rz(gamma):
 along the first to the foot of their common normal, over it, and along the second. Rz(gamma) Tz(e) stands at the next
@@ -24,7 +26,7 @@ from armsight.data import Array
 from armsight.errors import InputError
 from armsight.files import read_text
 from armsight.geometry.pose import pose
-from armsight.geometry.rotation import exp_so3
+from armsight.geometry.rotation import exp_so3, from_quaternion_wxyz
 from armsight.robot.kinematics.arm import Arm
 from armsight.robot.kinematics.table import exact_cos_sin
 from armsight.robot.urdf.tree import MOVING, Joint, Tree
@@ -69,7 +71,8 @@ def parse_urdf(text: str, path: str | Path, *, tool_link: str | None = None) -> 
         raise InputError(f"{path}: the outermost element is <{robot.tag}>, must be <robot>")
     if any("xacro" in element.tag for element in robot.iter() if isinstance(element.tag, str)):
         raise InputError(f"{path}: holds xacro macros; expand them first: xacro {Path(path).name} > arm.urdf")
-    joints = [_joint(path, element) for element in robot.findall("joint")]
+    quaternions = robot.get("version", "1.0") != "1.0"
+    joints = [_joint(path, element, quaternions) for element in robot.findall("joint")]
     chain = Tree(path, [element.get("name") for element in robot.findall("link")], joints).chain(tool_link)
     _check_units(path, list(dropwhile(lambda joint: not joint.rotary, chain)))
     return _arm(path, robot, chain, [joint for joint in chain if joint.rotary])
@@ -90,8 +93,8 @@ def _check_units(path: str | Path, chain: list[Joint]) -> None:
             raise InputError(f"{where}: its <origin> has the angle {angle:g} in rpy; expected are radians: write these")
 
 
-def _joint(path: str | Path, element: ET.Element) -> Joint:
-    """Read what every joint has."""
+def _joint(path: str | Path, element: ET.Element, quaternions: bool) -> Joint:
+    """Read what every joint has; ``quaternions``: the file's version has them."""
     name = element.get("name")
     if name is None:
         raise InputError(f"{path}: a <joint> has no name")
@@ -107,8 +110,18 @@ def _joint(path: str | Path, element: ET.Element) -> Joint:
         links.append(link)
     origin = element.find("origin")
     xyz, rpy = (_vector(where, origin, key, "0 0 0") for key in ("xyz", "rpy"))
-    T = pose(rotation_of(rpy), xyz)
-    return Joint(name, kind, links[0], links[1], T, element)
+    R = rotation_of(rpy)
+    if origin is not None and "quat_xyzw" in origin.attrib:
+        if "rpy" in origin.attrib or not quaternions:
+            raise InputError(
+                f'{where}: <origin> has quat_xyzw, which needs <robot version="1.1"> or later and no rpy beside it: other '
+                "programs would read another rotation"
+            )
+        q = _vector(where, origin, "quat_xyzw", "0 0 0 1")
+        if not q.any():
+            raise InputError(f"{where}: <origin> has a quat_xyzw of length zero")
+        R = from_quaternion_wxyz(q[[3, 0, 1, 2]])
+    return Joint(name, kind, links[0], links[1], pose(R, xyz), element)
 
 
 def rotation_of(rpy: Array) -> Array:
@@ -121,15 +134,15 @@ def rotation_of(rpy: Array) -> Array:
 
 
 def _vector(where: str, element: ET.Element | None, key: str, default: str) -> Array:
-    """Read three numbers of an attribute."""
+    """Read the numbers of an attribute, as many as its default has."""
     text = default if element is None else element.get(key, default)
     tag = "" if element is None else element.tag
     try:
         values = np.array([float(word) for word in text.split()])
     except ValueError:
         values = np.zeros(0)
-    if values.shape != (3,) or not np.isfinite(values).all():
-        raise InputError(f'{where}: <{tag} {key}="{text}"> must be three numbers')
+    if len(values) != len(default.split()) or not np.isfinite(values).all():
+        raise InputError(f'{where}: <{tag} {key}="{text}"> must be {len(default.split())} numbers')
     return values
 
 
