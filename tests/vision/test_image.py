@@ -72,6 +72,39 @@ def test_exif_orientation_is_ignored(tmp_path):
     np.testing.assert_array_equal(read_image(path), plain)
 
 
+def with_orientation(tiff, orientation):
+    """Give a little-endian TIFF the orientation: a copy of its first directory with the tag, at the end."""
+    (at,) = struct.unpack_from("<I", tiff, 4)
+    (count,) = struct.unpack_from("<H", tiff, at)
+    entries = [tiff[at + 2 + 12 * k :][:12] for k in range(count)]
+    entries = [one for one in entries if one[:2] != struct.pack("<H", 274)]
+    entries.append(struct.pack("<HHIHH", 274, 3, 1, orientation, 0))
+    directory = struct.pack("<H", len(entries)) + b"".join(
+        sorted(entries, key=lambda one: struct.unpack("<H", one[:2]))
+    )
+    return tiff[:4] + struct.pack("<I", len(tiff)) + tiff[8:] + directory + bytes(4)
+
+
+@pytest.mark.opencv
+@pytest.mark.parametrize("image", [GREY, COLOUR])
+@pytest.mark.parametrize(
+    ("orientation", "shown"),
+    [(1, lambda a: a), (3, lambda a: a), (6, lambda a: a), (8, lambda a: a), (2, np.fliplr), (4, np.flipud)],
+)
+def test_a_tiffs_rotation_is_ignored_and_its_mirrored_rows_are_put_right(
+    tmp_path, image, orientation, shown, monkeypatch
+):
+    path = stored(tmp_path, "a.tiff", image)
+    path.write_bytes(with_orientation(path.read_bytes(), orientation))
+    np.testing.assert_array_equal(read_image(path), shown(image))
+    monkeypatch.setattr("armsight.vision.image.IMAGE_MB", 1e-6)  # as a large file is read
+    if orientation in (6, 8):  # which OpenCV's imread, unlike imdecode, does not read
+        with pytest.raises(InputError, match="not an image that can be read"):
+            read_image(path)
+    else:
+        np.testing.assert_array_equal(read_image(path), shown(image))
+
+
 def test_a_thumbnail_end_is_not_the_end(tmp_path):
     path = stored(tmp_path, "a.jpg", COLOUR)
     data = with_exif(path.read_bytes(), 1, thumbnail=path.read_bytes())

@@ -8,10 +8,13 @@ agree with OpenCV's bit by bit, and it is not a dependency.)
 from __future__ import annotations
 
 import contextlib
+import io
 import os
+import struct
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from typing import IO
 
 import cv2
 import numpy as np
@@ -78,8 +81,36 @@ def _png_complete(data: bytes) -> bool:
 _FORMATS = {b"\xff\xd8\xff": ("JPEG", jpeg_in), b"\x89PNG\r\n\x1a\n": ("PNG", _png_complete)}
 
 
+#: First numbers of a TIFF and of a BigTIFF -> their header, number of entries and entry, as struct has them.
+_TIFF = {42: ("4xI", "H", "HHIH2x"), 43: ("8xQ", "Q", "HHQH6x")}
+_ORIENTATION = 274  # tag of a TIFF's first directory, and of EXIF
+#: Orientation -> by how many right angles, counterclockwise, OpenCV's image is rotated to be as stored.
+_BACK = {3: 2, 6: 1, 8: 3}
+
+
+def _right_angles(file: IO[bytes]) -> int:
+    """Return by how many right angles, counterclockwise, OpenCV's image of a file must be rotated to be as stored.
+
+    OpenCV (5.0.0) applies a TIFF's orientation under every flag, IMREAD_UNCHANGED included, and a JPEG's, PNG's, WebP's not
+    under that one. Where a TIFF's is a mirroring, its rows are stored mirrored, and OpenCV's image is the one to take.
+    """
+    with contextlib.suppress(struct.error):
+        start = file.read(16)
+        order = {b"II": "<", b"MM": ">"}.get(start[:2])
+        layout = _TIFF.get(struct.unpack_from(f"{order}H", start, 2)[0]) if order else None
+        if layout is not None:
+            header, number, entry = (f"{order}{part}" for part in layout)
+            file.seek(struct.unpack_from(header, start)[0])
+            (count,) = struct.unpack(number, file.read(struct.calcsize(number)))
+            entries = file.read(min(count, 0xFFFF) * struct.calcsize(entry))
+            return next(
+                (_BACK.get(value, 0) for tag, *_, value in struct.iter_unpack(entry, entries) if tag == _ORIENTATION), 0
+            )
+    return 0
+
+
 def read_image(path: str | Path) -> Image:
-    """Read an image file as it is stored; an EXIF orientation is ignored, for pixels must stay where the camera has them.
+    """Read an image file as it is stored; an orientation is ignored, for pixels must stay where the camera has them.
 
     Returns:
         (H, W) grey or (H, W, 3) BGR, uint8 or uint16.
@@ -89,11 +120,13 @@ def read_image(path: str | Path) -> Image:
     """
     with opened(path, _RAW_MB) as file:
         piecewise = os.fstat(file.fileno()).st_size > IMAGE_MB * 1e6 and not file.read(8).startswith(tuple(_FORMATS))
+        file.seek(0)
+        back = _right_angles(file)
     if piecewise:
         image = None
         with _quiet(), contextlib.suppress(cv2.error):
             image = cv2.imread(os.fspath(path), cv2.IMREAD_UNCHANGED)
-        return _checked(image, path)
+        return _checked(image, path, back)
     data = read_bytes(path, IMAGE_MB)
     if not data:
         raise InputError(f"{path}: the file is empty")
@@ -110,11 +143,11 @@ def decoded(data: bytes, path: str | Path) -> Image:
     image = None
     with _quiet(), contextlib.suppress(cv2.error):
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    return _checked(image, path)
+    return _checked(image, path, _right_angles(io.BytesIO(data)))
 
 
-def _checked(image: Image | None, path: str | Path) -> Image:
-    """Return an image as OpenCV decoded it without its alpha; reject None, and what has not 8 or 16 bits."""
+def _checked(image: Image | None, path: str | Path, back: int) -> Image:
+    """Return OpenCV's image without its alpha, rotated back; reject None, and what has not 8 or 16 bits."""
     if image is None:
         raise InputError(
             f"{path}: not an image that can be read (JPEG, PNG, TIFF, BMP, PGM, ... of {MOST_PIXELS >> 20} Mpx at most)"
@@ -125,7 +158,7 @@ def _checked(image: Image | None, path: str | Path) -> Image:
         image = image[:, :, :3]
     elif image.ndim == 3 and image.shape[2] == 1:
         image = image[:, :, 0]
-    return np.ascontiguousarray(image)
+    return np.ascontiguousarray(np.rot90(image, back))
 
 
 #: An image is dark where all but this share of its pixels are below so many of 255 grey levels.

@@ -126,7 +126,9 @@ def _of_source(request: Request, recorded: RecordedRun | None, say: Callable[[st
     shots, notes = read_tags(spec, target)
     for note in notes:
         say(f"note: {note}")
-    with contextlib.closing(open_streams(request.streams, Published(rig, body, properties=_PROPERTIES), say)) as publisher:
+    with contextlib.closing(
+        open_streams(request.streams, Published(rig, body, properties=_PROPERTIES), say)
+    ) as publisher:
         replayed = replay_tags(rig, body, shots, pace=Pace(request.rate), publisher=publisher)
     return _with_joints(replayed, bag, say)
 
