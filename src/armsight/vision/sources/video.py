@@ -4,8 +4,8 @@ In: file names. Out: one shot a frame, with the file's own time stamps. Frames a
 one recorder dropped costs one shot and does not shift the rest.
 
 :class:`Film` decodes by PyAV, which brings FFmpeg with the decoders that cameras and LeRobot use (AV1 among them, which
-opencv-python's wheels open, count and do not decode). A rotation by right angles that a phone noted for players is
-applied, as OpenCV's reader does.
+opencv-python's wheels open, count and do not decode). A rotation by right angles or a mirroring that was noted for players
+is applied, as ffmpeg does; PyAV's frame.rotation (18.1.0) and OpenCV (5.0.0) take a mirroring for a rotation, or for none.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import os
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -202,9 +202,9 @@ class Film:
         self._frames: Iterator[VideoFrame] = self._decoded()
         first = list(itertools.islice(self._frames, 1))  # the rotation stands in the frames alone
         self._frames = itertools.chain(first, self._frames)
-        self._right_angles = round(first[0].rotation / 90) if first else 0  # counterclockwise
+        self._swapped, self._steps = _shown(first[0]) if first else (False, (1, 1))
         size = (self._stream.width, self._stream.height)
-        self.size_px = size[::-1] if self._right_angles % 2 else size
+        self.size_px = size[::-1] if self._swapped else size
 
     def _problem(self) -> str | None:
         """Return why the stream cannot be decoded."""
@@ -240,7 +240,8 @@ class Film:
         """Return the current frame, (H, W, 3) BGR, uint8."""
         assert self._frame is not None
         image = self._frame.to_ndarray(format="bgr24")
-        return np.ascontiguousarray(np.rot90(image, self._right_angles))
+        down, right = self._steps
+        return np.ascontiguousarray((image.transpose(1, 0, 2) if self._swapped else image)[::down, ::right])
 
     def seek(self, t_s: float) -> None:
         """Go to a frame at a time or before it, from which the frames up to that time can be decoded."""
@@ -253,6 +254,18 @@ class Film:
         self._frames = iter(())
         self._frame = None
         self._container.close()
+
+
+def _shown(frame: VideoFrame) -> tuple[bool, tuple[int, int]]:
+    """Return whether a frame is shown with its rows as columns, and then in which steps, 1 or -1, down and right.
+
+    The display matrix (ISO 14496-12, 8.3.2) takes pixel (x, y) to (a x + c y, b x + d y), less a translation.
+    """
+    matrix: Any = frame.side_data.get("DISPLAYMATRIX")
+    a, b, _, c, d = (1, 0, 0, 0, 1) if matrix is None else np.frombuffer(bytes(matrix), np.int32)[:5].tolist()
+    swapped = abs(b) + abs(c) > abs(a) + abs(d)
+    right, down = (c, b) if swapped else (a, d)
+    return swapped, (-1 if down < 0 else 1, -1 if right < 0 else 1)
 
 
 class _File(Film):
