@@ -11,6 +11,7 @@ import importlib
 import os
 import re
 import sys
+from collections.abc import Callable
 
 import click
 
@@ -131,28 +132,45 @@ def main() -> None:
 
 
 def run(arguments: list[str]) -> int:
-    """Run a command and return its exit code; what is wrong is said on stderr."""
+    """Run a command and return its exit code; what is wrong is said on stderr.
+
+    What the command appends to its context's ``obj`` is called with the exit code, and what is wrong.
+    """
+    at_exit: list[Callable[[int, str], None]] = []
+    code, wrong = 1, "a mistake in armsight"
     try:
-        code = group.main(arguments, prog_name="armsight", standalone_mode=False, color=colour())
+        code, wrong = _run(arguments, at_exit)
+        if wrong:
+            print_error(wrong)
+    finally:
+        for call in at_exit:
+            call(code, wrong)
+    return code
+
+
+def _run(arguments: list[str], at_exit: list[Callable[[int, str], None]]) -> tuple[int, str]:
+    """Run a command and return its exit code, and what is wrong."""
+    try:
+        code = group.main(arguments, prog_name="armsight", standalone_mode=False, color=colour(), obj=at_exit)
         if sys.stdout is not None:
             sys.stdout.flush()
-        return code if isinstance(code, int) else 0
+        return code if isinstance(code, int) else 0, ""
     except (click.exceptions.Abort, KeyboardInterrupt):
         click.echo("armsight: interrupted", err=True)
-        return 130
+        return 130, ""
     except click.exceptions.NoArgsIsHelpError as error:  # a group by itself: its help
         error.show()
     except click.ClickException as error:
-        print_error(_usage_text(error))
+        return 2, _usage_text(error)
     except ArmsightError as error:
-        print_error(str(error))
+        return 2, str(error)
     except BrokenPipeError:
         silence_stdout()
-        return 0
+        return 0, ""
     except OSError as error:  # errors of files and devices are ArmsightErrors: only the output is left
         silence_stdout()
-        print_error(f"{error.filename or 'the output'}: cannot be written: {error.strerror or error}")
-    return 2
+        return 2, f"{error.filename or 'the output'}: cannot be written: {error.strerror or error}"
+    return 2, ""
 
 
 def _usage_text(error: click.ClickException) -> str:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import socket
 import subprocess
 import sys
 import time
@@ -9,6 +10,7 @@ import urllib.error
 import urllib.request
 from datetime import datetime, timedelta
 
+import cv2
 import numpy as np
 import pytest
 
@@ -67,7 +69,7 @@ def fetched(hub, path):
 
 
 def test_a_cell_that_began_before_its_hub_arrives_with_all_its_events(hub_at, cell_at, port, wait):
-    cell = cell_at(f"table-1@127.0.0.1:{port}")
+    cell = cell_at(f"table-1@127.0.0.1:{port}", temperatures_c=lambda: np.array([30.0, 41.2]))
     cell.put(NoteDatum(1.0, "rig: a camera moved", "warning", ("rig: a camera moved",)))
     hub = hub_at(port)
     for number in range(30):
@@ -76,6 +78,7 @@ def test_a_cell_that_began_before_its_hub_arrives_with_all_its_events(hub_at, ce
     found = wait(lambda: (f := shown(hub)["table-1"])["about"] and f)
     assert found["about"]["mode"] == "measure"
     assert (found["level"], found["why"]) == (3, "rig: a camera moved")
+    assert found["state"]["temperature_c"] == 41.2
     assert [each["kind"] for each in json.loads(fetched(hub, "events?q=camera+moved"))] == ["health"]
     assert fetched(hub, "image?site=site&cell=table-1").startswith(b"\xff\xd8")
     assert 'armsight_cell_missed_ratio{site="site",cell="table-1"}' in fetched(hub, "metrics").decode()
@@ -141,6 +144,24 @@ def test_no_thread_of_a_cell_is_in_zenoh_when_its_command_ends(cell_at, port):
     assert not cell._post.is_alive()
 
 
+def test_the_exit_code_of_a_command_is_its_last_event(hub_at, port, tmp_path, wait, armsight):
+    example_rig().save(tmp_path / "rig.json")
+    for side in ("left", "right"):
+        cv2.imwrite(str(tmp_path / f"{side}0.png"), GREY)
+    hub = hub_at(port)
+    shot, cell = ("--source", tmp_path, "--stream"), f"cell:a@127.0.0.1:{port}"
+    said = armsight("measure", tmp_path / "rig.json", "--target", "chessboard:9x6:25mm", *shot, cell)
+    assert said.code == 2
+    found = wait(lambda: (f := shown(hub).get("a", {})).get("level") == 1 and f)
+    assert "ended after 0 shots with exit code 2: " in found["why"]
+    assert found["why"].endswith("measure at the size the rig was calibrated at")
+    assert not hub._store.known()[0].sessions
+    assert hub._store.known()[0].need(0.0)[::2] == (1, found["why"])  # after a restart, too
+    assert armsight("record", tmp_path, "-o", tmp_path / "kept", "--stream", cell).code == 0
+    found = wait(lambda: (f := shown(hub)["a"])["level"] == -1 and f)
+    assert found["why"] == "armsight record ended after 1 shots with exit code 0"
+
+
 def with_line(path, old, new):
     """Change a file, and return its path."""
     path.write_text(path.read_text().replace(old, new))
@@ -157,6 +178,31 @@ def test_a_cell_writes_below_its_own_name_alone(hub_at, cell_at, port, tmp_path,
     wait(lambda: shown(hub).get("a", {}).get("state"))
     assert set(shown(hub)) == {"a"}
     assert {each["cell"] for each in hub._store.events()} == {"a"}
+
+
+def test_a_connection_without_a_key_is_rejected_and_that_is_an_event(port, tmp_path, wait):
+    make_keys(tmp_path / "keys", "lab", ["a"], "127.0.0.1", port)
+    listen = ["--listen", f"tls/127.0.0.1:{port}", "--keys", tmp_path / "keys", "--http", "127.0.0.1:0"]
+    command = [sys.executable, "-m", "armsight", "hub", *listen, "-o", tmp_path / "hub", "--json"]
+    hub = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    address = json.loads(hub.stdout.readline())["address"]
+    for _ in range(3):
+        with socket.create_connection(("127.0.0.1", port)) as plain:
+            plain.sendall(b"GET / HTTP/1.0\r\n\r\n")
+            plain.recv(100)
+
+    def events():
+        with urllib.request.urlopen(address + "events", timeout=5) as answer:
+            return json.load(answer)
+
+    found = wait(events)
+    assert [(each["site"], each["cell"], each["kind"]) for each in found] == [
+        ("lab", "hub", "rejected")
+    ]  # not one each
+    hub.terminate()
+    out, err = hub.communicate()
+    assert out == ""
+    assert f"note: {found[0]['text']}\n" in err
 
 
 def test_a_cell_holds_for_the_key_of_its_site_alone(hub_at, cell_at, port, tmp_path, wait, monkeypatch):

@@ -233,6 +233,16 @@ def runs(folder):
     return folder
 
 
+def test_the_oldest_events_are_forgotten(tmp_path, monkeypatch):
+    monkeypatch.setattr("armsight.app.hub.store._MOST", 10)
+    store = Store(tmp_path)
+    for n in range(1, 26):
+        store.add_events("lab", "a", {"outbox": "x", "events": [{"n": n, "t": 0.0}]}, float(n))
+    store.flush()
+    assert sorted(each["n"] for each in store.events()) == list(range(16, 26))
+    store.close()
+
+
 def test_a_push_goes_on_where_it_was(tmp_path):
     folder, store, cell = runs(tmp_path / "runs"), tmp_path / "store", Cell("a", "lab")
     done = push(cell, folder, str(store), 100.0, lambda sent: None)

@@ -35,7 +35,7 @@ _CLOCK_S = 2.0
 #: lamp is off.
 _MISSED = 0.5
 #: Numbers of a state that are stored, with what is shown of them.
-NUMBERS = ("rate_hz", "shots", "missed", "error_mm", "sigma_mm", "tilt_mdeg", "size_ppm")
+NUMBERS = ("rate_hz", "shots", "missed", "error_mm", "sigma_mm", "tilt_mdeg", "size_ppm", "temperature_c")
 #: What drifts -> its unit and what a person calls it.
 DRIFTS = {
     "tilt_mdeg": ("mdeg", "one camera rotates against the other"),
@@ -71,7 +71,8 @@ class CellView:
     alive_s: float = 0.0  # since when it is connected
     lost_s: float | None = None  # since when it is not; None while it is
     asked_s: float = -math.inf  # when it was asked who it is
-    ended: bool = True  # whether its command said that it ends
+    ended: str = "ended"  # what its command said when it ended; empty while it did not
+    failed: bool = False  # whether that was a warning
     offset_s: float = math.nan  # its clock less the hub's
     rejected_s: float = -math.inf  # when the newest message that could not be read came
     why_rejected: str = ""
@@ -79,6 +80,10 @@ class CellView:
     drifts: dict[str, Drift] = field(default_factory=dict)
     day: dict[int, float] = field(default_factory=dict)  # number of the bar -> largest error, mm
     _block: tuple[int, dict[str, list[float]]] = field(default_factory=lambda: (0, {}))
+
+    def end(self, text: str, level: object) -> None:
+        """Take what its command said when it ended, and how serious that is; no text: it goes on."""
+        self.ended, self.failed = text[:300], level == "warning"
 
     def token(self, session: str, came: bool, at_s: float) -> None:
         """Take that a process of this cell connected, or is gone."""
@@ -88,7 +93,7 @@ class CellView:
                 for each in self.slopes.values():
                     each.begin_anew()
             self.sessions.add(session)
-            self.lost_s, self.ended = None, False
+            self.lost_s, self.ended = None, ""
             self.state_s = max(self.state_s, at_s)
             return
         self.sessions.discard(session)
@@ -130,7 +135,7 @@ class CellView:
         """Return how much somebody should look, how far beyond it is within that, and why in words."""
         if not self.sessions:
             if self.ended:
-                return ENDED, 0.0, "ended"
+                return LOOK if self.failed else ENDED, 0.0, self.ended
             return (
                 LOST,
                 now_s - (self.lost_s or now_s),

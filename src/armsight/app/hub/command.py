@@ -50,6 +50,7 @@ def command(ctx: click.Context, listen: str, http: str, keys: Path | None, outpu
         return
     import threading
 
+    from armsight.app.hub.router import rejected
     from armsight.app.hub.service import Hub
     from armsight.app.show.http import host_and_port
     from armsight.app.show.messages import require
@@ -65,7 +66,8 @@ def command(ctx: click.Context, listen: str, http: str, keys: Path | None, outpu
             click.echo(json.dumps({"address": hub.pages.address, "listen": listen, "directory": str(output)}))
         else:
             click.echo(f"open {hub.pages.address} in a browser; cells connect to {listen}; Ctrl-C ends the hub")
-        threading.Event().wait()
+        with rejected(hub.rejected):
+            threading.Event().wait()
     finally:
         hub.close()
 

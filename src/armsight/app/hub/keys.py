@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 _DAYS, _CA_DAYS = 397, 3650
 #: days before its end in which a certificate is made anew; half: less warning, double: made anew more often.
 _RENEW_DAYS = 30
-_CA, _HUB, _CELLS = "ca", "hub", "cells"
+_CA, HUB, _CELLS = "ca", "hub", "cells"
 
 
 def make_keys(folder: Path, site: str, cells: Sequence[str], host: str, port: int) -> list[Path]:
@@ -47,11 +47,11 @@ def make_keys(folder: Path, site: str, cells: Sequence[str], host: str, port: in
     check_name(site, "the site's name")
     for name in cells:
         check_name(name, "a cell's name")
-        if name == _HUB:
-            raise InputError(f"a cell cannot be called {_HUB}: that is the hub's own certificate")
+        if name == HUB:
+            raise InputError(f"a cell cannot be called {HUB}: that is the hub's own certificate")
     folder.mkdir(parents=True, exist_ok=True, mode=0o700)
     authority = _authority(folder, site)
-    _ensure(folder / _HUB, authority, f"{site}.{_HUB}", [host, "localhost", "127.0.0.1"])
+    _ensure(folder / HUB, authority, f"{site}.{HUB}", [host, "localhost", "127.0.0.1"])
     made = []
     for name in cells:
         at = folder / _CELLS / name
@@ -85,7 +85,7 @@ def site_of(folder: Path) -> tuple[str, list[str]]:
             f"{folder}: no keys of a site are here: make them with `armsight hub keys SITE CELL ... -o {folder}`"
         )
     site = _common_name(_certificate(folder / "ca.pem"))
-    _check_valid(folder / f"{_HUB}.pem")
+    _check_valid(folder / f"{HUB}.pem")
     return site, sorted(path.parent.name for path in folder.glob(f"{_CELLS}/*/cell.pem"))
 
 

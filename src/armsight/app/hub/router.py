@@ -7,11 +7,15 @@ certificate.
 from __future__ import annotations
 
 import json
+import os
+import re
+import sys
+import threading
 import time
-from collections.abc import Callable, Sequence
-from contextlib import closing, suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 from armsight.app.hub.keys import sign_hold, site_of
 from armsight.app.stream.cell_file import ANSWER_S, LONGEST, Cell, endpoint, require_here, zenoh_config
@@ -21,6 +25,9 @@ _ALLOWED = (
     "put", "delete", "declare_subscriber", "query", "reply", "declare_queryable", "liveliness_token",
     "liveliness_query", "declare_liveliness_subscriber",
 )  # fmt: skip
+#: Of zenoh's log: its colours, and why a TLS handshake failed; it says no address.
+_COLOUR = re.compile(r"\x1b\[[0-9;]*m")
+_REJECTED = re.compile(r"zenoh_link_tls::unicast: (.+?)(?:\. Hint|$)")
 #: What came from a cell: its site, its name, which of its keys, when (s), and the JSON; None of JSON: the token is
 #: gone.
 Heard = tuple[str, str, str, float, Any]
@@ -153,3 +160,41 @@ def hold(keys: Path, cell: str, reason: str, address: str) -> str:
             if reply.ok is not None:
                 return str(reply.ok.payload.to_string())
     return ""
+
+
+@contextmanager
+def rejected(heard: Callable[[str], None]) -> Iterator[None]:
+    """Hand on why connections are rejected within the block, in which nothing else may be printed.
+
+    zenoh writes its log to the standard output of the process.
+
+    Args:
+        heard: is given the reason, in a thread of its own.
+    """
+    import zenoh
+
+    zenoh.init_log_from_env_or("error,zenoh_link_tls=warn")
+    sys.stdout.flush()
+    reading, writing = os.pipe()
+    before = os.dup(1)
+    os.dup2(writing, 1)
+    os.close(writing)
+    thread = threading.Thread(target=_read, args=(os.fdopen(reading), heard), name="rejected", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        os.dup2(before, 1)  # the pipe has no other writer: its reader ends
+        os.close(before)
+        thread.join()
+
+
+def _read(log: TextIO, heard: Callable[[str], None]) -> None:
+    """Hand on the reasons; other lines go to standard error."""
+    with log:
+        for line in log:
+            plain = _COLOUR.sub("", line)
+            if (found := _REJECTED.search(plain.rstrip())) is not None:
+                heard(found[1])
+            else:
+                sys.stderr.write(plain)

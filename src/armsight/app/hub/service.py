@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.resources
 import json
+import math
 import queue
 import threading
 import time
@@ -15,6 +16,7 @@ from typing import Any
 
 from armsight.app.hub.cells import CellView, look_for_drifts, number, ranked
 from armsight.app.hub.drift import LOOK_S
+from armsight.app.hub.keys import HUB, site_of
 from armsight.app.hub.router import Heard, Router
 from armsight.app.hub.store import FLUSH_S, Store
 from armsight.app.show.http import Answer, Pages, metrics_text
@@ -32,10 +34,13 @@ METRICS = {
     "cell_sigma_millimetres": ("gauge", "standard deviation of the position"),
     "cell_rate_hertz": ("gauge", "shots a second"),
     "cell_missed_ratio": ("gauge", "share of shots without a measurement"),
+    "cell_temperature_celsius": ("gauge", "of the hottest motor"),
     "cell_clock_seconds": ("gauge", "the cell's clock less the hub's"),
-    "hub_events_total": ("counter", "events stored"),
+    "hub_events": ("gauge", "events stored"),
     "hub_dropped_total": ("counter", "states dropped because too many waited"),
 }
+#: s between two events of rejected connections; half: twice as many from a cell with a wrong key, double: counted later.
+_REJECTED_S = 60.0
 #: s after which a cell that did not say who it is is asked again; half: nothing, double: its limit is missing longer.
 _ASK_AGAIN_S = 10.0
 #: Texts that a cell says of itself.
@@ -45,6 +50,7 @@ _OF_STATE = {
     "cell_sigma_millimetres": "sigma_mm",
     "cell_rate_hertz": "rate_hz",
     "cell_missed_ratio": "missed",
+    "cell_temperature_celsius": "temperature_c",
 }
 
 
@@ -66,6 +72,8 @@ class Hub:
         self._say, self._cells = say, dict[tuple[str, str], CellView]()
         self._heard: queue.Queue[Heard] = queue.Queue()
         self._dropped, self._problem = 0, ""
+        self._keys = keys
+        self._rejected, self._rejected_s = 0, -math.inf
         self._lock = threading.Lock()  # of the cells
         self._cached: tuple[float, bytes] = (0.0, b"")
         self._asking = ThreadPoolExecutor(4, "ask")
@@ -92,6 +100,17 @@ class Hub:
         self._asking.shutdown(wait=False, cancel_futures=True)
         self._store.close()
 
+    def rejected(self, why: str) -> None:
+        """Say and keep that a connection was rejected, and how many were since the last time."""
+        self._rejected += 1
+        if self._keys is None or time.monotonic() - self._rejected_s < _REJECTED_S:
+            return
+        text = f"{self._rejected} connections rejected: no valid key of this site (the last: {why})"
+        self._rejected, self._rejected_s, now = 0, time.monotonic(), time.time()
+        self._say(text)
+        event = {"n": 1, "kind": "rejected", "level": "warning", "text": text, "t": now}
+        self._store.add_events(site_of(self._keys)[0], HUB, {"outbox": str(now), "events": [event]}, now)
+
     def _hear(self, heard: Heard) -> None:
         if heard[2] == "state" and self._heard.qsize() > _WAITING:  # another follows in a second; of tokens none does
             self._dropped += 1
@@ -104,9 +123,9 @@ class Hub:
             return 0
         n = self._store.add_events(site, cell, message, time.time())
         if n:  # a command that began after one that ended has not ended
-            kinds = [each.get("kind") for each in message["events"] if isinstance(each, dict)]
-            for kind in [kind for kind in kinds if kind in ("began", "ended")][-1:]:
-                self._hear((site, cell, kind, time.time(), None))
+            events = [each for each in message["events"] if isinstance(each, dict)]
+            for each in [each for each in events if each.get("kind") in ("began", "ended")][-1:]:
+                self._hear((site, cell, each["kind"], time.time(), each))
         return n
 
     def _run(self) -> None:
@@ -142,7 +161,8 @@ class Hub:
                 if came:
                     self._ask(cell, at_s)
             elif what in ("began", "ended"):
-                cell.ended = what == "ended" and len(cell.sessions) < 2
+                goes_on = what == "began" or len(cell.sessions) > 1
+                cell.end("" if goes_on else str(content.get("text") or "ended"), content.get("level"))
             elif what == "state":
                 before_s = cell.state_s
                 row = cell.take(content, at_s)
@@ -209,12 +229,12 @@ class Hub:
         rows: dict[str, dict[str, float]] = {name: {} for name in METRICS}
         for cell in found["cells"]:
             labels = f'{{site="{cell["site"]}",cell="{cell["name"]}"}}'
-            rows["cell_up"][labels] = float(0 <= cell["level"] < 4)
+            rows["cell_up"][labels] = float(cell["alive_s"] is not None and cell["level"] < 4)
             rows["cell_need"][labels] = cell["level"]
             values = {name: cell["state"].get(key) for name, key in _OF_STATE.items()}
             values |= {"cell_clock_seconds": cell["clock_s"]}
             for name, value in values.items():
                 if value is not None:
                     rows[name][labels] = value
-        rows["hub_events_total"][""], rows["hub_dropped_total"][""] = found["events"], found["dropped"]
+        rows["hub_events"][""], rows["hub_dropped_total"][""] = found["events"], found["dropped"]
         return 200, "text/plain; version=0.0.4", metrics_text(METRICS, rows)

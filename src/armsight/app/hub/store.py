@@ -26,10 +26,13 @@ FLUSH_S = 600.0
 _SEARCH_S = 1.0
 #: events of a search at most; half: scroll less, double: a larger page.
 _FOUND = 200
+#: events that are kept; half: half the history and disk (0.3 GB), double: both twice.
+_MOST = 1_000_000
 _TABLES = (
     "CREATE TABLE IF NOT EXISTS events (site TEXT, cell TEXT, outbox TEXT, n INTEGER, t REAL, arrived REAL, kind TEXT,"
     " level TEXT, text TEXT, PRIMARY KEY (site, cell, outbox, n)) WITHOUT ROWID",
     "CREATE INDEX IF NOT EXISTS by_time ON events (t)",
+    "CREATE INDEX IF NOT EXISTS by_arrival ON events (arrived)",
     "CREATE TABLE IF NOT EXISTS cells (site TEXT, cell TEXT, about TEXT, PRIMARY KEY (site, cell))",
 )
 
@@ -93,15 +96,18 @@ class Store:
     def known(self) -> list[CellView]:
         """Return the cells of earlier days; one whose last event is not that it ended was lost."""
         query = (
-            "SELECT c.site, c.cell, about, kind, max(arrived) FROM cells c LEFT JOIN events e"
-            " ON e.site = c.site AND e.cell = c.cell AND kind IN ('began', 'ended') GROUP BY c.site, c.cell"
-        )  # of a group with max(), SQLite returns the row that has it
+            "SELECT c.site, c.cell, about, kind, level, text, arrived FROM cells c LEFT JOIN"
+            " (SELECT *, row_number() OVER (PARTITION BY site, cell ORDER BY arrived DESC, n DESC) AS row FROM events"
+            " WHERE kind IN ('began', 'ended')) e ON e.site = c.site AND e.cell = c.cell AND row = 1"
+        )
         with self._lock:
             rows = self._db.execute(query).fetchall()
-        return [
-            CellView(site, cell, json.loads(about), ended=kind != "began", lost_s=at_s)
-            for site, cell, about, kind, at_s in rows
-        ]
+        cells = []
+        for site, cell, about, kind, level, text, at_s in rows:
+            cells.append(CellView(site, cell, json.loads(about), lost_s=at_s))
+            if kind is not None:
+                cells[-1].end("" if kind == "began" else text, level)
+        return cells
 
     def events(self, words: str = "", site: str = "", cell: str = "") -> list[dict[str, Any]]:
         """Return the newest events that hold all words, of one cell where it is named."""
@@ -135,7 +141,7 @@ class Store:
         self._rows[f"{cell.site}.{cell.name}"].append(row)
 
     def flush(self) -> None:
-        """Write the states since the last time; on a full disk they are lost, and that is said."""
+        """Write the states since the last time, and forget old events; on a full disk states are lost, and that is said."""
         import pyarrow as pa
         import pyarrow.parquet as pq
 
@@ -151,6 +157,9 @@ class Store:
                     pq.write_table(pa.Table.from_pylist(states, schema), file)
             except (OSError, InputError) as error:
                 self.problem = f"states are not stored: {error}"
+        oldest = "SELECT arrived FROM events ORDER BY arrived DESC LIMIT 1 OFFSET ?"
+        with suppress(sqlite3.Error), self._lock, self._db:
+            self._db.execute(f"DELETE FROM events WHERE arrived <= ({oldest})", (_MOST,))
 
     def close(self) -> None:
         """Write what waits."""

@@ -82,7 +82,8 @@ def run_in(
         write_text(folder / name, text)
     rig.save(folder / "rig.json")
     texts = properties(rig, files["body.toml"], setup.arm, command=command)
-    published = Published(rig, setup.target.body, setup.arm, texts, _interrupt if command == "run" else None)
+    hold = _interrupt if command == "run" else None
+    published = Published(rig, setup.target.body, setup.arm, texts, hold, lambda: setup.board.joints.temperature_c)
     with contextlib.ExitStack() as stack:
         file = stack.enter_context(contextlib.closing(LazyMcap(folder, published, say)))
         beside = stack.enter_context(contextlib.closing(open_streams(streams, published, say)))

@@ -14,6 +14,7 @@ import math
 import socket
 import threading
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -52,6 +53,8 @@ _FRESH_S = 60.0
 _SIDE_PX, _JPEG = 480, 70
 #: findings that a state names at most; half: less is seen at once, double: a state of 2 kB.
 _FINDINGS = 5
+#: s that closing may take; half: a slow hub aborts the process, double: the same.
+_CLOSE_S = 5.0
 #: A limit for the error is so many times the held-out error of the rig; half: good cells are yellow, double: bad ones
 #: are not.
 _LIMIT = 3.0
@@ -85,6 +88,11 @@ def _mean(values: Array, unit: float, *, root: bool = False) -> float | None:
         return None
     mean = float(np.mean(values))
     return float(f"{unit * (math.sqrt(mean) if root else mean):.6g}")
+
+
+def _hottest(celsius: Array | None) -> float | None:
+    """Return the temperature of the hottest motor, degrees Celsius."""
+    return None if celsius is None else round(float(celsius.max()), 1)
 
 
 def tilt_and_size(rig: StereoRig, points: Array, pose: PoseEstimate) -> tuple[float, float]:
@@ -122,7 +130,7 @@ class CellSink(Sink):
     """
 
     def __init__(self, cell: Cell, published: Published, mode: str) -> None:
-        super().__init__(wakes=256, close_s=5.0)
+        super().__init__(wakes=256, close_s=_CLOSE_S)
         tls = None if cell.ca is None else {
             "root_ca_certificate": str(cell.ca),
             "enable_mtls": True,
@@ -138,6 +146,9 @@ class CellSink(Sink):
         self._looked = 0.0
         self._newest: Shot | None = None
         self._held, self._began_utc = set[float](), time.time()
+        self._exit: tuple[int, str] | None = None
+        self._exited = threading.Event()  # whether nothing more is to be heard of how the command ends
+        self._exited.set()
         self._session: Any = None
         self._declared: list[Any] = []
         self._ending, self._end_at = threading.Event(), math.inf
@@ -148,6 +159,18 @@ class CellSink(Sink):
         self._event("began", "info", f"armsight {self._mode} began")
         self._post.start()
         super().start()
+
+    def stay(self) -> Callable[[int, str], None]:
+        """Stay beyond :meth:`close`, until what is returned is called with the exit code, and what is wrong."""
+        self._exited.clear()
+        self._close_s = 0.0
+
+        def end(code: int, wrong: str) -> None:
+            self._exit, self._close_s = (code, wrong), _CLOSE_S
+            self._exited.set()
+            self.close()
+
+        return end
 
     def write(self, datum: Datum) -> None:
         """Count a shot, or keep an event."""
@@ -189,6 +212,7 @@ class CellSink(Sink):
             "rate_hz": round(window.shots / max(now - self._state_at, 1e-3), 2),
             "shots": self._shots,
             **window.state(),
+            "temperature_c": _hottest(self._published.temperatures_c()),
             "health": [each[:300] for each in self._findings[:_FINDINGS]],
         }
         self._window, self._state_at = _Window(), now
@@ -198,8 +222,15 @@ class CellSink(Sink):
                 self._session.put(self._cell.topic("state"), json_text(state))
 
     def finish(self) -> None:
-        """Say that the command ended, send what waits, and leave."""
-        self._event("ended", "info", f"armsight {self._mode} ended after {self._shots} shots")
+        """Say how the command ended, send what waits, and leave."""
+        while not self._exited.wait(STATE_S):
+            self._put_state()
+        text, level = f"armsight {self._mode} ended after {self._shots} shots", "info"
+        if self._exit is not None:
+            code, wrong = self._exit
+            text += f" with exit code {code}" + (f": {wrong}" if wrong else "")
+            level = "info" if code in (0, 130) else "warning"
+        self._event("ended", level, text)
         self._end_at = time.monotonic() + _END_S
         self._ending.set()
         self._post.join()  # it waits for zenoh a second or two; a thread in a library when Python ends aborts the process
@@ -360,5 +391,9 @@ def signed_by(ca: Path, signature: bytes, data: bytes) -> bool:
 
 
 def open_cell(rest: str, published: Published) -> CellSink:
-    """Open ``NAME[@ROUTER]`` or a cell.toml."""
-    return CellSink(read_cell(rest), published, published.properties.get("command", "python"))
+    """Open ``NAME[@ROUTER]`` or a cell.toml; in a command of the command line it stays until the exit code is known."""
+    sink = CellSink(read_cell(rest), published, published.properties.get("command", "python"))
+    context = click.get_current_context(silent=True)
+    if context is not None and isinstance(context.obj, list):
+        context.obj.append(sink.stay())
+    return sink

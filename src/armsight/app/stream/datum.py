@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from armsight.app.show.encode import json_of
-from armsight.data import Body, Record
+from armsight.data import Array, Body, Record
 
 try:
     import orjson  # of the extra ``record``; five times as fast
@@ -32,6 +32,7 @@ class Published(Record):
         arm: the nominal arm; None where there is none.
         properties: texts that are stored with a recording: files, versions, options.
         hold: brings the arm to rest, with the reason; None where nothing moves.
+        temperatures_c: returns those of the motors (n,), degrees Celsius; None where nothing measures them.
     """
 
     rig: StereoRig | None = None
@@ -39,6 +40,7 @@ class Published(Record):
     arm: Arm | None = None
     properties: Mapping[str, str] = field(default_factory=dict)
     hold: Callable[[str], None] | None = None
+    temperatures_c: Callable[[], Array | None] = lambda: None
 
 
 def json_text(content: Mapping[str, Any]) -> bytes:
