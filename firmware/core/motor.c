@@ -236,7 +236,7 @@ static void sample_limited(motor_state *motor, const motor_config *config, float
     const float high_v = motor->part_v > 0.0f ? motor->part_v : 0.0f;
     motor->withheld_rad += motor->part_v * motor->per_constant * TICK_S;
     motor->part_v = number_clamp(asked_v, low_v, high_v);
-    motor->dither_vv = motor->dither_va = motor->dither_aa = 0.0f; /* what changed is not known */
+    motor->dither_vv = motor->dither_va = motor->dither_aa = motor->dithers = 0.0f; /* what changed is not known */
     motor->window_side = SIDE_UNKNOWN; /* backlash may be crossed meanwhile */
     motor->limited = 0u;
 }
@@ -258,7 +258,6 @@ bool motor_flows_asleep(const zero_state *zero, const motor_config *config, floa
 
 #define ANSWER_NONE 0.25f /* a current that answers less does not follow its voltage; half: bridges look like sensors,
                              double: gains of 0.4 like bridges */
-#define ANSWER_TICKS 64.0f /* that count in the sums; half: less is certain, double: noise names parts */
 #define ANSWER_VV 0.1f /* V^2; smaller squares in them show little yet; half, double: nothing notable */
 #define ANSWER_OFF 0.2f /* by so much an answer differs at least; half: light joints are suspected, double: shorted
                            windings are not seen */
@@ -275,7 +274,7 @@ static float answer_of(const motor_state *motor, const motor_config *config)
 
 bool motor_answers_otherwise(const motor_state *motor, const motor_config *config)
 {
-    if (motor->damping_share > 0.0f) { /* its noise is in the voltage */
+    if (motor->damping_share > 0.0f || motor->dithers < 2.0f) { /* its noise is in the voltage; two changes show none */
         return false;
     }
     const float ohm = motor->resistance_scale * config->resistance_ohm;
@@ -283,7 +282,7 @@ bool motor_answers_otherwise(const motor_state *motor, const motor_config *confi
     const float va = motor->dither_va;
     const float per_vv = 1.0f / (vv + ANSWER_VV); /* hardly driven it shows nothing */
     const float left = number_size(motor->dither_aa * vv - va * va);
-    const float variance = ohm * ohm * left * per_vv * per_vv * (1.0f / ANSWER_TICKS) + motor->variance_rr;
+    const float variance = ohm * ohm * left * per_vv * per_vv / (motor->dithers - 1.0f) + motor->variance_rr;
     const float off = number_size(ohm * va - vv) * per_vv;
     return off > ANSWER_OFF + SIGMAS * number_root(variance) && /* a wrong reading may have taught a wrong resistance */
            number_size(config->resistance_ohm * va - vv) * per_vv > ANSWER_OFF;
@@ -338,6 +337,7 @@ static void sample(motor_state *motor, const motor_config *config, float ir_v, f
     motor->dither_vv *= DITHER_KEPT;
     motor->dither_va *= DITHER_KEPT;
     motor->dither_aa *= DITHER_KEPT;
+    motor->dithers *= DITHER_KEPT;
     motor->none_samples = answers_as_none(motor, config) ? motor->none_samples + 1u : 0u;
     motor->withheld_rad *= SAMPLE_KEEPS;
     motor->gap_rad *= SAMPLE_KEEPS;
@@ -414,6 +414,7 @@ static void dither(motor_state *motor, float change_v, float change_a)
     motor->dither_vv += change_v * change_v;
     motor->dither_va += change_v * change_a;
     motor->dither_aa += change_a * change_a;
+    motor->dithers += 1.0f;
 }
 
 void motor_measure(motor_state *motor, const motor_config *config, float supply_v, float current_a, float angle_rad)

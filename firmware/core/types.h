@@ -392,6 +392,7 @@ typedef struct motor_state {
     float dither_vv;         /* sums of the changes of both from tick to tick: squares of the voltage's, */
     float dither_va;         /* products, */
     float dither_aa;         /* squares of the current's; fade */
+    float dithers;           /* how many changes they hold; fades */
     float unsure_per_a;      /* rad/s by which speed_rad_s may be off for each ampere */
     float swift_per_a;       /* rad/s by which an ampere changes its speed in a tick */
     uint32_t step_ticks;     /* driven_ticks when that was last seen, 0: never */
