@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import errno
 import io
 import itertools
 import json
@@ -375,6 +376,74 @@ def write_text(path: str | Path, text: str) -> None:
         file.write(text)
 
 
+class RowFile:
+    """A CSV being written: a row is in the file, whole, once it is added, and nothing of one that failed.
+
+    Args:
+        path: the file to be; its folder must exist.
+        columns: its header.
+        replaces: whether a file that stands there is replaced; if not, that is an error.
+
+    Attributes:
+        path: the file.
+        rows: how many rows it has, without the header.
+    """
+
+    def __init__(self, path: Path, columns: Sequence[str], *, replaces: bool = False) -> None:
+        self.path, self.rows, self._whole = path, 0, 0
+        flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | (os.O_TRUNC if replaces else os.O_EXCL)
+        with self._named():
+            self._file = os.open(path, flags, 0o644)
+        try:
+            self._append(columns)
+        except InputError:
+            os.close(self._file)
+            path.unlink()
+            raise
+
+    @contextlib.contextmanager
+    def _named(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise InputError(f"{self.path}: cannot be written: {error.strerror}") from None
+
+    def _append(self, cells: Sequence[object]) -> None:
+        text = io.StringIO()
+        csv.writer(text, lineterminator="\n").writerow(cells)
+        data = text.getvalue().encode(errors="backslashreplace")
+        with self._named():
+            try:
+                if os.write(self._file, data) < len(data):
+                    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            except OSError:
+                with contextlib.suppress(OSError):
+                    os.ftruncate(self._file, self._whole)
+                raise
+        self._whole += len(data)
+
+    def add(self, cells: Sequence[object]) -> None:
+        """Append a row.
+
+        Raises:
+            InputError: the disk is full; the rows before stay.
+        """
+        self._append(cells)
+        self.rows += 1
+
+    def close(self) -> None:
+        """Close the file; it outlives a crash of the computer from then on.
+
+        Raises:
+            InputError: the disk does not take it.
+        """
+        with self._named():
+            try:
+                os.fsync(self._file)
+            finally:
+                os.close(self._file)
+
+
 def try_writing(folder: Path) -> None:
     """Write a file in a folder and remove it.
 
@@ -414,11 +483,11 @@ def check_writable(path: str | Path, *, apart_from: Iterable[str | Path | None] 
 
 
 def unused(path: Path) -> Path:
-    """Return the first of NAME, NAME-2, NAME-3 ... that is not there yet."""
+    """Return the first of NAME.csv, NAME-2.csv, NAME-3.csv ... that is not there yet; of a folder likewise."""
     found, number = path, 1
     while found.exists():
         number += 1
-        found = path.with_name(f"{path.name}-{number}")
+        found = path.with_stem(f"{path.stem}-{number}")
     return found
 
 

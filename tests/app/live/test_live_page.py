@@ -1,5 +1,6 @@
 """The page in a headless browser, step by step by clicking, on rendered cameras and the emulated board; and the session."""
 
+import os
 import shutil
 import urllib.request
 
@@ -178,20 +179,10 @@ def test_body_and_measure(page, session):
 
 
 def test_a_full_disk_ends_the_recording_with_a_line(session):
-    class Full:
-        def write(self, text):
-            raise OSError(28, "No space left on device")
-
-        def close(self):
-            raise OSError(28, "No space left on device")
-
-        flush = close
-
     session.execute(records.RecordPoses())
     measuring, before = session.measuring, len(session.events())
     with measuring.lock:
-        measuring._recording.file.close()
-        measuring._recording.file = Full()
+        measuring._recording._file._file = os.open("/dev/full", os.O_WRONLY)
     until(lambda: any("No space left" in event.text for event in session.events()[before - 1 :]))
     assert measuring.state.recording is None
     until(lambda: measuring.state.pose is not None)

@@ -14,7 +14,9 @@ from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from armsight.app.measure.run import MeasureRun
 from armsight.app.measure.shots import _detected, reversed_notes
+from armsight.files import read_table
 from armsight.geometry.pose import exp_se3, inverse, log_se3, pose, transform
 from armsight.vision.markers.body_file import save_body_csv
 from armsight.vision.markers.targets import open_body, open_target
@@ -332,8 +334,27 @@ def test_a_full_disk(start, arm, armsight, full_disk):
     said = armsight(*start, *images(arm), "-o", out)
     assert said.code == 2
     assert len(said.out.splitlines()) == 4, "what was measured was printed before, below its head"
-    assert said.err.splitlines() == [f"armsight: error: {out}: cannot be written: No space left on device"]
+    warned, *_, last = said.err.splitlines()
+    assert warned.endswith(f"{out}: cannot be written: No space left on device; measuring goes on")
+    assert last == f"armsight: error: {out}: 3 of 3 rows could not be written"
     assert os.listdir(full_disk) == ["ballast"]
+
+
+def test_a_killed_run_keeps_its_rows_and_its_memory_is_bounded(start, arm, tmp_path, monkeypatch, armsight):
+    """Rows are in the file as they are measured; of many shots the counts are kept, not the records."""
+    out, seen = tmp_path / "poses.csv", []
+    monkeypatch.setattr("armsight.app.measure.run._KEPT", 2)
+
+    def watched(self, record):
+        keep(self, record)
+        seen.append((len(read_table(out)) - 1, len(self.records), self.total))
+
+    keep = MeasureRun._keep
+    monkeypatch.setattr(MeasureRun, "_keep", watched)
+    said = armsight(*start, *images(arm), "-o", out)
+    assert said.code == 0
+    assert seen == [(1, 1, 1), (2, 2, 2), (3, 2, 3)]
+    assert "measured 3 of 3 shots" in said.err
 
 
 # Detections instead of images.

@@ -136,7 +136,7 @@ def test_a_disk_that_fills_within_a_shot_leaves_none_of_it(tmp_path, monkeypatch
 
     def failing_write(handle, data):
         lines.append(data)
-        if moment == "index" and len(lines) == 3:
+        if moment == "index" and len(lines) == 4:
             return write(handle, data[:7])  # half a line gets out
         return write(handle, data)
 
@@ -161,7 +161,7 @@ def test_an_interrupt_within_a_shot_waits_until_it_is_stored(tmp_path, monkeypat
 
     def interrupted_write(handle, data):
         lines.append(data)
-        if moment == "index" and len(lines) == 3:
+        if moment == "index" and len(lines) == 4:
             signal.raise_signal(signal.SIGINT)
         return write(handle, data)
 

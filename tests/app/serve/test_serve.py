@@ -165,6 +165,16 @@ def test_options_become_arguments(rendered, tmp_path):
     assert (found.folder, found.log_files) == (tmp_path, 2)
 
 
+def test_no_start_writes_over_the_poses_of_another(rendered, tmp_path):
+    text = f'[measure]\nrig = "{rendered.rig}"\ntarget = "{rendered.plate}"\nsource = "usb:0,1"\noutput = "poses.csv"\n'
+    found, named = read_config(write(tmp_path / "a.toml", text)), []
+    for _ in range(3):
+        named += [Path(each.removeprefix("--output=")) for each in found.started() if each.startswith("--output=")]
+        named[-1].touch()
+    assert [each.name for each in named] == ["poses.csv", "poses-2.csv", "poses-3.csv"]
+    assert {each.parent for each in named} == {tmp_path}
+
+
 def test_a_first_start_without_a_shot_ends_it_and_what_is_no_datum_is_passed_over(serving, tmp_path):
     with pytest.raises(InputError, match="no such camera"):
         serving("0 no such camera")

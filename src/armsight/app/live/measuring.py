@@ -7,7 +7,6 @@ measure``. The sigma is split into precision (the noise of this shot) and what t
 from __future__ import annotations
 
 import contextlib
-import os
 import time
 from collections import Counter, deque
 from collections.abc import Callable
@@ -24,6 +23,7 @@ from armsight.app.stream.mcap_file import LazyMcap, properties
 from armsight.app.stream.streams import open_streams
 from armsight.data import Array, Body, Missed, PoseEstimate, Shot
 from armsight.errors import InputError
+from armsight.files import RowFile
 from armsight.geometry.pose import adjoint, inverse, left_axes, transform
 from armsight.geometry.rotation import euler_zyx, skew
 from armsight.loop.handeye.pivot import MIN_POSES, Pivot, calibrate_pivot
@@ -35,7 +35,7 @@ from armsight.vision.markers.calibrated_board import is_print
 from armsight.vision.markers.marker import Target
 from armsight.vision.markers.targets import open_target
 from armsight.vision.pose.locate import by_rig
-from armsight.vision.pose.shot_pose import csv_text, shot_pose
+from armsight.vision.pose.shot_pose import CSV_COLUMNS, row_of, shot_pose
 from armsight.vision.rig import StereoRig
 
 #: Health is asked for once a second; so many times as long as it took it is not.
@@ -143,40 +143,34 @@ class _PoseFile:
         while path.exists() or path.with_suffix(".mcap").exists():
             number += 1
             path = folder / f"poses-{number}.csv"
-        self.path, self.body, self.rows = path, body, 0
-        head = csv_text([])
+        self.path, self.body = path, body
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            self.file = path.open("x", encoding="utf-8")  # open while the recording lasts
-            self.file.write(head)
         except OSError as error:
             raise InputError(f"{path}: cannot be written: {error.strerror}") from None
-        self._whole = len(head.encode())
+        self._file = RowFile(path, CSV_COLUMNS)
         published = Published(rig, body, None, properties(rig, None, command="live"))
         self._mcap = LazyMcap(folder, published, say, path.with_suffix(".mcap").name)
 
     def add(self, live: LiveShot, result: PoseEstimate | Missed) -> None:
-        """Write a row; an OSError ends the recording with the rows before."""
-        row = csv_text([shot_pose(live.shot.name, live.shot.t_s, self.body, result)]).partition("\n")[2]
+        """Write a row; an InputError ends the recording with the rows before."""
         try:
-            self.file.write(row)
-            self.file.flush()
-        except OSError:
+            self._file.add(row_of(shot_pose(live.shot.name, live.shot.t_s, self.body, result)))
+        except InputError:
             self.close()
-            with contextlib.suppress(OSError):  # a row that is there in part goes
-                os.truncate(self.path, self._whole)
             raise
-        self.rows, self._whole = self.rows + 1, self._whole + len(row.encode())
         self._mcap.put(ShotDatum(live.shot, result, time.monotonic()))
+
+    @property
+    def rows(self) -> int:
+        """How many poses it holds."""
+        return self._file.rows
 
     def close(self) -> None:
         """Close both files."""
         self._mcap.close()
-        with contextlib.suppress(OSError):  # what is still buffered may not fit on the disk: the row that failed
-            self.file.flush()
-            os.fsync(self.file.fileno())
-        with contextlib.suppress(OSError):
-            self.file.close()
+        with contextlib.suppress(InputError):  # a full disk: what it took is whole
+            self._file.close()
 
 
 class MeasureStep(PageStep[MeasureState]):
@@ -373,9 +367,9 @@ class MeasureStep(PageStep[MeasureState]):
             return
         try:
             recording.add(live, result)
-        except OSError as error:
+        except InputError as error:
             self._recording = None
-            why = f"the recording has ended: {error.strerror}; {recording.rows} poses are in {recording.path}"
+            why = f"the recording has ended: {error}; it holds {recording.rows} poses"
             self.say("error", why)
 
     def close(self) -> None:

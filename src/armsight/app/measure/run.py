@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import time
+from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -15,7 +16,7 @@ import numpy as np
 from armsight.app.measure.command import MeasureOptions
 from armsight.app.measure.moving import Requested, requested_shutters
 from armsight.app.measure.picture import SINGULAR
-from armsight.app.measure.shots import NAMED, DetectedShots, ImageShots, Result, named, open_shots
+from armsight.app.measure.shots import NAMED, DetectedShots, ImageShots, NamedShots, Result, open_shots
 from armsight.app.measure.view import CHART, PictureFolder, view_folder
 from armsight.app.options import DETECTIONS
 from armsight.app.progress import bar
@@ -23,15 +24,15 @@ from armsight.app.show.messages import colour, silence_stdout, weak
 from armsight.app.stream.datum import Published
 from armsight.data import Body, Dropped, Missed, PoseEstimate, Shot
 from armsight.errors import ArmsightError, InputError
-from armsight.files import check_writable, write_text
+from armsight.files import RowFile, check_writable
 from armsight.loop.health import HealthFinding, HealthMonitor, health_lines, unseen_lines
 from armsight.loop.running.data import Fanout, HealthNotes, Publisher, ShotDatum
 from armsight.vision.follow.follower import measurer
 from armsight.vision.markers.marker import Target
 from armsight.vision.markers.targets import open_fixed
 from armsight.vision.match import gate
-from armsight.vision.pose.shot_pose import ANGLES, ShotPose, csv_text, shot_pose
-from armsight.vision.rig import StereoRig
+from armsight.vision.pose.shot_pose import ANGLES, CSV_COLUMNS, SHUTTER_COLUMNS, ShotPose, row_of, shot_pose
+from armsight.vision.rig import Shutters, StereoRig
 from armsight.vision.source import LIVE_S
 from armsight.vision.sources import open_rig
 
@@ -41,8 +42,8 @@ _SYNC_S = 1e-3
 _WIDE_PX, _AGAIN = 2.0, 60
 #: What to do about repeated shots of a recording.
 _RECORDED = "they are no new measurements: leave them out, and record at the rate that the cameras really give"
-#: Shots that are kept for the lines at the end where no file needs all of them; half, double: so much memory.
-_KEPT = 10_000
+#: Newest shots that are kept for the lines at the end, which count all; half, double: so much memory, 7 kB a shot.
+_KEPT = 1_000
 #: s, between two looks at the health of live cameras; half: nothing, double: a warning comes later.
 _HEALTH_S = 1.0
 #: Columns of the table for people, their widths and digits; the shot's name is before them.
@@ -78,19 +79,19 @@ def measure_shots(options: MeasureOptions) -> tuple[HealthFinding, ...]:
         run = MeasureRun(options, rig, shots, view, HealthMonitor(rig, shots.body, _SYNC_S, printed=shots.printed))
         # What was measured is written whatever ends the run; where one of the two cannot be written the other is.
         if view is not None:
-            stack.callback(view.finish, run.records)
-        stack.callback(run.write)
+            stack.callback(lambda: view.finish([*run.records]))
+        stack.callback(run.close)
         publisher = stack.enter_context(contextlib.closing(_streams(options.stream, rig, shots.body)))
         missed = _Contradicting(rig, shots.body, shots.again)
         try:
             run.measure(_watched(rig, fixed, missed.keeping(shots.results), run.monitor), publisher)
         except KeyboardInterrupt:
-            kept = f", kept in {options.output}" if options.output is not None and run.records else ""
-            click.echo(f"armsight: stopped after {run.past + len(run.records)} shots{kept}", err=True)
+            kept = f", kept in {options.output}" if options.output is not None and run.total else ""
+            click.echo(f"armsight: stopped after {run.total} shots{kept}", err=True)
             raise
         shots.finish(run.records)
         contradicted = missed.finding()
-        if run.records and not any(record.ok for record in run.records):
+        if run.total and not run.measured:
             raise ArmsightError(run.nothing_measured(contradicted))
     click.echo(run.summary(time.perf_counter() - started), err=True)
     saved = run.keep_noise()
@@ -136,9 +137,20 @@ class MeasureRun:
     shots: DetectedShots | ImageShots
     view: PictureFolder | None
     monitor: HealthMonitor
-    records: list[ShotPose] = field(default_factory=list)
-    past: int = 0  #: shots of days, of which no file needs all: counted and forgotten
-    past_good: int = 0  #: those of them that were measured
+    records: deque[ShotPose] = field(init=False)  #: the newest; all where a chart is drawn of them
+    total: int = 0
+    measured: int = 0
+    ways: Counter[str] = field(default_factory=Counter)
+    jumped: NamedShots = field(default_factory=NamedShots)
+    contradicted: NamedShots = field(default_factory=NamedShots)
+    misfit: NamedShots = field(default_factory=NamedShots)
+    shutters: Shutters | None = None
+    first: ShotPose | None = None
+    file: RowFile | None = None
+    unwritten: int = 0
+
+    def __post_init__(self) -> None:
+        self.records = deque(maxlen=_KEPT if self.view is None else None)
 
     def measure(self, results: Iterator[Result], publisher: Publisher) -> None:
         """Measure every shot, print its line, keep its record and draw it; of live cameras also warn at once."""
@@ -183,46 +195,74 @@ class MeasureRun:
             silence_stdout()
 
     def _keep(self, record: ShotPose) -> None:
-        """Keep a record; once there are many that no file needs, forget the older half."""
+        """Count a record, keep it for a while, and write its row."""
         self.records.append(record)
-        if self.options.output is None and self.view is None and len(self.records) >= 2 * _KEPT:
-            self.past += _KEPT
-            self.past_good += sum(record.ok for record in self.records[:_KEPT])
-            del self.records[:_KEPT]
+        self.first = self.first or record
+        self.total += 1
+        self.measured += record.ok
+        self.shutters = self.shutters or record.shutters
+        if record.way is not None:
+            self.ways[record.way] += 1
+        for shots, holds in (
+            (self.jumped, record.jump is not None),
+            (self.contradicted, record.ok and _contradicts(record.dropped, len(record.points_m))),
+            (self.misfit, record.ok and record.misfit > 1),
+        ):
+            if holds:
+                shots.add(record.shot)
+        if self.options.output is not None:
+            self._write(record, self.options.output)
 
-    def write(self) -> None:
-        """Write the poses, where there are any and a file is named."""
-        if self.records and self.options.output is not None:
-            write_text(self.options.output, csv_text(self.records))
+    def _write(self, record: ShotPose, output: Path) -> None:
+        """Write a record's row; where the disk is full go on, and try again with the next."""
+        columns = CSV_COLUMNS + (SHUTTER_COLUMNS if self.shots.moves else ())
+        try:
+            self.file = self.file or RowFile(output, columns, replaces=True)
+            self.file.add(row_of(record, columns))
+        except InputError as error:
+            if not self.unwritten:
+                _warn(f"{error}; measuring goes on")
+            self.unwritten += 1
+
+    def close(self) -> None:
+        """Close the file of the poses.
+
+        Raises:
+            InputError: it does not have all rows.
+        """
+        if self.file is not None:
+            self.file.close()
+        if self.unwritten:
+            raise InputError(f"{self.options.output}: {self.unwritten} of {self.total} rows could not be written")
 
     def nothing_measured(self, contradicted: HealthFinding | None) -> str:
         """Return why no shot could be measured: what was done to the images, or the first reason and what explains it."""
-        records, mistake = self.records, self.shots.mistake()
-        why = mistake or f"{records[0].shot}: {records[0].reason}"
+        first, mistake = self.first, self.shots.mistake()
+        assert first is not None
+        why = mistake or f"{first.shot}: {first.reason}"
         if contradicted is not None and contradicted.cause == "rig" and not mistake:
             why += f"; {contradicted.what}; {contradicted.advice}"
         written = "" if self.options.output is None else f" (the reason of each is in {self.options.output})"
-        return f"none of {len(records)} shots could be measured: {why}{written}"
+        return f"none of {self.total} shots could be measured: {why}{written}"
 
     def summary(self, seconds: float) -> str:
         """Return what was measured and missed; raise an ArmsightError where there was nothing to measure."""
-        if not self.records:
+        if not self.total:
             raise ArmsightError("the source ended without a single shot")
-        good = [r for r in self.records if r.ok]
-        total, measured, output = self.past + len(self.records), self.past_good + len(good), self.options.output
+        total, measured, output = self.total, self.measured, self.options.output
         missed = f", {total - measured} missed (their lines have the reasons)" if total > measured else ""
         said = [f"measured {measured} of {total} shots in {seconds:.1f} s{missed}"]
         said.append(self._ways())
-        if jumps := [r.shot for r in self.records if r.jump]:
-            said.append(f"jumped in {named(jumps, 5)}")
-        if few := [r.shot for r in good if _contradicts(r.dropped, len(r.points_m))]:
+        if self.jumped.count:
+            said.append(f"jumped in {self.jumped}")
+        if self.contradicted.count:
             said.append(
-                f"in {named(few)} most points contradict each other: do not use it; the body moved between the two "
+                f"in {self.contradicted} most points contradict each other: do not use it; the body moved between the two "
                 "exposures, or the images do not belong together"
             )
-        if odd := [r.shot for r in good if r.misfit > 1]:
-            which = f" ({', '.join(odd)})" if len(odd) <= NAMED else ""
-            worse = f"{len(odd)} fit the body worse than the noise allows{which}"
+        if odd := self.misfit.count:
+            which = f" ({self.misfit})" if odd <= NAMED else ""
+            worse = f"{odd} fit the body worse than the noise allows{which}"
             said.append(f"{worse} (misfit in their lines; their sigma includes it)")
             # The board as the rig's calibration found it, where it is measured by its drawing.
             given, board = self.rig.provenance.get("target"), self.rig.provenance.get("board")
@@ -239,8 +279,10 @@ class MeasureRun:
         for record in self.records:
             if record.way is not None and record.took_ms is not None:
                 took.setdefault(record.way, []).append(record.took_ms)
-        often = sorted(took.items(), key=lambda item: -len(item[1]))
-        return ", ".join(f"{len(times)} {way} ({np.median(times):.1f} ms each)" for way, times in often)
+        return ", ".join(
+            f"{count} {way}" + (f" ({np.median(took[way]):.1f} ms each)" if way in took else "")
+            for way, count in self.ways.most_common()
+        )
 
     def keep_noise(self) -> bool:
         """Say how noisy the cameras' discs were, and write the rig with that and with the shutters that were found.
@@ -250,7 +292,6 @@ class MeasureRun:
         """
         rig, shots, save_rig = self.rig, self.shots, self.options.save_rig
         found = None if shots.noise is None or shots.skewed else shots.noise.found()
-        moved = next((record.shutters for record in self.records if record.shutters is not None), None)
         if found is not None:
             left, right = found
             kept = (
@@ -260,13 +301,13 @@ class MeasureRun:
                 f"note: discs' centres vary {left} (left) and {right} (right) times as much as single images say{kept}",
                 err=True,
             )
-        if save_rig is not None and found is None and moved is None:
+        if save_rig is not None and found is None and self.shutters is None:
             few = "too few shots, or the body moved too little, to know the discs' noise"
             why = "the shots show a skew, which hides the discs' noise: give --skew find" if shots.skewed else few
             _warn(f"{save_rig} was not written: {why}")
             return False
         if save_rig is not None:
-            replace(rig, shutters=moved or rig.shutters, disc_noise=found or rig.disc_noise).save(save_rig)
+            replace(rig, shutters=self.shutters or rig.shutters, disc_noise=found or rig.disc_noise).save(save_rig)
         return True
 
     def concluded(self, contradicted: HealthFinding | None) -> tuple[HealthFinding, ...]:

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Collection, Iterable, Iterator
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import click
@@ -37,7 +37,7 @@ from armsight.vision.sources import Source, notes_of, open_source
 from armsight.vision.sources.pairs import StoredSource
 
 #: So many shots that fit badly are named.
-NAMED = 3
+NAMED = 3  # half: fewer are looked at, double: longer lines
 #: So much a board that looks the same when it is rotated may be rotated less than by that, degrees.
 _ROTATED_SPARE_DEG = 35.0
 
@@ -60,6 +60,7 @@ class DetectedShots:
 
     discs = noise = None
     recorded = True
+    moves = False
 
     def __init__(self, options: MeasureOptions, rig: StereoRig) -> None:
         """Read them."""
@@ -77,7 +78,7 @@ class DetectedShots:
     def close(self) -> None:
         """Close nothing: all was read."""
 
-    def finish(self, records: list[ShotPose]) -> None:
+    def finish(self, records: Collection[ShotPose]) -> None:
         """Say nothing more."""
 
     def mistake(self) -> str:
@@ -94,6 +95,7 @@ class ImageShots:
         results: what each shot shows, as they are read.
         recorded: whether they were taken before.
         noise: what gathers the noise of discs.
+        moves: whether its shots are moved to one time.
         skewed: filled at the end: that the cameras do not expose at one time.
     """
 
@@ -124,7 +126,8 @@ class ImageShots:
             if requested is None and rig.shutters is not None and not self._timed:
                 click.echo(f"note: {options.rig} has {rig.shutters}, not used: no recording with times", err=True)
             self._requested = rig.shutters if requested is None and self._timed else requested
-            self._again = open_source(options.source) if self._requested is not None and draws else None
+            self.moves = self._requested is not None
+            self._again = open_source(options.source) if self.moves and draws else None
         except BaseException:
             self.close()
             raise
@@ -188,7 +191,7 @@ class ImageShots:
             if each is not None:
                 each.close()
 
-    def finish(self, records: list[ShotPose]) -> None:
+    def finish(self, records: Collection[ShotPose]) -> None:
         """Say what only the images showed."""
         source, target = self._source, self._target
         say(note for note in notes_of(source) if note not in self._said)
@@ -250,9 +253,23 @@ def say(notes: Iterable[str]) -> None:
         click.echo(f"note: {note}", err=True)
 
 
-def named(names: Sequence[str], most: int = NAMED) -> str:
-    """Return names as text, at most so many."""
-    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+@dataclass
+class NamedShots:
+    """Shots of one kind: how many they are, and the names of the first."""
+
+    count: int = 0
+    names: list[str] = field(default_factory=list)
+
+    def add(self, name: str) -> None:
+        """Count one."""
+        self.count += 1
+        if len(self.names) < NAMED:
+            self.names.append(name)
+
+    def __str__(self) -> str:
+        """Return the names, and how many more there are."""
+        more = self.count - len(self.names)
+        return ", ".join(self.names) + (f" and {more} more" if more else "")
 
 
 #: What a camera's driver may have done to its images -> how it is undone.
@@ -280,7 +297,7 @@ def _undone(left: Image, right: Image) -> dict[str, tuple[Image, Image]]:
     return undone
 
 
-def reversed_notes(target: Target, records: list[ShotPose]) -> list[str]:
+def reversed_notes(target: Target, records: Iterable[ShotPose]) -> list[str]:
     """Say which shots show a board that looks the same when it is rotated, rotated so against the shot before."""
     if not target.symmetries:
         return []
@@ -291,8 +308,9 @@ def reversed_notes(target: Target, records: list[ShotPose]) -> list[str]:
     names = [record.shot for record, angle in zip(measured[1:], angles, strict=True) if angle > least]
     if not names:
         return []
+    which = NamedShots(len(names), names[:NAMED])
     return [
-        f"{named(names)}: rotated by {least + _ROTATED_SPARE_DEG:.0f} degrees or so against the shot before; this board "
+        f"{which}: rotated by {least + _ROTATED_SPARE_DEG:.0f} degrees or so against the shot before; this board "
         "looks the same then, and its origin is the corner most to the upper left in the image: codes, rings, or one even "
         "and one odd count of a chessboard distinguish its ends"
     ]

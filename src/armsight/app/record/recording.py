@@ -6,9 +6,6 @@ A line is added after both images are complete on disk: whatever stops the recor
 
 from __future__ import annotations
 
-import csv
-import errno
-import io
 import os
 import time
 from collections.abc import Callable
@@ -21,7 +18,7 @@ import numpy as np
 from armsight.app.interrupts import uninterrupted
 from armsight.data import SIDES, Shot
 from armsight.errors import ArmsightError, InputError
-from armsight.files import check_folder, replacing
+from armsight.files import RowFile, check_folder, replacing
 from armsight.vision.source import Source
 from armsight.vision.sources.folder import COLUMNS, INDEX
 
@@ -136,8 +133,7 @@ class ShotFolder:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self._index: int | None = None
-        self._whole = 0  # bytes of the index that are complete
+        self._index: RowFile | None = None
         self.shots = 0
         self.problems = 0
 
@@ -163,13 +159,11 @@ class ShotFolder:
                     encoded.append(data.tobytes())
             names = [file.name for file in files] or ["", ""]
             t_s = "" if shot.t_s is None else f"{shot.t_s:.6f}"
-            self._append(index, [shot.name, t_s, *names, " ".join((shot.problem or "").split())])
+            index.add([shot.name, t_s, *names, " ".join((shot.problem or "").split())])
         except InputError:
-            os.ftruncate(index, self._whole)
             for path in files:
                 path.unlink(missing_ok=True)
             raise
-        self._whole = os.fstat(index).st_size
         self.shots += 1
         self.problems += shot.problem is not None
         return shot if shot.encoded is not None or not encoded else replace(shot, encoded=(encoded[0], encoded[1]))
@@ -177,28 +171,17 @@ class ShotFolder:
     def close(self) -> None:
         """Close the index, and remove it if it names no shot; what it names is on the disk then."""
         if self._index is not None:
-            os.close(self._index)
+            self._index.close()
             os.sync()
-            if self._whole == 0:
-                (self.folder / INDEX).unlink()
+            if self._index.rows == 0:
+                self._index.path.unlink()
 
-    def _opened(self) -> int:
-        """Return the open index, a file descriptor; make folder and index the first time."""
+    def _opened(self) -> RowFile:
+        """Return the open index; make folder and index the first time."""
         if self._index is None:
             try:
                 self.folder.mkdir(parents=True, exist_ok=True)
-                self._index = os.open(self.folder / INDEX, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o644)
             except OSError as error:
                 raise InputError(f"{self.folder}: no recording can be made here: {error.strerror}") from None
+            self._index = RowFile(self.folder / INDEX, COLUMNS)
         return self._index
-
-    def _append(self, index: int, row: list[str]) -> None:
-        """Append a line to the index in one write, the first time with the header above it."""
-        text = io.StringIO()
-        csv.writer(text, lineterminator="\n").writerows([row] if self._whole else [COLUMNS, row])
-        data = text.getvalue().encode()
-        try:
-            if os.write(index, data) < len(data):
-                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        except OSError as error:
-            raise InputError(f"{self.folder / INDEX}: cannot be written: {error.strerror}") from None

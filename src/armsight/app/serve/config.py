@@ -11,7 +11,7 @@ from typing import Any
 import click
 
 from armsight.errors import InputError
-from armsight.files import read_toml
+from armsight.files import read_toml, unused
 
 #: Keys of the table ``serve`` that are texts, and numbers.
 _TEXTS, _NUMBERS = ("http", "log"), ("log_mb", "log_files", "stale_s", "retry_s")
@@ -29,7 +29,7 @@ class ServeConfig:
     """What is kept going, and how.
 
     Attributes:
-        arguments: of `armsight measure`.
+        arguments: of `armsight measure`, without --output.
         folder: where relative paths begin: that of the file.
         http: where /healthz and /metrics are, ``host:port``; empty for nowhere.
         log: file of the log, empty for stderr.
@@ -37,6 +37,7 @@ class ServeConfig:
         log_files: older logs that are kept.
         stale_s: time without a shot after which the command is started again, s.
         retry_s: longest time between two tries, s.
+        output: file of the poses, empty for none.
     """
 
     arguments: tuple[str, ...]
@@ -47,6 +48,11 @@ class ServeConfig:
     log_files: int = 5
     stale_s: float = 10.0
     retry_s: float = 3.0
+    output: str = ""
+
+    def started(self) -> tuple[str, ...]:
+        """Return the arguments of the next start: its poses go into a file of their own, poses.csv, poses-2.csv ..."""
+        return self.arguments + ((f"--output={unused(self.folder / self.output)}",) if self.output else ())
 
 
 def read_config(path: Path) -> ServeConfig:
@@ -74,7 +80,8 @@ def read_config(path: Path) -> ServeConfig:
     except click.UsageError as error:
         raise InputError(f"{path}: [measure]: {error.format_message()}") from None
     _check(folder, given)
-    return ServeConfig(arguments, folder, **service)
+    each_start = tuple(each for each in arguments if not each.startswith("--output="))
+    return ServeConfig(each_start, folder, **service, output=str(given.get("output", "")))
 
 
 def _service(path: Path, given: Any) -> dict[str, Any]:  # noqa: ANN401 - whatever TOML holds

@@ -124,7 +124,7 @@ class Service:
 
     def _one(self, heard: socket.socket) -> int | None:
         """Start the child and listen to it until it ends or falls silent; return its exit code, None where it was ended."""
-        arguments = [*self._config.arguments, f"--stream=json+udp:127.0.0.1:{heard.getsockname()[1]}"]
+        arguments = [*self._config.started(), f"--stream=json+udp:127.0.0.1:{heard.getsockname()[1]}"]
         self._tries, self._last_line, self._lines = self._tries + 1, "", set()
         listener: threading.Thread | None = None
         try:

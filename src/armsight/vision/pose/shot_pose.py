@@ -199,27 +199,29 @@ def shot_pose(name: str, t_s: float | None, body: Body, result: PoseEstimate | M
     )
 
 
-def rows_of(poses: Sequence[ShotPose]) -> tuple[tuple[str, ...], list[list[Any]]]:
-    """Return the columns of a table of shots and its rows; None where a shot has no value.
+def row_of(p: ShotPose, columns: Sequence[str] = CSV_COLUMNS) -> list[Any]:
+    """Return a shot's row of a table with CSV_COLUMNS, and SHUTTER_COLUMNS behind them or not; None where it has no value.
 
-    ``cov_ij`` is the upper triangle of ``covariance``. Where shots were moved to one time, SHUTTER_COLUMNS follow.
+    ``cov_ij`` is the upper triangle of ``covariance``.
     """
+    row: list[Any] = [p.shot, p.status, p.reason, p.t_s]
+    if p.ok:
+        row += [*p.position_m.tolist(), *p.quaternion_wxyz.tolist(), *p.euler_zyx_deg.tolist()]
+        row += np.sqrt(np.diag(p.cov_left)).tolist()
+        row += [p.residual_rms_m, p.reprojection_rms_px, p.misfit, len(p.points_m), len(p.dropped)]
+        row += [float(p.cov_left[i, j]) for i, j in UPPER]
+        for share in (p.cov_precision, p.cov_calibration):
+            row += np.sqrt(np.maximum(np.diag(share), 0.0)).tolist()
+    if p.shutters is not None:
+        row += [None] * (len(CSV_COLUMNS) - len(row))
+        row += [p.shutters.skew_s, p.shutters.readout_s, *p.shutters.sigmas.tolist()]
+    return row + [None] * (len(columns) - len(row))
+
+
+def rows_of(poses: Sequence[ShotPose]) -> tuple[tuple[str, ...], list[list[Any]]]:
+    """Return the columns of a table of shots, SHUTTER_COLUMNS where shots were moved to one time, and its rows."""
     columns = CSV_COLUMNS + (SHUTTER_COLUMNS if any(p.shutters is not None for p in poses) else ())
-    rows = []
-    for p in poses:
-        row: list[Any] = [p.shot, p.status, p.reason, p.t_s]
-        if p.ok:
-            row += [*p.position_m.tolist(), *p.quaternion_wxyz.tolist(), *p.euler_zyx_deg.tolist()]
-            row += np.sqrt(np.diag(p.cov_left)).tolist()
-            row += [p.residual_rms_m, p.reprojection_rms_px, p.misfit, len(p.points_m), len(p.dropped)]
-            row += [float(p.cov_left[i, j]) for i, j in UPPER]
-            for share in (p.cov_precision, p.cov_calibration):
-                row += np.sqrt(np.maximum(np.diag(share), 0.0)).tolist()
-        if p.shutters is not None:
-            row += [None] * (len(CSV_COLUMNS) - len(row))
-            row += [p.shutters.skew_s, p.shutters.readout_s, *p.shutters.sigmas.tolist()]
-        rows.append(row + [None] * (len(columns) - len(row)))
-    return columns, rows
+    return columns, [row_of(p, columns) for p in poses]
 
 
 def csv_text(poses: Sequence[ShotPose]) -> str:
