@@ -90,7 +90,7 @@ def test_windings_that_warm_or_cool_are_followed(motors, library, share):
 
 @pytest.mark.parametrize("seed", [556009, 556037, 556178])
 def test_a_warm_winding_whose_voltage_hardly_changes_is_no_fault(motors, library, seed):
-    """How a current answers is uncertain where few changes of voltage show it: the noise of the current may be most of it."""
+    """Few changes of voltage show little of how the current answers: noise of the current may be most of it."""
     table = motors.Table()
     motors.warming(library, seed, table, seconds=20, share=1.4, moving=True)
     assert [list(codes) for codes in table.codes.values()] == [["-"]]
