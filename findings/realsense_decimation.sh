@@ -1,11 +1,11 @@
 #!/bin/sh
 # pyrealsense2 2.59.1: the intrinsics of decimated depth are those of other pixels: points are displaced sideways.
 #
-# decimation_filter puts n x n pixels into one, pixel u of the result covers n u to n u + n - 1 and has its centre at
-# n u + (n - 1) / 2. The filter's profile has the principal point divided by n, as if pixel u were at n u: half a pixel of the
-# result, less 1 / 2 n, to the right of and below where it is. Deprojected points are displaced by (n - 1) / 2 f of their distance
-# against those of the full image (whose pixel (0, 0) is documented as a centre): 0.8 mm a metre at n = 2 and f 600 px, 5.8 mm at n = 8. cv2.resize and the rest of
-# the field's use (c + 0.5) / n - 0.5. Where n does not divide the size (3, 6, 7) columns of zeros, no depth, are appended.
+# decimation_filter puts n x n pixels into one: pixel u of the result covers n u to n u + n - 1 and has its centre at
+# n u + (n - 1) / 2. The filter's profile has the principal point divided by n, as if pixel u were at n u (pixel (0, 0) is
+# documented as a pixel's centre). Deprojected points are displaced by (n - 1) / 2 f of their distance against those of the
+# full image: 0.8 mm a metre at n = 2 and f 600 px, 5.8 mm at n = 8. The rest of the field uses (c + 0.5) / n - 0.5. Where n
+# does not divide the size (3, 6, 7), columns of zeros, no depth, are appended.
 #
 # A mark of 16 x 16 px, its centre at pixel (407.5, 247.5) of 640 x 480, 1 m away; principal point (320, 240), f 600 px.
 #

@@ -4,7 +4,7 @@
 # IMREAD_UNCHANGED and IMREAD_IGNORE_ORIENTATION leave the pixels of a JPEG where they are stored, whatever its EXIF says.
 # Of a TIFF with the orientation tag (274) imdecode rotates and mirrors the array under every flag, these two included; the
 # TIFF decoder does it itself. imread does so for orientations 1 to 4, and returns None where rows become columns: the same
-# file is an image from memory and none from disk. Pillow's Image.open does the same for TIFF alone, its JPEGs need ImageOps.exif_transpose.
+# file is an image from memory and none from disk. Pillow's Image.open moves TIFFs alone, JPEGs need ImageOps.exif_transpose.
 # tifffile returns the array as it is stored. A camera mounted on its side that writes the tag has its calibration in other
 # pixels than its images, once one of both is stored as TIFF and the other is not, or is read by another library.
 #
