@@ -15,7 +15,7 @@ import json
 import os
 import re
 import stat
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
@@ -31,6 +31,7 @@ _JSON_PARTS = (
     1_000_000  # lists, mappings and pairs of values of a JSON text; half: long tracks are rejected; double: 400 MB
 )
 TABLE_MB = 64  # half: an hour of a run is rejected; double: twice the memory
+LONG_TABLE_MB = 2000  # of a table that is read piece by piece; half: 2 hours of a run are rejected; double: nothing
 #: Cells and lines of a table, of up to 72 bytes each; half: 5 minutes of detections are rejected; double: 700 MB.
 _TABLE_CELLS = 5_000_000
 _LONGEST_LINE = 1_000_000  # characters of a table's line; half, double: the same, no table has such lines
@@ -231,17 +232,37 @@ def read_table(path: str | Path) -> list[list[str]]:
     return rows
 
 
+def is_long(path: str | Path) -> bool:
+    """Return whether a table is one of numbers between commas, so long that it is to be read piece by piece."""
+    with opened(path, LONG_TABLE_MB) as file:
+        size, head = os.fstat(file.fileno()).st_size, file.read(_LONGEST_LINE).partition(b"\n")[0]
+    return size > DOCUMENT_MB * _MB and b"," in head and head.isascii()
+
+
+def long_rows(path: str | Path) -> Generator[list[str]]:
+    """Yield the rows of cells of such a table, its header first; errors as :func:`read_table`."""
+    with opened(path, LONG_TABLE_MB) as raw, io.TextIOWrapper(raw, "utf-8") as text:
+        try:
+            yield from csv.reader(_bounded(path, text))
+        except csv.Error as error:
+            raise InputError(f"{path}: not a table: {error}") from None
+
+
 def _lines(path: str | Path) -> Iterator[str]:
     """Yield the lines of a table; errors as :func:`read_text`."""
     data = read_bytes(path, TABLE_MB)
-    file = io.TextIOWrapper(io.BytesIO(data), _encoding(path, data))
+    return _bounded(path, io.TextIOWrapper(io.BytesIO(data), _encoding(path, data)))
+
+
+def _bounded(path: str | Path, file: io.TextIOWrapper) -> Iterator[str]:
+    """Yield the lines of a text file, none of them longer than a table's."""
     try:
         while line := file.readline(_LONGEST_LINE + 1):
             if len(line) > _LONGEST_LINE:
                 raise InputError(f"{path}: a line of more than {_LONGEST_LINE} characters: not a table")
             yield line
     except UnicodeDecodeError as error:
-        raise InputError(_no_text(path, data, error)) from None
+        raise InputError(_no_text(path, b"", error)) from None
 
 
 def _with_points(path: str | Path, rows: list[list[str]]) -> list[list[str]]:

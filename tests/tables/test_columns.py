@@ -51,3 +51,23 @@ def test_cells_that_are_empty_and_lines_that_end_early(tmp_path):
 )
 def test_one_number_parser(text, value):
     assert number(text) == value
+
+
+def test_a_long_table_stays_in_its_file_and_is_read_as_a_short_one(tmp_path, monkeypatch):
+    """An hour of a run at 1 kHz: the same numbers, texts, lines and errors as by the whole file at once."""
+    path = tmp_path / "joints.csv"
+    path.write_text('"t_s", x_m ,phase\n0,1.5,rest\n\n1,nan,"open, loop"\n2,-2e-3\n')
+    tables = [Columns.of_csv(path)]
+    monkeypatch.setattr("armsight.files.DOCUMENT_MB", 1e-6)
+    tables.append(Columns.of_csv(path))
+    assert isinstance(tables[0].rows, list)
+    assert not isinstance(tables[1].rows, list)
+    for table in tables:
+        np.testing.assert_array_equal(table.numbers(["t_s", "x_m"], gaps=True), [[0, 1.5], [1, np.nan], [2, -2e-3]])
+        assert table.texts("phase") == ["rest", "open, loop", ""]
+        assert [table.line(k) for k in range(3)] == [2, 4, 5]
+        with pytest.raises(InputError, match=r"joints\.csv: line 4: x_m is 'nan', not a number"):
+            table.numbers(["x_m"])
+    monkeypatch.setattr("armsight.tables.columns._MOST_NUMBERS", 5)
+    with pytest.raises(InputError, match="3 rows of 2 numbers are too many"):
+        tables[1].numbers(["t_s", "x_m"], gaps=True)

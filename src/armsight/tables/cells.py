@@ -19,7 +19,7 @@ from armsight.tables.lengths import NUMBER, number
 from armsight.tables.nested import BY_COUNT, PACKED, document_rows, is_document, is_packed
 from armsight.tables.programs import program_rows
 
-Rows = list[tuple[int, list[str]]]
+Rows = Sequence[tuple[int, list[str]]]
 #: A number with its unit.
 _WITH_UNIT = re.compile(rf"({NUMBER}|{DECIMAL_COMMA.pattern})\s*(mm|m|deg|\N{{DEGREE SIGN}}|rad|s)")
 _LIST = re.compile(r"\[([^\[\]{}\"]*)\],?")  # a list alone in its line

@@ -6,16 +6,21 @@ In: names of a file, and the option ``--columns``. Out: names such as x_mm, qw, 
 
 from __future__ import annotations
 
+import contextlib
+import itertools
+import math
 import re
-from collections.abc import Mapping, Sequence
+import sys
+from collections.abc import Generator, Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from armsight.data import Array
 from armsight.errors import InputError
-from armsight.files import read_table
+from armsight.files import is_long, long_rows, read_table
 from armsight.geometry.rotation import nearest_rotation
 from armsight.tables.cells import Rows, renamed
 from armsight.tables.lengths import number
@@ -46,6 +51,8 @@ _MAKERS = {"KUKA": ("c", "b", "a"), "Fanuc": ("w", "p", "r")}
 _OF_A_MAKER = re.compile(r"(?:([xyz])(?:_(m|mm))?|([abcwpr])(?:_(deg|rad))?)")  # a column of theirs, in small letters
 _UNITLESS = re.compile(r"(?:q|j|joint)_?([1-7])")  # a joint without a unit
 _JOINT = re.compile(r"q(\d+)_(rad|deg)")
+#: Numbers that are read of one table; half: half an hour of a run at 1 kHz is rejected, double: 800 MB.
+_MOST_NUMBERS = 50_000_000
 
 
 def understood(
@@ -155,6 +162,32 @@ def degree_columns(path: str | Path, rows: list[list[str]]) -> list[list[str]]:
     return [[f"q{at[k]}_deg" if k in at else name for k, name in enumerate(head)], *rows[1:]]
 
 
+def _padded(row: list[str], head: list[str]) -> list[str]:
+    return row + [""] * (len(head) - len(row))
+
+
+class _StoredRows(Sequence[tuple[int, list[str]]]):
+    """Lines and rows of a long table, which stay in its file: each look at them all reads it again."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        with contextlib.closing(long_rows(path)) as rows:
+            self.head = [cell.strip() for cell in next(rows, [])]
+        self._count = sum(1 for _ in self)
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __iter__(self) -> Generator[tuple[int, list[str]]]:
+        for line, row in enumerate(long_rows(self._path), 1):
+            if line > 1 and any(row):
+                yield line, _padded([cell.strip() for cell in row], self.head)
+
+    def __getitem__(self, row: Any) -> Any:  # noqa: ANN401 - the line and the row; a slice of none is asked for
+        with contextlib.closing(iter(self)) as rows:
+            return next(itertools.islice(rows, row, None))
+
+
 class Columns:
     """Columns of a table by their names."""
 
@@ -175,11 +208,20 @@ class Columns:
         Raises:
             InputError: no table, a column named twice, or one that is not there.
         """
-        head, *rows = [[cell.strip() for cell in row] for row in read_table(path)] or [[]]
+        rows: Rows
+        if is_long(path):
+            rows = _StoredRows(path)
+            head = rows.head
+        else:
+            head, *cells = [[cell.strip() for cell in row] for row in read_table(path)] or [[]]
+            rows = [(line, _padded(row, head)) for line, row in enumerate(cells, 2) if any(row)]
         if twice := next((name for name in head if name and head.count(name) > 1), None):
             raise InputError(f"{path}: line 1 names a column twice: {twice}")
-        padded = ((line, row + [""] * (len(head) - len(row))) for line, row in enumerate(rows, 2) if any(row))
-        return cls(path, renamed(path, head, columns), list(padded))
+        return cls(path, renamed(path, head, columns), rows)
+
+    def line(self, row: int | np.integer[Any]) -> int:
+        """Return which line of the file, or record, a row is."""
+        return self.rows[int(row)][0]
 
     def has_position(self) -> bool:
         """Return whether there are positions."""
@@ -195,25 +237,35 @@ class Columns:
     def texts(self, name: str) -> list[str]:
         """Return the cells of a column (N,), "" where there is no such column."""
         at = self.at.get(name)
-        return ["" if at is None else row[at] for _, row in self.rows]
+        return ["" if at is None else sys.intern(row[at]) for _, row in self.rows]
 
     def numbers(self, names: Sequence[str], *, gaps: bool = False, empty: bool = False) -> Array:
         """Return columns (N, K); with ``empty`` NaN where a cell is empty, with ``gaps`` also where it is not finite."""
         self.require(*names)
+        if len(self.rows) * len(names) > _MOST_NUMBERS:
+            raise InputError(
+                f"{self.path}: {len(self.rows)} rows of {len(names)} numbers are too many: split the table"
+            )
         out = np.full((len(self.rows), len(names)), np.nan)
+        columns = [self.at[name] for name in names]
         for i, (line, row) in enumerate(self.rows):
-            for k, name in enumerate(names):
-                cell = row[self.at[name]] if self.at[name] < len(row) else ""
-                if not cell and (gaps or empty):
-                    continue
-                value = number(cell)
-                if value is None or not (gaps or np.isfinite(value)):
-                    raise InputError(
-                        f"{self.path}: line {line}: {name} is {cell[:40]!r}, not a number; finite numbers are needed: "
-                        "correct or remove the line"
-                    )
-                out[i, k] = value if np.isfinite(value) else np.nan
+            cells = [row[k] if k < len(row) else "" for k in columns]
+            values = [math.nan if value is None else value for value in map(number, cells)]
+            if not all(map(math.isfinite, values)):
+                self._check(line, dict(zip(names, cells, strict=True)), gaps=gaps, empty=empty or gaps)
+                values = [value if math.isfinite(value) else math.nan for value in values]
+            out[i] = values
         return out
+
+    def _check(self, line: int, cells: Mapping[str, str], *, gaps: bool, empty: bool) -> None:
+        """Reject a row's cell that is no number, or with no ``gaps`` not finite; ``empty``: it may be empty."""
+        for name, cell in cells.items():
+            value = number(cell)
+            if (cell or not empty) and (value is None or not (gaps or math.isfinite(value))):
+                raise InputError(
+                    f"{self.path}: line {line}: {name} is {cell[:40]!r}, not a number; finite numbers are needed: "
+                    "correct or remove the line"
+                )
 
     def joint_names(self, joint_count: int | None = None, arm: str = "") -> list[str]:
         """Return the names of the columns of joint angles, from the first joint on; [] where there are none.
@@ -258,7 +310,7 @@ class Columns:
         if names[0].endswith("_rad") and np.nanmax(np.abs(q), initial=0.0) > MOST_RAD:
             row, joint = np.unravel_index(int(np.nanargmax(np.abs(q))), q.shape)
             raise InputError(
-                f"{self.path}: line {self.rows[row][0]}: q{joint + 1}_rad is {q[row, joint]:g}: are these degrees? name "
+                f"{self.path}: line {self.line(row)}: q{joint + 1}_rad is {q[row, joint]:g}: are these degrees? name "
                 "the columns q1_deg .."
             )
         return np.radians(q) if names[0].endswith("_deg") else q
@@ -330,7 +382,7 @@ class Columns:
         if unit == "_rad" and np.abs(found).max() > MOST_RAD:
             row, column = np.unravel_index(int(np.abs(found).argmax()), found.shape)
             raise InputError(
-                f"{self.path}: line {self.rows[row][0]}: {names[column]} is {found[row, column]:g}: are these degrees? "
+                f"{self.path}: line {self.line(row)}: {names[column]} is {found[row, column]:g}: are these degrees? "
                 "name the columns rx_deg ry_deg rz_deg"
             )
         radians = unit == "_rad" or (unit != "_deg" and bool((np.abs(found) <= 2 * np.pi + 1e-3).all()))

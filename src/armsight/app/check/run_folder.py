@@ -51,6 +51,7 @@ _MOVES_RAD = float(np.radians(0.5))
 _NEAR = 0.015
 #: From here on a joint was elsewhere, rad: what it was off by less does not take up its backlash.
 _AWAY_RAD = float(np.radians(0.3))
+_LOOK_ROWS = 4096  # that are looked through at once; half, double: so much memory
 #: Columns of joints.csv in version 1 of a run's folder -> their present names; both are read.
 _VERSION_1 = {f"q{joint}_wanted_rad": f"q{joint}_ref_rad" for joint in range(1, MOST_JOINTS + 1)}
 
@@ -104,10 +105,18 @@ class JointTrack(Record):
 
     def sides(self, t_s: float) -> Array:
         """Return how each joint came to its command at a time, s (n,): 1 with rising angle, -1 with falling, 0 unmoved."""
-        q = self.q_ref[: max(int(np.searchsorted(self.t_s, t_s, side="right")), 1)]
-        away = np.abs(q - q[-1]) > _AWAY_RAD
-        last = len(q) - 1 - np.argmax(away[::-1], axis=0)
-        return np.where(away.any(axis=0), np.sign(q[-1] - q[last, np.arange(q.shape[1])]), 0.0)
+        end = max(int(np.searchsorted(self.t_s, t_s, side="right")), 1)
+        here = self.q_ref[end - 1]
+        sides = np.zeros(len(here))
+        for stop in range(end, 0, -_LOOK_ROWS):  # backwards: what the joints did before their last motion is of no use
+            away = self.q_ref[max(stop - _LOOK_ROWS, 0) : stop] - here
+            far = np.abs(away) > _AWAY_RAD
+            last = len(far) - 1 - np.argmax(far[::-1], axis=0)
+            found = far.any(axis=0) & (sides == 0)
+            sides = np.where(found, -np.sign(away[last, np.arange(len(here))]), sides)
+            if sides.all():
+                break
+        return sides
 
 
 def joint_track(folder: Path, joints: int | None = None) -> JointTrack:

@@ -319,7 +319,7 @@ def read_track(file: Path, more: tuple[str, ...] = ()) -> tuple[ToolTrack, Array
         raise InputError(f"{file}: no rows")
     falls = np.flatnonzero(np.diff(numbers[:, 0]) < 0)
     if len(falls):
-        line, _ = table.rows[falls[0] + 1]
+        line = table.line(falls[0] + 1)
         raise InputError(f"{file}: line {line}: t_s is less than in the line before; times must rise")
     if not np.linalg.norm(numbers[:, 4:8], axis=1).all():
         raise InputError(f"{file}: a quaternion qw .. qz is zero")

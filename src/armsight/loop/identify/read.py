@@ -253,7 +253,7 @@ def _rotation_columns(table: Columns, convention: str | None) -> tuple[list[str]
 def _gaps(table: Columns, requested: list[str], numbers: Array) -> tuple[str, ...]:
     """Return a note on rows with gaps; reject a file that has hardly another."""
     gaps = np.flatnonzero(~np.isfinite(numbers).all(axis=1))
-    named = [(table.rows[k][0], requested[int(np.argmin(np.isfinite(numbers[k])))]) for k in gaps]
+    named = [(table.line(k), requested[int(np.argmin(np.isfinite(numbers[k])))]) for k in gaps[:5]]
     if len(gaps) > len(numbers) - len(gaps):
         line, name = named[0]
         raise InputError(
@@ -261,7 +261,7 @@ def _gaps(table: Columns, requested: list[str], numbers: Array) -> tuple[str, ..
         )
     if len(numbers) == 0:
         raise InputError(f"{table.path}: no rows; one line a pose is needed")
-    where = ", ".join(f"line {line} ({name})" for line, name in named[:5]) + (", .." if len(gaps) > 5 else "")
+    where = ", ".join(f"line {line} ({name})" for line, name in named) + (", .." if len(gaps) > 5 else "")
     return (f"{len(gaps)} rows left out, empty or no finite number: {where}",) if named else ()
 
 
@@ -270,7 +270,7 @@ def _repeated(table: Columns, numbers: Array, good: NDArray[np.bool_]) -> tuple[
     rows = np.flatnonzero(good)
     again = np.delete(rows, np.unique(numbers[rows], axis=0, return_index=True)[1])
     good[again] = False
-    where = ", ".join(f"line {table.rows[k][0]}" for k in again[:5]) + (", .." if len(again) > 5 else "")
+    where = ", ".join(f"line {table.line(k)}" for k in again[:5]) + (", .." if len(again) > 5 else "")
     return (f"{len(again)} rows repeat another to the last digit, and are left out: {where}",) if len(again) else ()
 
 
