@@ -10,7 +10,7 @@ from faults import BODY, RATE_HZ, SIGMA_PX, SIGMAS, SYNC_S, TRUE, measured, watc
 from armsight.geometry.pose import inverse, log_se3, pose
 from armsight.geometry.rotation import exp_so3
 from armsight.loop.health import HealthMonitor
-from armsight.loop.health.residuals import ResidualSums, Since
+from armsight.loop.health.residuals import Grown, History, ResidualSums
 from armsight.loop.health.rig import RigWatch
 from armsight.vision.pose.locate import locate
 from armsight.vision.triangulate import triangulate
@@ -177,18 +177,43 @@ def test_a_focal_length_that_drifts_is_said_to_go_on_and_poses_are_widened():
     assert np.mean([off @ np.linalg.solve(cov, off) for off, cov in offs]) < 12.0
 
 
-def test_sums_of_what_grows_are_those_of_its_own_columns():
-    """Of rows whose last columns are multiplied by the share of a test's time, added up one by one."""
+@pytest.mark.parametrize(("begin", "end"), [(1, 1), (1, 3), (2, 6), (5, 6)])
+def test_sums_of_what_grows_are_those_of_its_own_columns(begin, end):
+    """Of rows whose last columns are multiplied by the share of a test's time, added up one by one.
+
+    The test before the beginning is left out, and those before it say of the first columns what they did.
+    """
     rng = np.random.default_rng(8)
-    rows, begins_s = rng.normal(size=(5, 9, 6)), [2.0, 3.0, 4.5, 5.0, 7.0]
-    tests, slow = [], np.zeros((6, 6))
-    for each, begin_s in zip(rows, begins_s, strict=True):
-        tests.append(ResidualSums(5, begin_s))
-        tests[-1].take(each, 9.0)
-        scaled = each * np.append(np.ones(4), np.full(2, (begin_s - 2.0) / 5.0))
-        slow += scaled.T @ scaled
-    np.testing.assert_allclose(Since(tests, 3).ramped(0).M, slow, rtol=1e-12)
-    np.testing.assert_array_equal(Since(tests, 3).ramped(4).M, tests[4].M)  # one test: a step
+    rows, begins_s = rng.normal(size=(7, 9, 6)), np.array([2.0, 3.0, 4.5, 5.0, 7.0, 8.5, 9.0])
+    tests, slow = History(3, 5), np.zeros((6, 6))
+    since = np.clip((begins_s - begins_s[begin]) / max(begins_s[end] - begins_s[begin], 1e-9), 0.0, 1.0)
+    shares = np.where(begins_s >= begins_s[end], 1.0, since)
+    for k, (each, begin_s) in enumerate(zip(rows, begins_s, strict=True)):
+        sums = ResidualSums(5, begin_s)
+        sums.take(each, 9.0)
+        tests.keep(sums, np.inf)
+        scaled = each * np.append(np.ones(4), np.full(2, shares[k]))
+        slow += (k != begin - 1) * scaled.T @ scaled
+    found = tests.since(Grown(begins_s[begin], begins_s[end]))
+    np.testing.assert_allclose(found.M, slow, rtol=1e-9, atol=1e-9)
+    assert found.freedom == 9.0 * 6
+    if end == 6:
+        np.testing.assert_array_equal(tests.since(Grown(begins_s[begin])).M, found.M)
+
+
+def test_what_is_no_longer_kept_says_of_the_parameters_what_it_did():
+    """History of before a change settle, with less weight the older they are, until it began; those after it do not."""
+    rng, tests, kept = np.random.default_rng(9), History(3, 5), np.zeros((4, 4))
+    for k in range(45):
+        sums = ResidualSums(5, float(k))
+        sums.take(rng.normal(size=(9, 6)), 9.0)
+        tests.keep(sums, 12.0)
+        if k < 11:  # the eleventh may be of both times
+            kept = np.exp(-1.0 / 30.0) * kept + sums.M[:4, :4]
+    found = tests.since(Grown(12.0, 12.0))
+    after = sum(each.M for each in tests.kept)
+    np.testing.assert_allclose(found.M[:4, :4] - after[:4, :4], kept, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(found.M[4:], after[4:])
 
 
 def test_a_focal_length_that_grew_and_stands_still_is_as_large_as_it_is():

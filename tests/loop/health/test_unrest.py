@@ -76,7 +76,8 @@ def test_images_seen_before_say_nothing_new():
             often.take(estimate, t_s + 3.0 * k)
             if k == 0:
                 once.take(estimate, t_s)
-    np.testing.assert_array_equal(often._ended()._whole.M, once._ended()._whole.M)
+        kept = [each._ended()._wholes.kept for each in (often, once)]
+    np.testing.assert_array_equal(*([each.M for each in tests] for tests in kept))
 
 
 def test_unrest_finds_a_variance_and_no_other():

@@ -38,7 +38,7 @@ import numpy as np
 
 from armsight.data import Array
 from armsight.loop.finding import HealthFinding, displacement_m
-from armsight.loop.health.residuals import UNKNOWN_SHARE, ExposedShot, ResidualSums, eliminated, total
+from armsight.loop.health.residuals import UNKNOWN_SHARE, ExposedShot, Grown, History, ResidualSums, eliminated
 
 #: Standard deviations that are tried of the times that each shot has of its own, s, and that of the times that all share.
 _APART_S, _SHARED_S = (0.0, *(1e-3 * 2.0**k for k in range(-2, 7))), 0.03
@@ -54,7 +54,9 @@ _MODELLED = 0.05
 _ALIKE = 6.0
 #: Times are another in each shot where their own part is this share of what all have in common at the least.
 _CONSTANT = 0.4
-#: Tests that must show something before it is said: one in which a camera moved is of both times, and looks alike.
+#: What passes and what stays began at one time where they are dated so near, s: each is known to about a test.
+_DATED_S = 2.0
+#: History that must show something before it is said: one in which a camera moved is of both times, and looks alike.
 _LEAST = 2
 #: Of the columns of a shot those of times: of the right camera, of the rows of the right and of the left one; acceleration.
 _TIMES = [0, 7, 8, 9]
@@ -236,25 +238,41 @@ def _occam(information: Array) -> float:
     return float(np.linalg.slogdet(_SHARED_S**2 * information)[1])
 
 
-def _without(tests: Sequence[_Doubtful], cause: Passes, excess: float) -> tuple[ResidualSums, float]:
-    """Return the sums of tests with a cause eliminated, and twice the logarithm of what chance explains with it.
+def _without(
+    tests: Sequence[_Doubtful], cause: Passes, excess: float, size: int
+) -> tuple[tuple[ResidualSums, ResidualSums], float]:
+    """Return the sums of tests with a cause eliminated, of steps and of ramps, and what chance explains with it.
+
+    The latter is twice its logarithm; ``size``: how many parameters there are.
 
     A focal length is another in each test, the times that shots share are the same in all: what differs, shots have of
     their own.
     """
     some = [each.shows(cause, excess) for each in tests]
-    sums = total([each.rests[cause].sums if shows else each.every for each, shows in zip(tests, some, strict=True)])
+    both = _summed(
+        [each.rests[cause].sums if shows else each.every for each, shows in zip(tests, some, strict=True)], size
+    )
     occam = sum(each.rests[cause].occam for each, shows in zip(tests, some, strict=True) if shows)
     times = [each.times for each, shows in zip(tests, some, strict=True) if shows and each.times is not None]
     if cause == "lens" or not times:
-        return sums, occam
-    for each in times:
-        sums.M += each.shared.T @ np.linalg.solve(each.found.information, each.shared)
+        return both, occam
     prior = np.eye(len(_TIMES)) / _SHARED_S**2
     information = prior + np.sum([each.found.information - prior for each in times], axis=0)
     shared = np.sum([each.shared for each in times], axis=0)
-    sums.M -= shared.T @ np.linalg.solve(information, shared)
-    return sums, occam + _occam(information)
+    for sums in both:
+        for each in times:
+            sums.M += each.shared.T @ np.linalg.solve(each.found.information, each.shared)
+        sums.M -= shared.T @ np.linalg.solve(information, shared)
+    return both, occam + _occam(information)
+
+
+def _summed(tests: Sequence[ResidualSums], size: int) -> tuple[ResidualSums, ResidualSums]:
+    """Return the sums of tests of what is the same in all, and of what grows in them, from nothing; but the parameters."""
+    both = History(size, len(tests[0].b))
+    for each in tests:
+        both.keep(each, np.inf)
+    begin_s = tests[0].begin_s
+    return both.since(Grown(begin_s, begin_s)), both.since(Grown(begin_s))
 
 
 class _Weighed(NamedTuple):
@@ -275,16 +293,21 @@ class _Weighed(NamedTuple):
     @classmethod
     def of(cls, tests: Sequence[_Doubtful], stays: Staying, size: int) -> _Weighed:
         """Weigh tests; ``size``: how many parameters there are."""
-        none = total([each.every for each in tests])
-        lefts = [_left(each, len(each.b)) for each in (none, *(_without(tests, cause, 1.0)[0] for cause in _PASSES))]
-        excess, of_none = max(min(lefts) / max(none.freedom, 1.0), 1.0), _left(none, size)
+        none = _summed([each.every for each in tests], size)
+        without = [_without(tests, cause, 1.0, size)[0][0] for cause in _PASSES]
+        lefts = [_left(each, len(each.b)) for each in (none[0], *without)]
+        excess, of_none = max(min(lefts) / max(none[0].freedom, 1.0), 1.0), _left(none[0], size)
+
+        def best(both: Sequence[ResidualSums], skewed: bool) -> float:
+            return max(stays(each, excess, skewed) for each in both[: len(tests)])
+
         explained, ahead = dict[Passes, float](), dict[Passes, float]()
         for cause in _PASSES:
-            sums, occam = _without(tests, cause, excess)
-            explained[cause] = 0.5 * ((of_none - _left(sums, size)) / excess - occam)
+            sums, occam = _without(tests, cause, excess, size)
+            explained[cause] = 0.5 * ((of_none - _left(sums[0], size)) / excess - occam)
             skewed = cause != "time"  # cameras that are apart by the same time always are no rival of times
-            ahead[cause] = explained[cause] + stays(sums, excess, skewed) - stays(none, excess, skewed)
-        return cls(excess, stays(none, excess, True), explained, ahead)
+            ahead[cause] = explained[cause] + best(sums, skewed) - best(none, skewed)
+        return cls(excess, best(none, True), explained, ahead)
 
     def best(self, shown: Passes | None, *, one: bool) -> Passes | None:
         """Return what passes that explains most; None where it is what stays.
@@ -415,7 +438,7 @@ class Passing:
         since_s = min(begins, default=0.0)
         # What is left of it looks like what stays: that cannot be excluded, but what was found before.
         others = [each for each in stays if each not in same]
-        before = [each for each in others if begins and each.since_s is not None and each.since_s < since_s - 1.0]
+        before = [each for each in others if begins and each.since_s is not None and each.since_s < since_s - _DATED_S]
         causes = [*(each.cause for each in others if each not in before), *(("lens",) if self.focal else ())]
         return (*before, _besides(replace(found, since_s=since_s if begins else None), causes))
 

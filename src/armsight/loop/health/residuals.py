@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from copy import copy
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from armsight.data import Array, Body, Ids, PoseEstimate
+from armsight.data import Array, Body, PoseEstimate
 from armsight.estimate.chance import chi_square_limit
 from armsight.geometry.pose import inverse, pose
 from armsight.loop.health.rows import LENS, differentiated, eliminate_pose
@@ -44,11 +45,14 @@ TRACK, _LONGEST_S = 5, 1.0
 UNKNOWN_SHARE = 0.2
 #: An acceleration moves the body like so many seconds of it, where times are of a second.
 _BENT_S = 0.1
-#: A change that goes on is looked for in more tests than this; half: steps are taken for it, double: it is found later.
-STEPS = 4
-#: What goes on is as large as a line through so many of the newest tests says; half: its sigma is 1.4 times as large,
-#: double: what came to rest, or bends, is off by more for longer.
-_NEWEST = 8
+#: Newest tests that are kept; half: what a change is compared with is forgotten sooner, double: 2 MB more. Those that are
+#: not kept are forgotten with this time constant, in tests.
+KEPT, _SETTLED = 30, 30.0
+#: So many newest tests, together, may be those after a change, or all; one that goes on is looked for in more than STEPS.
+#: half: steps are taken for it, double: it is found later.
+_AFTER, STEPS = (1, 2, 4, 8, 16), 4
+#: Beginnings that are tried first, and then all between the best one's neighbours.
+_BEGINS = 8
 #: The newest test agrees with all together unless chance explains their difference more rarely than this.
 UNLIKE = 0.01
 
@@ -317,11 +321,14 @@ class ResidualSums:
         self.M *= weight
         self.freedom *= weight
 
-    def besides(self, before: ResidualSums, size: int) -> ResidualSums:
-        """Return these with what sums from before say of the first parameters, the others being zero then."""
-        found = ResidualSums(len(self.b), self.begin_s)
-        found.M, found.freedom = self.M.copy(), self.freedom + before.freedom
-        found.M[: 1 + size, : 1 + size] += before.M[: 1 + size, : 1 + size]
+    def copied(self) -> ResidualSums:
+        """Return a copy."""
+        return self.of(len(self.b))
+
+    def reduced(self, count: int) -> ResidualSums:
+        """Return those of the others, with the first parameters eliminated, which have priors of variance 1."""
+        found = ResidualSums(len(self.b) - count, self.begin_s)
+        found.M, found.freedom = eliminated(self.M, slice(1, 1 + count)), self.freedom
         return found
 
     def of(self, size: int) -> ResidualSums:
@@ -372,68 +379,161 @@ def total(tests: Sequence[ResidualSums]) -> ResidualSums:
     return found
 
 
-class Since:
-    """The sums of some tests since each one of them, all added up in one pass.
+class Grown(NamedTuple):
+    """A change that grew from nothing to what it is.
 
-    Args:
-        tests: in the order of time.
-        size: count of the first parameters, which never grow.
+    Attributes:
+        begin_s: when it began, s.
+        end_s: when it ended, s: of a step when it began, infinite of what goes on.
     """
 
-    def __init__(self, tests: Sequence[ResidualSums], size: int) -> None:
-        self._begins_s, self._size = np.array([each.begin_s for each in tests]), size
-        M = np.array([each.M for each in tests])
-        ages_s = (self._begins_s - self._begins_s[-1])[:, None, None]
-        by_age = ages_s * M[:, 1 + size :]
-        self._M, self._once, self._twice, self._freedom = (
-            np.cumsum(each[::-1], axis=0)[::-1]
-            for each in (M, by_age, ages_s * by_age[:, :, 1 + size :], np.array([each.freedom for each in tests]))
-        )
+    begin_s: float
+    end_s: float = np.inf
 
-    def plain(self, k: int) -> ResidualSums:
-        """Return the sums of the tests from one on."""
-        found = ResidualSums(self._M.shape[1] - 1, float(self._begins_s[k]))
-        found.M, found.freedom = self._M[k].copy(), float(self._freedom[k])
-        return found
-
-    def ramped(self, k: int) -> ResidualSums:
-        """Return the same where all but the first parameters grow with time, from zero to what they are now."""
-        found, rest = self.plain(k), slice(1 + self._size, None)
-        span_s = float(self._begins_s[-1] - self._begins_s[k])
-        if span_s > 0.0:  # else all are of now
-            once, twice = self._once[k] / span_s, self._twice[k] / span_s**2
-            found.M[rest] += once
-            found.M[:, rest] += once.T
-            found.M[rest, rest] += twice
-        return found
+    @property
+    def goes_on(self) -> bool:
+        """Whether it grows still."""
+        return self.end_s == np.inf
 
 
-def lined(tests: Sequence[ResidualSums], before: Array, columns: Ids) -> tuple[Array, Array]:
-    """Return what the newest tests say of parameters that are on a line in time, and the covariance (2 C, 2 C).
+class History:
+    """The sums of the newest tests, and what older ones say.
+
+    A change grows from nothing at the time of one test to what it is at another one, and stays; a step does at once. What
+    the tests before it say of the first parameters, which do not change, counts with those after it. The test just before
+    it may be of both times: it is left out.
 
     Args:
-        tests: since these began to change, in units of the priors.
-        before: (1 + K, 1 + K) what those before say of the first parameters, which are constant.
-        columns: (C,) rows of the others.
+        size: K, count of the first parameters.
+        columns: K + P, of all, in units of their priors.
 
-    Returns:
-        (2 C,) what they are at the newest test, and by how much they grew since the first of the newest; covariance.
+    Attributes:
+        kept: sums of the newest tests.
+        count: how many there were.
     """
-    newest = tests[-_NEWEST:]
-    size, count, last_s = len(before), len(columns), newest[-1].begin_s
-    span_s, kept = max(last_s - newest[0].begin_s, 1e-9), np.append(np.arange(size), 1 + columns)
-    M, by = np.zeros((size + 2 * count, size + 2 * count)), np.eye(size + count, size + 2 * count)
-    M[:size, :size] = before
-    for each in newest:
-        by[size:, size + count :] = np.eye(count) * (each.begin_s - last_s) / span_s
-        M += by.T @ each.M[np.ix_(kept, kept)] @ by
-    M = eliminated(M, slice(1, size))
-    cov = np.asarray(np.linalg.inv(M[1:, 1:] + np.eye(2 * count)))
-    return cov @ M[1:, 0], cov
 
+    def __init__(self, size: int, columns: int) -> None:
+        self._size, self._settled = size, ResidualSums(columns, 0.0)
+        self.kept, self.count = deque[ResidualSums](), 0
+        self._added: tuple[Array, ...] | None = None  # up, since each test that is kept
+        self._reduced = dict[Grown, ResidualSums]()
 
-def grows(line: Array, cov: Array) -> bool:
-    """Return whether a line of :func:`lined` grew by more than chance, its covariance (2 C, 2 C) that of the noise."""
-    count = len(line) // 2
-    by = line[count:]
-    return float(by @ np.linalg.solve(cov[count:, count:], by)) > chi_square_limit(count, UNLIKE)
+    def keep(self, newest: ResidualSums, changed_s: float, *, again: bool = False) -> None:
+        """Keep a test, or the newest one ``again``; the oldest settles, unless it or the next is after a change, s."""
+        self._added, self._reduced = None, {}
+        if again:
+            self.kept[-1] = newest
+            return
+        self.kept.append(newest)
+        if not self.count:
+            self._settled.begin_s = newest.begin_s
+        self.count += 1
+        if len(self.kept) > KEPT:
+            oldest = self.kept.popleft()
+            if self.kept[0].begin_s < changed_s:
+                self._settled.scale(math.exp(-1.0 / _SETTLED))
+                self._settled.add(oldest, 1.0)
+
+    def forget(self, begins: Sequence[float]) -> None:
+        """Forget tests, by when they began, s."""
+        self.kept = deque(each for each in self.kept if each.begin_s not in begins)
+        self._added, self._reduced = None, {}
+
+    def copied(self) -> History:
+        """Return a copy; this one goes on."""
+        other = copy(self)
+        other.kept, other._settled, other._reduced = self.kept.copy(), self._settled.copied(), self._reduced.copy()
+        return other
+
+    def before_s(self, begin_s: float) -> float:
+        """Return when the test before that of a time began, s."""
+        return max((each.begin_s for each in self.kept if each.begin_s < begin_s), default=begin_s)
+
+    @property
+    def always(self) -> Grown:
+        """What was so before all tests."""
+        return Grown(self._settled.begin_s, self._settled.begin_s)
+
+    def windows(self, *, every: bool) -> list[Grown]:
+        """Return when a change may have begun, and ended.
+
+        Unless ``every``, those that begin with this test anew: as many windows as tests are looked at twice.
+        """
+        tests = len(self.kept)
+        counts = [*(count for count in _AFTER if count < tests), tests]
+        due = [(count, self.kept[-count].begin_s) for count in counts if every or self.count % min(count, STEPS) == 0]
+        found = [Grown(t_s, t_s) for _, t_s in due] + [Grown(t_s) for count, t_s in due if count > STEPS]
+        return [*found, self.always] if due and due[-1][0] == tests and self._settled.freedom else found
+
+    def _sums(self) -> tuple[Array, ...]:
+        """Return times (N,) against the newest test, and sums since each: plain, times the time once, twice; freedom."""
+        if self._added is None:
+            M, begins_s = np.array([each.M for each in self.kept]), np.array([each.begin_s for each in self.kept])
+            ages_s = (begins_s - begins_s[-1])[:, None, None]
+            by_age = ages_s * M[:, 1 + self._size :]
+            parts = M, by_age, ages_s * by_age[:, :, 1 + self._size :], np.array([each.freedom for each in self.kept])
+            self._added = (ages_s[:, 0, 0], *(np.cumsum(each[::-1], axis=0)[::-1] for each in parts))
+        return self._added
+
+    def since(self, grown: Grown) -> ResidualSums:
+        """Return the sums since a change began; all but the first parameters are what they were when it ended."""
+        if grown.end_s <= self._settled.begin_s:
+            return total([self._settled, *self.kept])
+        ages_s, plain, once, twice, freedom = self._sums()
+        begin, end = np.minimum(np.searchsorted(ages_s, np.array(grown) - self.kept[-1].begin_s), len(ages_s) - 1)
+        first, rest = slice(0, 1 + self._size), slice(1 + self._size, None)
+        found = ResidualSums(plain.shape[1] - 1, grown.begin_s)
+        found.M, found.freedom = plain[end].copy(), float(freedom[begin]) + self._settled.freedom
+        found.M[first, first] = self._settled.M[first, first] + plain[0, first, first]
+        if begin:
+            mixed = self.kept[begin - 1]
+            found.M[first, first] -= mixed.M[first, first]
+            found.freedom += float(freedom[0] - freedom[begin]) - mixed.freedom
+        if end > begin:
+            began_s = grown.begin_s - self.kept[-1].begin_s
+            span_s, M = ages_s[end] - began_s, plain[begin, rest] - plain[end, rest]
+            by = once[begin] - once[end] - began_s * M
+            more = twice[begin] - twice[end] - began_s * (once[begin] - once[end] + by)[:, rest]
+            found.M[rest, first] += by[:, first] / span_s
+            found.M[first, rest] += by[:, first].T / span_s
+            found.M[rest, rest] += more / span_s**2
+        return found
+
+    def reduced(self, grown: Grown) -> ResidualSums:
+        """Return the same of all but the first parameters, which are eliminated."""
+        if grown not in self._reduced:
+            self._reduced[grown] = self.since(grown).reduced(self._size)
+        return self._reduced[grown]
+
+    def dated(self, count: int, oldest_s: float | None = None) -> tuple[float, Grown]:
+        """Return the least that a change of the next parameters leaves, and when that began and ended.
+
+        The test before its beginning, which may be of both times, counts as noise.
+
+        Args:
+            count: of these parameters.
+            oldest_s: when it may have begun before all tests that are kept, s; before all tests if None.
+        """
+        settled_s, tests, times_s = self._settled.begin_s, len(self.kept), [each.begin_s for each in self.kept]
+        times_s.insert(0, settled_s if oldest_s is None or oldest_s >= times_s[0] else oldest_s)
+        ages = np.geomspace(1.0, tests, _BEGINS).round().astype(int)
+        coarse = sorted({0 if times_s[0] < times_s[1] else 1, *(tests + 1 - ages).tolist()})
+
+        def left(begin: int, end: int) -> tuple[float, int, int]:
+            if begin != end and (end - begin < STEPS or times_s[begin] <= settled_s < times_s[1]):
+                return np.inf, begin, end
+            sums = self.since(Grown(times_s[begin], times_s[end])).of(self._size + count).reduced(self._size)
+            gained = float(sums.b @ np.linalg.solve(sums.H + np.eye(count), sums.b))
+            return sums.square - gained + (self.kept[begin - 2].freedom if begin > 1 else 0.0), begin, end
+
+        def best(window: Callable[[int], tuple[int, int]]) -> tuple[float, int, int]:
+            row = coarse.index(min((*left(*window(k)), k) for k in coarse)[3])
+            return min(
+                left(*window(k)) for k in range(coarse[max(row - 1, 0)], coarse[min(row + 1, len(coarse) - 1)] + 1)
+            )
+
+        ramp = best(lambda k: (k, tests))
+        ramp = min(ramp, best(lambda k: (ramp[1], k)))
+        ramp = min(ramp, best(lambda k: (k, ramp[2])))
+        least, begin, end = min(best(lambda k: (k, k)), ramp)
+        return least, Grown(times_s[begin], np.inf if begin < end == tests else times_s[end])

@@ -8,8 +8,9 @@ Model of a shot's residuals, in standard deviations:
     r = A dT + B x + S e + D f + n,    x ~ N(0, rig.cov),  e ~ N(0, tolerance),  n ~ N(0, s^2)
 
 with dT the pose, which is eliminated shot by shot; x the calibration's own error and e the shape of the body, which all
-shots share; f the seven numbers, zero while all is well. The information of the shots is summed, weighted down with age; f
-is estimated with x and e eliminated (generalised least squares); chi-square of f against zero is the test. The part of r
+shots share; f the seven numbers, zero while all is well. The information of the shots is summed, test by test; f is
+estimated since some of them, as a step or a ramp, with x and e eliminated (generalised least squares), of which the tests
+before say what they are, too; chi-square of f against zero is the test. The part of r
 that needs no body is the epipolar distance; the rest says what the body's known shape does. Size of body and length of
 baseline have the same effect: which of them is wrong cannot be distinguished. The skew shows in the detections of the right
 camera by the body's motion between the shots; each shot has a skew of its own besides, of a known standard deviation.
@@ -44,19 +45,17 @@ from armsight.estimate.chance import chi_square_limit
 from armsight.geometry.pose import adjoint, inverse, log_se3
 from armsight.loop.finding import COSTS_M, SUSPECTED, HealthFinding, alarm_limit, displacement_m
 from armsight.loop.health.fixed import Unrest
-from armsight.loop.health.passing import TOGETHER, Apart, Leftover, Passing, Times, apart, eliminate, nodding
+from armsight.loop.health.passing import TOGETHER, Apart, Leftover, Passes, Passing, Times, apart, eliminate, nodding
 from armsight.loop.health.residuals import (
     STEPS,
+    Grown,
+    History,
     ResidualSums,
     ShotReader,
     ShotResiduals,
-    Since,
     differ,
     eliminated,
-    grows,
-    lined,
     noisier,
-    total,
 )
 from armsight.loop.health.rows import LENS
 from armsight.loop.health.shape import SMOOTH, ShapeWatch
@@ -71,12 +70,12 @@ _LEAST_S, _LIKE_S = 0.025, 0.1
 #: One of so many shots, those that fit worst, is no usual one.
 _ODD = 4
 #: The test is made after so long, s, or so many shots, and the past is forgotten with this time constant, in tests.
-TEST_S, TEST_SHOTS, FORGET_TESTS = 1.0, 60, 30.0
+TEST_S, TEST_SHOTS = 1.0, 60
 #: In so many tests after an alarm the lenses are tested each time; a test counts for what images leave after so many more.
 _FRESH, _BEFORE = 6, 3
 #: Beginnings that are tried; half: an old change is dated to a half of its age, double: twice the time after a fault.
 _BEGINS = 16
-#: Tests that are kept, to find since when: then the older half is merged in pairs, and so on. half: an old beginning is
+#: History that are kept, to find since when: then the older half is merged in pairs, and so on. half: an old beginning is
 #: known half as closely, double: 4 MB more. So many first ones say what the lenses lack.
 _MOST_KEPT, _LENS_KEPT = 64, 600
 #: Most of what all tests hold that merged ones may, as a change may begin in the midst of them, which are then left out;
@@ -123,8 +122,7 @@ class RigChange(Record):
         chi_square: of all against zero.
         alone: the same of each part alone, with the others right.
         without: the same of the others.
-        gained: sum of squares that the seven explain.
-        left: sum of squares that nothing explains.
+        excess: by how much the variance of what is left exceeds the noise (Birge ratio).
         slow: whether the newest tests show that it grows.
     """
 
@@ -133,8 +131,7 @@ class RigChange(Record):
     chi_square: float
     alone: dict[Part, float]
     without: dict[Part, float]
-    gained: float
-    left: float
+    excess: float
     slow: bool = False
 
 
@@ -161,20 +158,20 @@ class _Newest(NamedTuple):
     """The newest test.
 
     Attributes:
-        whole: sums of all that may have changed, of the points that fit.
-        every: the same of every point.
+        whole: sums of all that may have changed, and of the lenses' coefficients, of the points that fit.
         noise: variance of the noise.
         evidence: log-evidence of what the lenses leave.
-        test: sums of the parameters and the seven numbers, the lenses' coefficients eliminated.
-        own: times of exposure that explain it; None without.
+        fits: sums with the lenses' coefficients eliminated, of all shots, and without those that fit worst.
+        every: the same of every point; where all points fit it is ``fits`` itself.
+        passes: whether times of exposure explain it.
     """
 
     whole: ResidualSums
-    every: ResidualSums
     noise: float
     evidence: Array
-    test: ResidualSums
-    own: Apart | None
+    fits: tuple[ResidualSums, ResidualSums]
+    every: tuple[ResidualSums, ResidualSums]
+    passes: bool
 
 
 class RigWatch:
@@ -245,20 +242,20 @@ class RigWatch:
         self._full = self._size + LENS
         # Shots of the running test, in stays; sums since the beginning are for what the camera models lack.
         self._stays: list[list[ShotResiduals]] = []
-        self._window = ResidualSums(self._size + len(_WIDE), 0.0)
-        self._whole, self._leftover = ResidualSums(self._with_lens.shape[1], 0.0), Leftover()
-        self._wholes: deque[ResidualSums] = deque(maxlen=TOGETHER)  # of the newest tests
+        columns = self._scaled.shape[1]
+        self._fits = History(self._size, columns), History(self._size, columns)  # of all shots, and of the usual ones
+        self._every = self._fits  # the same of every point, since one did not fit
+        self._wholes, self._leftover = History(self._size, columns + LENS), Leftover()  # with the lenses' coefficients
         self._counted: list[Array] = []  # log-evidences of the newest tests, which the former is given later
         self.lens: LensError | None = None
-        self._tests, self._history = 0, list[ResidualSums]()
-        self._plain = list[ResidualSums]()  # the same with what images leave beyond noise
-        self._divided: tuple[list[ResidualSums], tuple[ResidualSums, RigChange]] | None = None  # tests and their split
         self._timed = False
-        self._doubted: ResidualSums | None = None  # what the alarm of the test before would have rested on
         self._poses = 0  # that differ
         self.alarm = self.alarmed = False
         self._alarms = 0  # in a row
         self.suspected: RigChange | None = None
+        # When the newest change began, and the test before it, s; and what the newest alarm found.
+        self._grown, self._since_s = Grown(0.0), 0.0
+        self._found: RigChange | None = None
         self.noise, self._unrest, self._newest_added = np.zeros((6, 6)), Unrest(4), np.zeros((6, 6))
         self._images: dict[bytes, None] = {}  # detections of shots that were summed, the newest last
 
@@ -414,7 +411,7 @@ class RigWatch:
     def explained(self, estimates: Sequence[PoseEstimate]) -> tuple[StereoRig, Body, HealthFinding]:
         """Return the rig and the body with the change that poses show, which are known to be wrong, and what it is."""
         sums, self._poses = self.information(estimates)
-        change = self._estimated(self._in_priors(sums))
+        change = self._estimated(self._in_priors(sums).reduced(self._size))
         more = {part: change.chi_square - change.without[part] for part in ("rig", "body")}
         part: Part = max(("rig", "body"), key=lambda each: (more[each], change.alone[each]))
         sure = more[part] > chi_square_limit(_PARTS[part].stop - _PARTS[part].start, _NECESSARY)
@@ -428,7 +425,9 @@ class RigWatch:
         T = estimate.T_left_body
         moved = self._began is None or differ(self._began, T)
         size = 1 + self._size
-        self._shape.take(shot.every[:, :size], T, shot.response_with_all[:, : self._size], estimate.cov, moved)
+        self._shape.take(
+            shot.t_s, shot.every[:, :size], T, shot.response_with_all[:, : self._size], estimate.cov, moved
+        )
         if moved or not self._stays:
             self._stays.append([])
             self._began = T
@@ -468,137 +467,115 @@ class RigWatch:
         return self._summed(stays, every=every, own=own).by(self._with_lens)
 
     def _decide(self, *, ends: bool = False) -> None:
-        """Test for a change with the newest sums; weigh the older ones down."""
+        """Test for a change with the newest shots."""
         stays, self._stays = self._stays, []
         if not stays:
             return
         self._poses += len(stays)
         newest, change = self._tested(stays)
-        self._leftover.passed(newest.test)
+        self._leftover.passed(newest.fits[0].of(self._size + len(_WIDE)))
         # A point that is displaced looks like it, for some tests before it is found.
         self._counted = [*self._counted, newest.evidence] if self._shape.found is None else []
         if len(self._counted) > _BEFORE:
             self._leftover.take(self._counted.pop(0))
-        nodded = stays if self._timed and newest.own is None else []
-        self._test_shape(stays, newest, ends=ends)
-        alarm, doubted = self._is_alarm(change), self._doubted
-        self._doubted = None
-        moments = [] if newest.own is not None else [stay[0] for stay in stays if len(stay) == 1]
-        if alarm and moments and not self._alarms and self._poses > 1:
-            newest, change, alarm = self._less_worst(moments, newest, change, doubted)
-        self._keep(newest, change, alarm)
-        if nodded and self._unrest_began(nodded):  # newest sums do not have it in their noise
-            self._take_back([each.begin_s for each in self._history[-TOGETHER:]])
-            return
-        if self._lens_is_due():
+        self._shape.decide(*self._every, ends=ends)
+        self._decided(change)
+        if self._timed and not newest.passes and self._unrest_began(stays):  # newest sums do not have it in their noise
+            self._take_back([each.begin_s for each in list(self._fits[0].kept)[-TOGETHER:]])
+        elif self._lens_is_due():
             self.lens = self._lens()
-        if len(self._history) >= _MOST_KEPT:
-            self._merge()
 
     def _lens_is_due(self) -> bool:
         """Return whether the lenses are looked at with the newest test."""
-        due = 0 < self._alarms <= _FRESH or self._tests % _LENS_TESTS == 0
-        return due and self._tests < _LENS_KEPT and self._poses >= _LENS_POSES
+        tests = self._fits[0].count
+        due = 0 < self._alarms <= _FRESH or tests % _LENS_TESTS == 0
+        return due and self._poses >= _LENS_POSES
 
-    def _keep(self, newest: _Newest, change: RigChange, alarm: bool) -> None:
-        """Keep the newest test, and what it says of the rig."""
-        self._tests += 1
-        if self._tests <= _LENS_KEPT:
-            self._wholes.append(newest.whole.over(newest.noise))
-            self._whole.add(self._wholes[-1], 1.0)
-        self._plain.append(newest.whole.of(len(newest.test.b)).over(newest.noise))
-        self._history.append(newest.test)
-        self._alarms = self._alarms + 1 if alarm else 0
-        if alarm:
-            since, change = self._newest_split()
-            self._window = since.of(len(since.b))
-        matters = alarm or (change.chi_square > _SUSPECTED and self._matters(change, slice(None)))
+    def _keep(self, newest: _Newest, *, again: bool) -> None:
+        """Keep the newest test, or keep it again where something that passes explains it."""
+        if newest.every is not newest.fits and self._every is self._fits:
+            self._every = self._fits[0].copied(), self._fits[1].copied()
+        changed_s = min(self._shape.changed_s, self._grown.begin_s if self._alarms else np.inf)
+        kept = [(self._fits, newest.fits), (self._every, newest.every)][: 1 if self._every is self._fits else 2]
+        for watched, sums in kept:
+            for tests, each in zip(watched, sums, strict=True):
+                tests.keep(each, changed_s, again=again)
+        self._wholes.keep(newest.whole.over(newest.noise), changed_s, again=again)
+
+    def _doubted(self) -> RigChange:
+        """Return the change that the newest tests show most clearly, of those that began at some times."""
+        tests = self._fits[0]
+        windows = [self._grown] if self._alarms else tests.windows(every=self.suspected is not None)
+        changes = [(self._estimated(tests.reduced(each)), each) for each in windows]
+        change, self._grown = max(changes, key=lambda each: each[0].chi_square)
+        return change
+
+    def _decided(self, change: RigChange) -> None:
+        """Decide whether the change that is shown is certain: the usual shots alone must show it, too."""
+        costs = self._cost_m(self._of_part(change, slice(None))) > COSTS_M
+        matters = change.chi_square > _SUSPECTED and self._matters(change, slice(None))
+        certain = costs and matters and _certain(change)
+        self.alarm = certain and _certain(self._estimated(self._fits[1].reduced(self._grown)))
+        self.alarmed = self.alarmed or self.alarm
+        self._alarms = self._alarms + 1 if self.alarm else 0
+        if self.alarm:
+            self._found = change = self._dated()
         self.suspected = change if matters else None
-        self.alarm, self.alarmed = alarm, self.alarmed or alarm
 
-    def _merge(self) -> None:
-        """Merge the older half of the tests in pairs, but for those about the beginning of a change."""
-        begin_s = self._since()[0] if self.alarmed else np.inf
-        begun = sum(each.begin_s < begin_s for each in self._history)
-        most = _BLOCK_SHARE * sum(each.freedom for each in self._history)
-        for k in reversed(range(0, len(self._history) // 2, 2)):
-            if not k - 2 <= begun <= k + 3 and sum(each.freedom for each in self._history[k : k + 2]) <= most:
-                for tests in (self._history, self._plain):
-                    tests[k : k + 2] = [total(tests[k : k + 2])]
+    def _dated(self) -> RigChange:
+        """Return the change as all shots show it, dated anew while the alarm is new, and now and then."""
+        tests, fresh = self._fits[0], self._alarms <= _FRESH
+        if fresh or tests.count % STEPS == 0:
+            _, self._grown = tests.dated(len(_WIDE), None if fresh else self._grown.begin_s)
+        if fresh:
+            self._since_s = tests.before_s(self._grown.begin_s)
+        change, (begin_s, end_s) = self._estimated(tests.reduced(self._grown)), self._grown
+        if end_s > begin_s:  # it is known to a test when it began, and what that does is no noise
+            off = change.f - self._estimated(tests.reduced(Grown(tests.before_s(begin_s), end_s))).f
+            change = replace(change, cov=change.cov + np.outer(off, off), slow=self._grown.goes_on)
+        return change
 
     def _tested(self, stays: Sequence[Sequence[ShotResiduals]]) -> tuple[_Newest, RigChange]:
-        """Return the newest test and the change by the window with it; what a passing cause explains is taken off."""
-        whole, every = self._sums_of(stays, None)
-        newest = self._without_lens(stays, whole, every, whole, None)
-        self._window.scale(float(np.exp(-1.0 / FORGET_TESTS)))
-        self._window.add(newest.test, 1.0)
-        change = self._estimated(self._window)
+        """Return the newest test, which is kept, what passes taken off, and the change that it shows with others."""
+        newest, every = self._newest(stays, None, None)
+        self._keep(newest, again=False)
+        change = self._doubted()
         if not self.passing.now and change.chi_square <= _SUSPECTED:
             return newest, change
-        self._window.add(newest.test, -1.0)
         passes, own = self._passes(stays, every)
-        if passes == "time":
-            whole, every = self._sums_of(stays, own)
         if passes is not None:
-            rest = whole.without(self._size + len(_WIDE)) if passes == "lens" else whole
-            newest = self._without_lens(stays, whole, every, rest, own if passes == "time" else None)
-        self._window.add(newest.test, 1.0)
-        return newest, self._estimated(self._window)
+            newest, _ = self._newest(stays, passes, own)
+            self._keep(newest, again=True)
+        return newest, self._doubted()
 
-    def _sums_of(
-        self, stays: Sequence[Sequence[ShotResiduals]], own: Apart | None
-    ) -> tuple[ResidualSums, ResidualSums]:
-        """Return the sums of the points that fit, and of every point."""
-        whole = self._in_units(stays, own=own)
-        if all(each.every is each.rows for stay in stays for each in stay):
-            return whole, whole
-        return whole, self._in_units(stays, every=True, own=own)
-
-    def _without_lens(
-        self,
-        stays: Sequence[Sequence[ShotResiduals]],
-        whole: ResidualSums,
-        every: ResidualSums,
-        rest: ResidualSums,
-        own: Apart | None,
-    ) -> _Newest:
-        """Return the test of what is to be explained, ``rest``, with the lenses' coefficients eliminated."""
+    def _newest(
+        self, stays: Sequence[Sequence[ShotResiduals]], passes: Passes | None, own: Apart | None
+    ) -> tuple[_Newest, ResidualSums]:
+        """Return the test of some stays, a cause that passes eliminated, and the sums of every point."""
+        own = own if passes == "time" else None
+        # Images that do not belong together are no moved camera; newer shots that agree with them are.
+        alone = self._poses > 1 and self.suspected is None and any(len(stay) == 1 for stay in stays)
+        odd = sorted(stays, key=_misfit)[len(stays) - max(len(stays) // _ODD, int(alone)) :]
+        left_out = any(each.every is not each.rows for stay in stays for each in stay)
+        sums = list[tuple[ResidualSums, ResidualSums]]()
+        for every in (False, True)[: 1 + left_out]:
+            whole = self._in_units(stays, every=every, own=own)
+            usual = whole.less(self._in_units(odd, every=every, own=own)) if odd else whole
+            sums.append((whole, usual))
+        (whole, usual), of_every = sums[0], sums[-1]
+        fitting = sums[0]
+        if passes == "lens":
+            fitting = whole.without(self._size + len(_WIDE)), usual.without(self._size + len(_WIDE))
         share, seven = len(stays) / sum(map(len, stays)), slice(1 + self._size, 1 + self._size + len(_WIDE))
-        noise, evidence = self._leftover.seen(rest, LENS, 3 * len(self.reader.points), seven, share)
-        test = self._leftover.without(rest, LENS, noise).of(len(self._window.b))
-        return _Newest(whole, every, noise, evidence, test, own)
+        noise, evidence = self._leftover.seen(fitting[0], LENS, 3 * len(self.reader.points), seven, share)
+        fits = self._without_lens(fitting, noise)
+        both = fits if fitting is of_every else self._without_lens(of_every, noise)
+        return _Newest(whole, noise, evidence, fits, both, own is not None), of_every[0]
 
-    def _test_shape(self, stays: Sequence[Sequence[ShotResiduals]], newest: _Newest, *, ends: bool) -> None:
-        """Test for displaced points, with all shots and without those that fit worst."""
-        odd = sorted(stays, key=_misfit)[len(stays) - len(stays) // _ODD :]
-        every = newest.every
-        usual = every.less(self._in_units(odd, every=True, own=newest.own)) if odd else every
-        self._shape.decide(*(self._leftover.without(each, LENS, newest.noise) for each in (every, usual)), ends=ends)
-
-    def _less_worst(
-        self, moments: list[ShotResiduals], newest: _Newest, change: RigChange, doubted: ResidualSums | None
-    ) -> tuple[_Newest, RigChange, bool]:
-        """Return the newest test, the change, and whether it is one, without images that alone say so.
-
-        Images that do not belong together are no moved camera; newer shots that agree with them are.
-        """
-        rest = newest.whole.less(self._worst(moments))
-        left_out = newest.test.less(self._leftover.without(rest, LENS, newest.noise).of(len(newest.test.b)))
-        without = self._window.less(left_out)
-        estimated = self._estimated(without)
-        if self._is_alarm(estimated):
-            return newest, change, True
-        if doubted is not None:
-            self._window.add(doubted, 1.0)
-            return newest, change, True
-        self._window, self._doubted = without, left_out
-        return newest._replace(whole=rest, test=newest.test.less(left_out)), estimated, False
-
-    def _is_alarm(self, change: RigChange) -> bool:
-        """Return whether a change is certain, beyond the sigmas of poses, and displaces them by what matters."""
-        every = slice(None)
-        costs = self._cost_m(self._of_part(change, every)) > COSTS_M
-        return _certain(change) and costs and self._matters(change, every)
+    def _without_lens(self, sums: tuple[ResidualSums, ResidualSums], noise: float) -> tuple[ResidualSums, ResidualSums]:
+        """Return two sums with the lenses' coefficients eliminated, over the variance of the noise."""
+        found = self._leftover.without(sums[0], LENS, noise)
+        return found, found if sums[1] is sums[0] else self._leftover.without(sums[1], LENS, noise)
 
     def _passes(
         self, stays: Sequence[Sequence[ShotResiduals]], every: ResidualSums
@@ -634,33 +611,19 @@ class RigWatch:
 
     def _take_back(self, begins: Sequence[float]) -> None:
         """Take back what was found since tests, by when they began, s, which something explains that passes."""
-        self._history, self._plain = (
-            [each for each in tests if each.begin_s not in begins] for tests in (self._history, self._plain)
-        )
-        self._window.scale(0.0)
-        for test in self._history:
-            age = (self._history[-1].begin_s - test.begin_s) / (TEST_S if self._timed else TEST_SHOTS)
-            self._window.add(test, float(np.exp(-age / FORGET_TESTS)))
-        for each in [each for each in self._wholes if each.begin_s in begins]:
-            self._whole.add(each, -1.0)
-            self._wholes.remove(each)
+        for tests in {*self._fits, *self._every, self._wholes}:
+            tests.forget(begins)
         self._shape.forget(begins)
         self._alarms, self.alarm, self.alarmed = 0, False, False
-        self.suspected = self._doubted = self.lens = None
+        self.suspected = self._found = self.lens = None
 
     def _in_priors(self, sums: ResidualSums) -> ResidualSums:
         """Return sums of the parameters and the seven numbers, in units of their priors, from those of the parameters."""
         return sums.by(self._scaled[:, : self._size + len(_WIDE)])
 
-    def _worst(self, moments: list[ShotResiduals]) -> ResidualSums:
-        """Return the sums of the moments that fit worst: of one, or where shots have no times of a tenth of them."""
-        count = 1 if self._timed else max(1, len(moments) // 10)
-        worst = sorted(moments, key=lambda each: float(each.rows[:, 0] @ each.rows[:, 0]) - len(each.rows))[-count:]
-        return self._in_units([[each] for each in worst])
-
     def _lens(self) -> LensError | None:
         """Return what the camera models lack; None where a change of the seven explains as much, or it hardly matters."""
-        K, sums, faults = self._size, self._whole, len(_WIDE)
+        K, sums, faults = self._size, self._wholes.since(self._wholes.always), len(_WIDE)
         every = np.arange(K + faults + LENS)
         changed, lens = every[K : K + faults], every[K + faults :]
         rows = np.append(every[: K + faults], len(sums.b) - LENS + np.arange(LENS))
@@ -674,7 +637,7 @@ class RigWatch:
         excess = max((sums.square - most) / max(sums.freedom, 1.0), 1.0)
         if by_lens - gained(lens) < _LENS_ALARM * excess:
             return None
-        more = (self._split(self._plain)[2] - (sums.square - by_lens)) / excess  # than a change at any time
+        more = (self._wholes.dated(faults)[0] - (sums.square - by_lens)) / excess  # than a change at any time
         # A lens that lacks a little is not to blame where the cameras moved: then they explain most.
         moved = gained(lens) - gained(changed, lens)
         if more < max(_LENS_ALARM, _LENS_SHARE * moved / excess):
@@ -740,12 +703,12 @@ class RigWatch:
         return float(np.max(squares)) > _MATTERS**2
 
     def _estimated(self, sums: ResidualSums) -> RigChange:
-        """Return the seven numbers from sums of the parameters and them, everything else eliminated."""
-        M = eliminated(sums.M, slice(1, 1 + self._size))
-        S, s, square = np.asarray(M[1:, 1:] + np.eye(len(_WIDE)), float), M[1:, 0], float(M[0, 0])
+        """Return the seven numbers from sums of them and the candidates, which are zero."""
+        seven = sums.of(len(_WIDE))
+        S, s = np.asarray(seven.H + np.eye(len(_WIDE)), float), seven.b
         f = np.linalg.solve(S, s)
         # What the model leaves unexplained widens the noise (Birge ratio); it never narrows it.
-        excess = max((square - float(s @ f)) / max(sums.freedom, 1.0), 1.0)
+        excess = max((seven.square - float(s @ f)) / max(sums.freedom, 1.0), 1.0)
 
         def explained(rows: Ids) -> float:
             return float(s[rows] @ np.linalg.solve(S[np.ix_(rows, rows)], s[rows])) / excess
@@ -754,62 +717,7 @@ class RigWatch:
         alone = {part: explained(every[rows]) for part, rows in _PARTS.items()}
         without = {part: explained(np.delete(every, rows)) for part, rows in _PARTS.items()}
         cov = excess * np.linalg.inv(S) * np.outer(_WIDE, _WIDE)
-        gained = float(s @ f)
-        return RigChange(_WIDE * f, cov, gained / excess, alone, without, gained, square - gained)
-
-    def _since(self) -> tuple[float, RigChange]:
-        """Return since when there is a change, on the clock of the shots, and the change estimated from then on.
-
-        It is the beginning that leaves least unexplained: with the seven numbers zero before it, and estimated after it.
-        """
-        sums, change = self._newest_split()
-        return sums.begin_s, change
-
-    def _newest_split(self) -> tuple[ResidualSums, RigChange]:
-        """Return the sums since the beginning of a change, and the change; of the same tests they are the same."""
-        if self._divided is None or self._divided[0] != self._history:
-            self._divided = self._history.copy(), self._split(self._history)[:2]
-        return self._divided[1]
-
-    def _split(self, tests: Sequence[ResidualSums]) -> tuple[ResidualSums, RigChange, float]:
-        """Return the sums of the tests after the beginning of a change, the change that they show, and what is left.
-
-        The test before its beginning may be of both times: it is left out, and counts as noise. One that grew is as large
-        as a line through the newest tests says.
-        """
-        since = Since(tests, self._size)
-        every = since.plain(0)
-
-        def begun(k: int) -> tuple[float, int, bool, ResidualSums]:
-            after, mixed = since.plain(k), ResidualSums(len(every.b), tests[0].begin_s)
-            if k:
-                mixed.add(tests[k - 1], 1.0)
-            without = sum(self._gained(every.less(after).less(mixed))) + mixed.freedom
-            shapes = (after, since.ramped(k)) if len(tests) - k > STEPS else (after,)
-            lefts = [self._gained(each)[1] + without for each in shapes]
-            best = int(np.argmin(lefts))
-            return lefts[best], k, best > 0, shapes[best]
-
-        coarse = len(tests) - np.unique(np.geomspace(1.0, len(tests), _BEGINS).round().astype(int))  # the newest first
-        k = min((begun(int(each)) for each in coarse), key=lambda each: each[0])[1]
-        between = range(max(coarse[coarse < k], default=k), min(coarse[coarse > k], default=k) + 1)
-        least, k, slow, found = min(map(begun, between), key=lambda each: each[0])
-        found.begin_s, change = tests[max(k - 1, 0)].begin_s, self._estimated(found)
-        return found, self._now(change, tests[k:], found.freedom) if slow else change, least
-
-    def _now(self, change: RigChange, tests: Sequence[ResidualSums], freedom: float) -> RigChange:
-        """Return a change that grew in some tests, as large as it is now."""
-        count, before = len(_WIDE), np.zeros((1 + self._size, 1 + self._size))
-        line, spread = lined(tests, before, self._size + np.arange(count))
-        spread *= max(change.left / max(freedom, 1.0), 1.0)
-        cov = spread[:count, :count] * np.outer(_WIDE, _WIDE)
-        return replace(change, f=_WIDE * line[:count], cov=cov, slow=grows(line, spread))
-
-    def _gained(self, sums: ResidualSums) -> tuple[float, float]:
-        """Return what the seven numbers explain of a sum of squares, and what nothing does."""
-        M = eliminated(sums.M, slice(1, 1 + self._size))
-        gained = float(M[0, 1:] @ np.linalg.solve(M[1:, 1:] + np.eye(len(_WIDE)), M[1:, 0]))
-        return gained, float(M[0, 0]) - gained
+        return RigChange(_WIDE * f, cov, float(s @ f) / excess, alone, without, excess)
 
     def findings(self) -> tuple[HealthFinding, ...]:
         """Return what was found so far, the shots of the running test included: nothing where no test gave an alarm."""
@@ -847,8 +755,8 @@ class RigWatch:
 
     def _changed(self) -> tuple[HealthFinding, ...]:
         """Return what the newest test found of the seven numbers."""
-        began_s, change = self._since()
-        since_s = began_s if self._timed else None
+        change, since_s = self._found, self._since_s if self._timed else None
+        assert change is not None
         parts = self._to_blame(change)
         found = (
             replace(
@@ -868,15 +776,17 @@ class RigWatch:
     def copied(self) -> RigWatch:
         """Return a copy that says what was found so far; this one goes on."""
         copied = copy(self)
-        copied._history, copied._plain, copied._shape = self._history.copy(), self._plain.copy(), self._shape.copied()
+        copied._fits, copied._shape = (self._fits[0].copied(), self._fits[1].copied()), self._shape.copied()
+        copied._every = (
+            copied._fits if self._every is self._fits else (self._every[0].copied(), self._every[1].copied())
+        )
         copied._stays, copied.passing = [stay.copy() for stay in self._stays], copy(self.passing)
-        copied._unrest, copied._wholes = self._unrest.copied(), self._wholes.copy()
+        copied._unrest, copied._wholes = self._unrest.copied(), self._wholes.copied()
         return copied
 
     def _ended(self) -> RigWatch:
         """Return a copy whose running test was made; this one goes on with it."""
         ended = self.copied()
-        ended._window, ended._whole = self._window.of(len(self._window.b)), self._whole.of(len(self._whole.b))
         ended._leftover = copy(self._leftover)
         ended._decide(ends=True)
         return ended
@@ -888,15 +798,12 @@ class RigWatch:
         """
         if not (self.alarm and self._timed and self.suspected is not None) or self.lens is not None or self._shaped:
             return None
-        since_s, change = self._since()
-        return None if self._in_newest(since_s) or self._to_blame(change) != ["rig"] else since_s
+        return None if self.only_newest() or self._to_blame(self.suspected) != ["rig"] else self._since_s
 
     def only_newest(self) -> bool:
         """Return whether only the newest test shows a change: cameras may have moved within it, so the next one decides."""
-        return self._in_newest(self._since()[0])
-
-    def _in_newest(self, since_s: float) -> bool:
-        return len(self._history) > 1 and since_s >= self._history[-2].begin_s
+        kept = self._fits[0].kept
+        return len(kept) > 1 and self._since_s >= kept[-2].begin_s
 
     def _needed(self, change: RigChange, part: Part) -> bool:
         """Return whether the other parts do not explain what was found."""

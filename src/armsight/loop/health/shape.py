@@ -12,8 +12,7 @@ r^T S^-1 r of the sum of squares, with
 where H and b are the sums, J selects the point, and M has the standard deviations of everything else as its columns. The
 point that explains most is taken, then the next one besides it, while one explains more than chance: a body that is bent.
 
-A change is a step, or a ramp that goes on: then what it did at a test is its share of what it does at the newest one. Few
-changes are exact ramps: how large one is now, and whether it still grows, a line through the newest tests alone says.
+A change is a step, or a ramp that ended or goes on: then what it did at a test is its share of what it does at the end.
 
 What the sums from before a change say of everything else (M) is added to those from after it: a body may be off by its
 tolerance, but by the same all the time, so a point that moves is found where it moved by less than that.
@@ -34,7 +33,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -43,17 +42,7 @@ from armsight.data import Array, Ids, Record
 from armsight.estimate.chance import chi_square_limit
 from armsight.geometry.rotation import skew
 from armsight.loop.finding import HealthFinding, alarm_limit
-from armsight.loop.health.residuals import (
-    FURTHEST_M,
-    STEPS,
-    UNLIKE,
-    ResidualSums,
-    Since,
-    eliminated,
-    grows,
-    lined,
-    total,
-)
+from armsight.loop.health.residuals import FURTHEST_M, STEPS, UNLIKE, Grown, History, ResidualSums, eliminated
 
 #: A focal length may change so much, as a share.
 _FOCAL = 0.05
@@ -65,8 +54,8 @@ _AGREE = (0.5, 2.0)
 _ASKED, _LEAST_SHOTS, _LEAST_POSES = 30, 8, 6
 #: The directions from which the body was seen must differ from their mean by so much, rad.
 _VIEWS_RAD = 0.05
-#: Tests that are kept; in so many after an alarm it is dated anew.
-_KEPT, _FRESH = 30, 6
+#: In so many tests after an alarm it is dated anew; directions that are remembered.
+_FRESH, _VIEWS = 6, 1000
 #: A displacement matters that moves a pose by so many of its claimed sigmas, of so many newest poses.
 _MATTERS, _POSES = 2.0, 60
 #: Explanations whose chi-squares differ by less are not distinguished; one is needed besides another beyond this chance.
@@ -80,10 +69,8 @@ _CERTAIN = float(np.log(1e3))
 #: Strain, shear and what bending adds at the body's edge, as a share of its radius: widths of their priors; half: an
 #: elongation of 0.3 % is found later, double: one of 0.1 % is.
 _STRAINS = (1e-3, 4e-3)
-#: So many newest tests, together, may be those after a change, or all; all points may be displaced by about so much, m.
-_AFTER, _BENT_M = (1, 2, 4, 8, 16), (2e-4, 1e-3)
-#: Tests that are not kept are forgotten with this time constant, in tests.
-_SETTLED = 30.0
+#: All points may be displaced by about so much, m.
+_BENT_M = (2e-4, 1e-3)
 #: The seven numbers are expected to change by such shares of their priors, which are wide.
 _SEVEN_SCALES = (1.0, 0.03, 0.003)
 
@@ -100,9 +87,7 @@ class ShapeError(Record):
         chi_square: by how much the first explains more than a change of the seven numbers does.
         seven: by how much the seven numbers explain more than they all do.
         alike: what explains nearly as much as the first.
-        begin_s: since when, s.
-        slow: whether it grew; it is as large as a line through the newest tests says.
-        goes_on: whether these alone show that it grows.
+        grown: since when.
     """
 
     chosen: tuple[int, ...]
@@ -111,9 +96,12 @@ class ShapeError(Record):
     chi_square: float
     seven: float
     alike: tuple[int, ...]
-    begin_s: float
-    slow: bool = False
-    goes_on: bool = False
+    grown: Grown
+
+    @property
+    def begin_s(self) -> float:
+        """Since when, s."""
+        return self.grown.begin_s
 
     @property
     def seven_needed(self) -> bool:
@@ -183,14 +171,6 @@ class _Explained(NamedTuple):
     cov: Array
 
 
-class _ShapeTest(NamedTuple):
-    """The sums of one test, of its usual shots, and the directions from which it saw the body."""
-
-    sums: ResidualSums
-    usual: ResidualSums
-    views: list[Array]
-
-
 class ShapeWatch:
     """Watches the shape of the body, and the focal lengths of the cameras against each other.
 
@@ -247,28 +227,22 @@ class ShapeWatch:
         self._hypotheses = _hypotheses(len(self._candidates), 3 * n, strained=strained)
         self._limit_focal, self._limit = (alarm_limit(size, 1.0 / test_s, 2 * (n + 1)) for size in (1, 3))
         self._view: Array | None = None  # the newest direction that differs from the one before
-        self._views: list[Array] = []  # of the running test
-        self._history: deque[_ShapeTest] = deque(maxlen=_KEPT)
-        every = 1 + K + 7 + 2 + 3 * n
-        # Of older tests, of all shots and of the usual ones; of those before what is suspected to have changed.
-        self._settled = ResidualSums(every - 1, 0.0), ResidualSums(every - 1, 0.0)
-        self._all = ResidualSums(every - 1, 0.0), ResidualSums(every - 1, 0.0)  # of both, with the tests that are kept
-        self._kept = tuple[Since, ...]()  # sums since each test that is kept, of all shots and of the usual ones
-        self._tests = 0
+        self._views: deque[tuple[float, Array]] = deque(maxlen=_VIEWS)  # and of what time, s
         self._shots: deque[Array] = deque(maxlen=_ASKED)  # rows, as they were taken
         # The response of the newest poses to the parameters, and the covariances of these poses.
         self._effects: deque[tuple[Array, Array]] = deque(maxlen=_POSES)
-        self._changed_s: float | None = None  # since when something may have changed
+        self.changed_s = np.inf  # since when something may have changed
         self._alarms = 0  # in a row
         self._suspect: ShapeError | None = None
         self.doubt: Array | None = None
         self.found: ShapeError | None = None
         self.said: ShapeError | None = None
 
-    def take(self, rows: Array, T: Array, response: Array, cov: Array, moved: bool) -> None:
+    def take(self, t_s: float, rows: Array, T: Array, response: Array, cov: Array, moved: bool) -> None:
         """Take a shot.
 
         Args:
+            t_s: its time, s.
             rows: (n, 1 + K) its residuals and their derivatives, all points included, its pose eliminated.
             T: (4, 4) pose T_left_body.
             response: (6, K) of a pose measured with all points to the parameters.
@@ -282,108 +256,53 @@ class ShapeWatch:
         view = T[:3, :3].T @ T[:3, 3]
         view /= np.sqrt(view @ view)
         if self._view is None or np.linalg.norm(view - self._view) > _VIEWS_RAD / _LEAST_POSES:  # else it rests
-            self._views.append(view)
+            self._views.append((t_s, view))
             self._view = view
 
-    def decide(self, sums: ResidualSums, usual: ResidualSums, *, ends: bool) -> None:
+    def decide(self, tests: History, usual: History, *, ends: bool) -> None:
         """Test once more; the first test is enough by itself only where it ends all.
 
         Args:
-            sums: since the last test: of the K parameters, the seven numbers and the candidates, in units of their priors.
+            tests: of the K parameters, the seven numbers and the candidates, in units of their priors.
             usual: the same without the shots that fit worst.
             ends: whether it ends all.
         """
-        self._keep(_ShapeTest(sums, usual, self._views))
-        self._views = []
-        tests, before = list(self._history), self._suspect
-        self._kept = tuple(Since(each, self._size) for each in zip(*(each[:2] for each in tests), strict=True))
+        self._tests, self._usual, before = tests, usual, self._suspect
         doubted_s, self.doubt = self._doubted(every=ends or self.doubt is not None)
         # What is not doubtful is not certain.
-        self._suspect = None if before is None and self.doubt is None else self._suspected(tests, before)
+        self._suspect = None if before is None and self.doubt is None else self._suspected(before)
         self._alarms = 0 if self._suspect is None else self._alarms + 1
         # What a change leaves in the test in which it began may look like a displaced point, once.
         again = before is not None and before.is_of(self._suspect)
-        self.found = self._suspect if again or (ends and len(tests) == 1) else None
+        self.found = self._suspect if again or (ends and len(tests.kept) == 1) else None
         self.said = self.found or self.said
         if self.found is not None:
             _, self.doubt = self._doubted(every=True)
-            self._changed_s = self.found.begin_s
+            self.changed_s = self.found.begin_s
         elif self.doubt is None:
-            self._changed_s = None
+            self.changed_s = np.inf
             self.doubt = self._tolerated()
-        elif self._changed_s is None:
-            self._changed_s = doubted_s
-        self._kept = ()  # some MB
-
-    def _keep(self, newest: _ShapeTest) -> None:
-        """Keep a test; the oldest one settles, but where it is of the time after a change.
-
-        The test before the first one after a change is of both times.
-        """
-        if len(self._history) == _KEPT and (self._changed_s is None or self._history[1].sums.begin_s < self._changed_s):
-            oldest, keep = self._history[0], float(np.exp(-1.0 / _SETTLED))
-            for settled, every, test in zip(self._settled, self._all, (oldest.sums, oldest.usual), strict=True):
-                every.add(settled, keep - 1.0)
-                settled.scale(keep)
-                settled.add(test, 1.0)
-        elif len(self._history) == _KEPT:
-            for every, test in zip(self._all, (self._history[0].sums, self._history[0].usual), strict=True):
-                every.add(test, -1.0)
-        self._history.append(newest)
-        self._tests += 1
-        for every, test in zip(self._all, (newest.sums, newest.usual), strict=True):
-            every.add(test, 1.0)
-
-    def _suspected(self, tests: list[_ShapeTest], before: ShapeError | None) -> ShapeError | None:
-        """Return what the tests show now, since when; ``before`` is what they showed last time."""
-        if before is None:
-            windows = ((len(tests) - count, slow) for count, slow in self._windows(every=True))
-            shown = next(filter(None, (self._shown(*each) for each in windows)), None)
         else:
-            later = sum(each.sums.begin_s >= before.begin_s for each in tests)
-            shown = self._shown(len(tests) - max(later, 1), before.slow)
-        if shown is not None and self._alarms < _FRESH:
-            return self._dated()
-        if shown is not None and before is not None and before.is_of(shown):
-            return replace(shown, begin_s=before.begin_s)  # though the tests of that time are no longer kept
+            self.changed_s = min(self.changed_s, doubted_s)
+
+    def _suspected(self, before: ShapeError | None) -> ShapeError | None:
+        """Return what the tests show now, since when; ``before`` is what they showed last time."""
+        tests = self._tests
+        windows = tests.windows(every=True) if before is None else [before.grown]
+        shown = next(filter(None, map(self._shown, windows)), None)
+        if shown is not None and (self._alarms < _FRESH or tests.count % STEPS == 0):
+            return self._shown(
+                tests.dated(9 + 3 * len(self._candidates), None if self._alarms < _FRESH else shown.begin_s)[1]
+            )
         return shown
-
-    def _windows(self, *, every: bool) -> tuple[tuple[int, bool], ...]:
-        """Return how many newest tests may be those after a change, and whether it goes on.
-
-        Unless ``every``, those that begin with this test anew: as many windows as tests are looked at twice.
-        """
-        tests = len(self._history)
-        counts = (*(count for count in _AFTER if count < tests), tests)
-        due = tuple(count for count in counts if every or self._tests % min(count, STEPS) == 0)
-        return (*((count, False) for count in due), *((count, True) for count in due if count > STEPS))
-
-    def _since(self, begin: int, slow: bool, *, usual: bool = False) -> ResidualSums:
-        """Return the sums of the tests from one on, with what those before it say of what does not change.
-
-        The test before may be of both times: it is left out.
-        """
-        since = self._kept[usual]
-        after = since.plain(begin)
-        before = self._before(begin, after, usual=usual)
-        return (since.ramped(begin) if slow else after).besides(before, self._size)
-
-    def _before(self, begin: int, after: ResidualSums, *, usual: bool) -> ResidualSums:
-        """Return the sums of the tests before one, of those after which the sums are given."""
-        before = self._all[usual].less(after)
-        if begin:
-            mixed = self._history[begin - 1]
-            before.add(mixed.usual if usual else mixed.sums, -1.0)
-        return before
 
     def _doubted(self, *, every: bool) -> tuple[float, Array | None]:
         """Return since when something may have changed, s, and its second moment (7 + C, 7 + C).
 
         None where nothing did, more probably.
         """
-        tests = len(self._history)
         if self.found is None:
-            sums = [self._since(tests - count, slow, usual=True) for count, slow in self._windows(every=every)]
+            sums = [self._usual.reduced(each) for each in self._usual.windows(every=every)]
             mixtures = [self._mixture(each, self._hypotheses) for each in sums]
             best = max(range(len(sums)), key=lambda n: mixtures[n][0])
             evidence, moment = mixtures[best]
@@ -391,9 +310,7 @@ class ShapeWatch:
         if self.found.chosen != (FOCAL,):
             return self.found.begin_s, None
         # Cameras that moved cannot be excluded.
-        later = sum(each.usual.begin_s >= self.found.begin_s for each in self._history)
-        sums_since = self._since(tests - max(later, 1), self.found.slow, usual=True)
-        return self.found.begin_s, self._mixture(sums_since, self._hypotheses[:1])[1]
+        return self.found.begin_s, self._mixture(self._usual.reduced(self.found.grown), self._hypotheses[:1])[1]
 
     def _tolerated(self) -> Array | None:
         """Return the second moment (7 + C, 7 + C) of the body's shape within its tolerance, where it matters, else None.
@@ -401,10 +318,10 @@ class ShapeWatch:
         A motion of all points is none of the body's shape: what has its axes is where its points are.
         """
         K, points = self._size, slice(self._first, self._first + len(self._smooth))
-        H = self._all[1].H[:K, :K] + np.eye(K)
-        cov = np.linalg.inv(H)
+        usual = self._usual.since(self._usual.always)
+        cov = np.linalg.inv(usual.H[:K, :K] + np.eye(K))
         of_points = self._tolerance * self._apart
-        d, spread = of_points @ (cov @ self._all[1].b[:K])[points], of_points @ cov[points, points] @ of_points.T
+        d, spread = of_points @ (cov @ usual.b[:K])[points], of_points @ cov[points, points] @ of_points.T
         if self._displaces(np.append([0.0, 0.0], d)) < 6.0:  # a pose's own squared error, all six numbers together
             return None
         moment = np.zeros((9 + len(d), 9 + len(d)))
@@ -422,16 +339,11 @@ class ShapeWatch:
         return max(0.0, *(float(_explained(M, each, excess).evidence.max()) for each in (some, *rest)))
 
     def forget(self, begins: Sequence[float]) -> None:
-        """Forget tests, by when they began, s, and what was found since the first: another cause explains them."""
-        self._history = deque((each for each in self._history if each.sums.begin_s not in begins), _KEPT)
-        self._all = (
-            total([self._settled[0], *(each.sums for each in self._history)]),
-            total([self._settled[1], *(each.usual for each in self._history)]),
-        )
+        """Forget what was found since the first of tests, by when they began, s: another cause explains them."""
         if self.said is not None and self.said.begin_s >= min(begins):
             self.said = None
-        self.found = self.doubt = self._suspect = self._changed_s = None
-        self._alarms = 0
+        self.found = self.doubt = self._suspect = None
+        self.changed_s, self._alarms = np.inf, 0
 
     def _mixture(self, sums: ResidualSums, hypotheses: Sequence[_Hypotheses]) -> tuple[float, Array]:
         """Return the log-evidence that anything changed before the tests of sums, and the second moment of what did.
@@ -457,46 +369,26 @@ class ShapeWatch:
 
         None where all together explain too little to matter.
         """
-        M = eliminated(sums.M, slice(1, 1 + self._size))
+        M = sums.M
         gain = float(M[0, 1:] @ np.linalg.solve(M[1:, 1:] + np.eye(len(M) - 1), M[1:, 0]))
         if gain < 2.0:
             return None, 1.0
         excess = max((float(M[0, 0]) - gain) / max(sums.freedom, 1.0), 1.0)  # what all together do not explain is noise
         return self._with_smooth.T @ M @ self._with_smooth, excess
 
-    def _shown(self, begin: int, slow: bool) -> ShapeError | None:
-        """Return what the tests from one on show for certain, of what goes on or stepped; None where that is nothing."""
-        tests = list(self._history)[begin:]
-        views = [view for each in tests for view in each.views]
-        if len(views) < _LEAST_POSES or not _differ(np.array(views)):
+    def _shown(self, grown: Grown) -> ShapeError | None:
+        """Return what the tests show for certain of a change that began at some time; None where that is nothing."""
+        sums = self._tests.reduced(grown)
+        views = np.array([view for t_s, view in self._views if t_s >= grown.begin_s])
+        if len(views) < _LEAST_POSES or not _differ(views):
             return None
-        sums = self._since(begin, slow)
-        found = self._reduced(sums)
-        error = self._focal_alone(found, sums.begin_s)
-        if error is None or not _one_is_enough(self._reduced(tests[-1].sums)):
-            error = self._deformed(sums) or self._displaced(found, sums.begin_s)
-        return self._now(error, found, begin) if error is not None and slow else error
+        found, newest = _reduced(sums), _reduced(self._tests.kept[-1].reduced(self._size))
+        error = self._focal_alone(found, grown)
+        if error is not None and _one_is_enough(newest):
+            return error
+        return self._deformed(sums, grown) or self._displaced(found, newest.whole, grown)
 
-    def _now(self, error: ShapeError, found: _Reduced, begin: int) -> ShapeError:
-        """Return what grew since a test, as sums show that, as large as it is now: a focal length or a point alone."""
-        if len(error.chosen) > 1 or error.chosen == (SMOOTH,):
-            return replace(error, slow=True)
-        of_focal, columns = error.chosen == (FOCAL,), _columns(error.chosen)
-        size, sums = self._size + (0 if of_focal else 7), found.without if of_focal else found.whole
-        tests = [each.sums for each in self._history][begin:]
-        before = self._before(begin, total(tests), usual=False).M
-        before[1 + self._size :] = before[:, 1 + self._size :] = 0.0
-        line, spread = lined(tests, before[: 1 + size, : 1 + size], self._size + 7 + columns)
-        spread *= sums.excess(sums.gain(columns))
-        value, cov, count = error.value.copy(), error.cov.copy(), len(columns)
-        wide = self._wide[columns]
-        value[columns] = wide * line[:count]
-        cov[np.ix_(columns, columns)] = spread[:count, :count] * np.outer(wide, wide)
-        if of_focal:
-            cov[1, 1] = (value[0] / 2.0) ** 2
-        return replace(error, value=value, cov=cov, slow=True, goes_on=grows(line, spread))
-
-    def _deformed(self, sums: ResidualSums) -> ShapeError | None:
+    def _deformed(self, sums: ResidualSums, grown: Grown) -> ShapeError | None:
         """Return a smooth deformation of the body that tests show for certain, beside any change of the seven numbers.
 
         And better than a single point does.
@@ -520,14 +412,13 @@ class ShapeWatch:
         value, cov = columns @ found.size[row], columns @ found.cov[row] @ columns.T
         if not self._matters(value):
             return None
-        return ShapeError((SMOOTH,), value, cov, 2.0 * max(most), 0.0, (), sums.begin_s)
+        return ShapeError((SMOOTH,), value, cov, 2.0 * max(most), 0.0, (), grown)
 
-    def _displaced(self, found: _Reduced, begin_s: float) -> ShapeError | None:
+    def _displaced(self, found: _Reduced, newest: _ShapeSums, grown: Grown) -> ShapeError | None:
         """Return the points that are displaced by what all tests together say, and the newest; None where none is."""
         whole = found.whole
         if not self._candidates or not (whole.gains(self._candidates) > self._limit).any():
             return None
-        newest = self._reduced(self._history[-1].sums).whole
         steady = [each for each in self._candidates if self._steady(whole, newest, each)]
         chosen = list[int]()
         scores = dict[int, float]()
@@ -541,9 +432,9 @@ class ShapeWatch:
                 break
             scores = scores or {each: gain / excess for each, gain in gains.items()}
             chosen.append(best)
-        return self._error(found, tuple(chosen), scores, begin_s) if chosen else None
+        return self._error(found, tuple(chosen), scores, grown) if chosen else None
 
-    def _focal_alone(self, found: _Reduced, begin_s: float) -> ShapeError | None:
+    def _focal_alone(self, found: _Reduced, grown: Grown) -> ShapeError | None:
         """Return the focal lengths' change where that one number explains as much as the seven do; else None."""
         columns, without = _columns([FOCAL]), found.without
         gain = without.gain(columns)
@@ -554,10 +445,10 @@ class ShapeWatch:
         if abs(value[0]) < _LEAST_FOCAL:
             return None
         cov[1, 1] = (value[0] / 2.0) ** 2 / excess  # one of the two may have changed alone
-        return ShapeError((FOCAL,), value, excess * cov, gain / excess, 0.0, (), begin_s)
+        return ShapeError((FOCAL,), value, excess * cov, gain / excess, 0.0, (), grown)
 
     def _error(
-        self, found: _Reduced, chosen: tuple[int, ...], scores: dict[int, float], begin_s: float
+        self, found: _Reduced, chosen: tuple[int, ...], scores: dict[int, float], grown: Grown
     ) -> ShapeError | None:
         """Return the record of what was chosen; None where it is too small to matter."""
         (whole, without), columns = found, _columns(chosen)
@@ -571,7 +462,7 @@ class ShapeWatch:
         seven = (without.square - without.gain(columns) - (whole.square - gain)) / excess
         best = chosen[0]
         alike = tuple(each for each, score in scores.items() if each != best and score > scores[best] - _ALIKE)
-        return ShapeError(chosen, value, excess * cov, scores[best], seven, alike, begin_s)
+        return ShapeError(chosen, value, excess * cov, scores[best], seven, alike, grown)
 
     def _values(self, whole: _ShapeSums, columns: Ids, others_m: float) -> tuple[Array, Array]:
         """Return the displacements (C,) of columns, and of all other points if these have a prior, and cov (C, C)."""
@@ -586,12 +477,6 @@ class ShapeWatch:
         value[free] = wide[free] * (inverse @ r[free])
         cov[np.ix_(free, free)] = inverse * np.outer(wide[free], wide[free])
         return value, cov
-
-    def _reduced(self, sums: ResidualSums) -> _Reduced:
-        """Eliminate the parameters from sums, and the seven numbers."""
-        without = eliminated(sums.M, slice(1, 1 + self._size))
-        whole, candidates = eliminated(without, _SEVEN), np.delete(np.arange(len(without)), _SEVEN)
-        return _Reduced(*(_of_candidates(M, sums.freedom) for M in (whole, without[np.ix_(candidates, candidates)])))
 
     def _steady(self, whole: _ShapeSums, newest: _ShapeSums, which: int) -> bool:
         """Return whether the newest test, and the median of single shots, agree on a point with all tests together."""
@@ -624,21 +509,6 @@ class ShapeWatch:
         squares = np.einsum("ni,ni->n", shift, np.linalg.solve(covs, shift[..., None])[..., 0])
         return float(np.max(squares))
 
-    def _dated(self) -> ShapeError | None:
-        """Return what is shown from the beginning on that leaves least unexplained, whichever points moved then.
-
-        The test before its beginning may be of both times: it is left out, and counts as noise.
-        """
-        free, tests = np.concatenate([[0, 1], *(_columns([each]) for each in self._candidates)]), len(self._history)
-
-        def left(begin: int, slow: bool) -> float:
-            whole = self._reduced(self._since(begin, slow)).whole
-            mixed = self._history[begin - 1].sums.freedom if begin else 0.0
-            return whole.square - whole.gain(free) + mixed
-
-        begins = [(k, slow) for k in range(tests) for slow in (False, True) if not slow or tests - k > STEPS]
-        return self._shown(*min(begins, key=lambda each: left(*each)))
-
     def added(self, response: Array) -> Array:
         """Return the covariance (6, 6) of what was found, of a pose with a response (6, K) to the parameters."""
         found = self.found
@@ -655,10 +525,7 @@ class ShapeWatch:
     def copied(self) -> ShapeWatch:
         """Return a copy that says what was found so far; this one goes on."""
         other = copy(self)
-        other._history, other._shots, other._effects = self._history.copy(), self._shots.copy(), self._effects.copy()
-        other._views = self._views.copy()
-        other._settled = total(self._settled[:1]), total(self._settled[1:])
-        other._all = total(self._all[:1]), total(self._all[1:])
+        other._views, other._shots, other._effects = self._views.copy(), self._shots.copy(), self._effects.copy()
         return other
 
     def finding(self, error: ShapeError, since_s: float | None) -> HealthFinding:
@@ -720,9 +587,11 @@ class ShapeWatch:
         )
 
 
-def _of_candidates(M: Array, freedom: float) -> _ShapeSums:
-    """Return sums M (1 + C, 1 + C) with the candidates' priors."""
-    return _ShapeSums(M[1:, 1:] + np.eye(len(M) - 1), M[1:, 0], float(M[0, 0]), freedom)
+def _reduced(sums: ResidualSums) -> _Reduced:
+    """Return what sums of the seven numbers and the candidates say of the latter."""
+    whole, candidates = eliminated(sums.M, _SEVEN), np.delete(np.arange(len(sums.M)), _SEVEN)
+    both = whole, sums.M[np.ix_(candidates, candidates)]
+    return _Reduced(*(_ShapeSums(M[1:, 1:] + np.eye(len(M) - 1), M[1:, 0], float(M[0, 0]), sums.freedom) for M in both))
 
 
 def _smooth(points: Array) -> Array:
@@ -790,7 +659,7 @@ def _differ(views: Array) -> bool:
 def _focal_finding(error: ShapeError, since_s: float | None) -> HealthFinding:
     """Return the finding of a focal length that changed."""
     share, sigma = 100.0 * float(error.value[0]), 100.0 * float(np.sqrt(error.cov[0, 0]))
-    goes_on = " so far, and it goes on" if error.goes_on else ""
+    goes_on = " so far, and it goes on" if error.grown.goes_on else ""
     longer, shorter = ("left", "right") if share > 0 else ("right", "left")
     return HealthFinding(
         "lens",
