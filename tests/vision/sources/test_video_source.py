@@ -1,5 +1,7 @@
 """Video files: real AVI files, written by OpenCV with a frame number in the grey of each frame."""
 
+from fractions import Fraction
+
 import av
 import cv2
 import numpy as np
@@ -100,7 +102,26 @@ def test_a_file_that_is_cut_short_says_so(film, picture):
     path.write_bytes(data[: len(data) // 2])
     found = shots(f"video:{path}")
     assert 5 <= len(found) < 20
-    assert found[-1].problem == f"{path} is damaged or cut short: it ends after {len(found) - 1} of 20 frames"
+    assert found[-1].problem == f"{path} is damaged or cut short: it ends at {(len(found) - 1) / 30:.3f} s of 0.667 s"
+
+
+@pytest.mark.parametrize(
+    ("name", "codec", "late"),
+    [("a.avi", "mjpeg", 0), ("a.mkv", "libx264", 0), ("a.mkv", "libx264", 150), ("a.mp4", "libx264", 0)],
+)
+def test_frames_that_the_recorder_dropped_are_no_damage(tmp_path, name, codec, late):
+    path, kept = tmp_path / name, [0, 1, 2, 3, 4, 7, 8, 12, 13, 14, 20]
+    with av.open(str(path), "w") as file:
+        stream = file.add_stream(codec, rate=30)
+        stream.height, stream.width, stream.pix_fmt = 48, 128, "yuvj420p" if codec == "mjpeg" else "yuv420p"
+        for k in kept:
+            frame = av.VideoFrame.from_ndarray(np.full((48, 128, 3), 10 * k, np.uint8), format="bgr24")
+            frame.pts, frame.time_base = k + late, Fraction(1, 30)
+            file.mux(stream.encode(frame))
+        file.mux(stream.encode())
+    found = shots(f"video:{path}")
+    assert [shot.problem for shot in found] == [None] * len(kept)
+    assert [shot.t_s for shot in found] == pytest.approx([k / 30 for k in kept], abs=1e-3)
 
 
 @pytest.mark.parametrize("codec", ["libsvtav1", "libx264", "mpeg4", "libvpx-vp9", "mjpeg"])

@@ -145,8 +145,10 @@ class VideoSource(Source):
     def _unexpected_end(self, grabbed: list[bool]) -> str | None:
         """Return what is wrong with the end of the files; None where nothing is."""
         for file, ok in zip(self._files, grabbed, strict=True):
-            if not ok and file.frames < file.promised - 1:  # some containers only estimate the number: one less is fine
-                return f"{file.path} is damaged or cut short: it ends after {file.frames} of {file.promised} frames"
+            if (
+                not ok and file.end_s < file.promised_s - file.period_s
+            ):  # some containers estimate: one frame less is fine
+                return f"{file.path} is damaged or cut short: it ends at {file.end_s:.3f} s of {file.promised_s:.3f} s"
         if any(grabbed):
             short, long = sorted(self._files, key=lambda file: file.frames)
             return f"{short.path} ends after {short.frames} frames, {long.path} goes on: stopped there"
@@ -166,10 +168,11 @@ class Film:
         path: the file.
         size_px: width and height of its images.
         period_s: between two frames, s; infinite where the file does not say.
-        promised: how many frames the file says it has; an estimate in some containers.
+        promised_s: how long the file says it is, s; an estimate in some containers. (The number of frames that an AVI says
+            is not that of those in it: it counts those that the recorder dropped.)
         frames: how many were decoded.
         undecoded: how many could not be.
-        t_s: time of the current frame from the beginning, s.
+        t_s, end_s: when the current frame is shown, from the beginning, and until when, s.
     """
 
     def __init__(self, path: str) -> None:
@@ -193,11 +196,14 @@ class Film:
         self._stream.thread_type = "AUTO"
         rate = self._stream.average_rate or self._stream.guessed_rate
         self.period_s = float(1 / rate) if rate else np.inf
-        duration_s = (self._container.duration or 0) / 1e6
-        self.promised = self._stream.frames or (int(duration_s / self.period_s) if rate else 0)
-        self.frames = self.undecoded = 0
-        self.t_s = 0.0
         self._time_base: Fraction = self._stream.time_base or Fraction(1)
+        self._start = self._stream.start_time or 0
+        if self._stream.frames and rate:
+            self.promised_s = self._stream.frames * self.period_s
+        else:  # Matroska's duration counts from zero
+            self.promised_s = (self._container.duration or 0) / 1e6 - float(self._start * self._time_base)
+        self.frames = self.undecoded = 0
+        self.t_s = self.end_s = 0.0
         self._frame: VideoFrame | None = None
         self._frames: Iterator[VideoFrame] = self._decoded()
         first = list(itertools.islice(self._frames, 1))  # the rotation stands in the frames alone
@@ -232,7 +238,8 @@ class Film:
         if self._frame.pts is None:
             self.t_s = self.frames * self.period_s if self.frames else 0.0
         else:
-            self.t_s = float((self._frame.pts - (self._stream.start_time or 0)) * self._time_base)
+            self.t_s = float((self._frame.pts - self._start) * self._time_base)
+        self.end_s = self.t_s + max(self.period_s, float((self._frame.duration or 0) * self._time_base))
         self.frames += 1
         return True
 
@@ -246,7 +253,7 @@ class Film:
     def seek(self, t_s: float) -> None:
         """Go to a frame at a time or before it, from which the frames up to that time can be decoded."""
         with contextlib.suppress(self._error):
-            self._container.seek(int(t_s / self._time_base) + (self._stream.start_time or 0), stream=self._stream)
+            self._container.seek(int(t_s / self._time_base) + self._start, stream=self._stream)
             self._frames = self._decoded()
 
     def close(self) -> None:
