@@ -10,7 +10,7 @@ from faults import BODY, RATE_HZ, SIGMA_PX, SIGMAS, SYNC_S, TRUE, measured, watc
 from armsight.geometry.pose import inverse, log_se3, pose
 from armsight.geometry.rotation import exp_so3
 from armsight.loop.health import HealthMonitor
-from armsight.loop.health.residuals import Grown, History, ResidualSums
+from armsight.loop.health.residuals import History, Onset, ResidualSums
 from armsight.loop.health.rig import RigWatch
 from armsight.vision.pose.locate import locate
 from armsight.vision.triangulate import triangulate
@@ -194,11 +194,11 @@ def test_sums_of_what_grows_are_those_of_its_own_columns(begin, end):
         tests.keep(sums, np.inf)
         scaled = each * np.append(np.ones(4), np.full(2, shares[k]))
         slow += (k != begin - 1) * scaled.T @ scaled
-    found = tests.since(Grown(begins_s[begin], begins_s[end]))
+    found = tests.since(Onset(begins_s[begin], begins_s[end]))
     np.testing.assert_allclose(found.M, slow, rtol=1e-9, atol=1e-9)
     assert found.freedom == 9.0 * 6
     if end == 6:
-        np.testing.assert_array_equal(tests.since(Grown(begins_s[begin])).M, found.M)
+        np.testing.assert_array_equal(tests.since(Onset(begins_s[begin])).M, found.M)
 
 
 def test_what_is_no_longer_kept_says_of_the_parameters_what_it_did():
@@ -210,7 +210,7 @@ def test_what_is_no_longer_kept_says_of_the_parameters_what_it_did():
         tests.keep(sums, 12.0)
         if k < 11:  # the eleventh may be of both times
             kept = np.exp(-1.0 / 30.0) * kept + sums.M[:4, :4]
-    found = tests.since(Grown(12.0, 12.0))
+    found = tests.since(Onset(12.0, 12.0))
     after = sum(each.M for each in tests.kept)
     np.testing.assert_allclose(found.M[:4, :4] - after[:4, :4], kept, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(found.M[4:], after[4:])

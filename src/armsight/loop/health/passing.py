@@ -38,7 +38,7 @@ import numpy as np
 
 from armsight.data import Array
 from armsight.loop.finding import HealthFinding, displacement_m
-from armsight.loop.health.residuals import UNKNOWN_SHARE, ExposedShot, Grown, History, ResidualSums, eliminated
+from armsight.loop.health.residuals import UNKNOWN_SHARE, ExposedShot, History, Onset, ResidualSums, eliminated
 
 #: Standard deviations that are tried of the times that each shot has of its own, s, and that of the times that all share.
 _APART_S, _SHARED_S = (0.0, *(1e-3 * 2.0**k for k in range(-2, 7))), 0.03
@@ -272,7 +272,7 @@ def _summed(tests: Sequence[ResidualSums], size: int) -> tuple[ResidualSums, Res
     for each in tests:
         both.keep(each, np.inf)
     begin_s = tests[0].begin_s
-    return both.since(Grown(begin_s, begin_s)), both.since(Grown(begin_s))
+    return both.since(Onset(begin_s, begin_s)), both.since(Onset(begin_s))
 
 
 class _Weighed(NamedTuple):

@@ -379,7 +379,7 @@ def total(tests: Sequence[ResidualSums]) -> ResidualSums:
     return found
 
 
-class Grown(NamedTuple):
+class Onset(NamedTuple):
     """A change that grew from nothing to what it is.
 
     Attributes:
@@ -416,7 +416,7 @@ class History:
         self._size, self._settled = size, ResidualSums(columns, 0.0)
         self.kept, self.count = deque[ResidualSums](), 0
         self._added: tuple[Array, ...] | None = None  # up, since each test that is kept
-        self._reduced = dict[Grown, ResidualSums]()
+        self._reduced = dict[Onset, ResidualSums]()
 
     def keep(self, newest: ResidualSums, changed_s: float, *, again: bool = False) -> None:
         """Keep a test, or the newest one ``again``; the oldest settles, unless it or the next is after a change, s."""
@@ -450,11 +450,11 @@ class History:
         return max((each.begin_s for each in self.kept if each.begin_s < begin_s), default=begin_s)
 
     @property
-    def always(self) -> Grown:
+    def always(self) -> Onset:
         """What was so before all tests."""
-        return Grown(self._settled.begin_s, self._settled.begin_s)
+        return Onset(self._settled.begin_s, self._settled.begin_s)
 
-    def windows(self, *, every: bool) -> list[Grown]:
+    def windows(self, *, every: bool) -> list[Onset]:
         """Return when a change may have begun, and ended.
 
         Unless ``every``, those that begin with this test anew: as many windows as tests are looked at twice.
@@ -462,7 +462,7 @@ class History:
         tests = len(self.kept)
         counts = [*(count for count in _AFTER if count < tests), tests]
         due = [(count, self.kept[-count].begin_s) for count in counts if every or self.count % min(count, STEPS) == 0]
-        found = [Grown(t_s, t_s) for _, t_s in due] + [Grown(t_s) for count, t_s in due if count > STEPS]
+        found = [Onset(t_s, t_s) for _, t_s in due] + [Onset(t_s) for count, t_s in due if count > STEPS]
         return [*found, self.always] if due and due[-1][0] == tests and self._settled.freedom else found
 
     def _sums(self) -> tuple[Array, ...]:
@@ -475,14 +475,14 @@ class History:
             self._added = (ages_s[:, 0, 0], *(np.cumsum(each[::-1], axis=0)[::-1] for each in parts))
         return self._added
 
-    def since(self, grown: Grown) -> ResidualSums:
+    def since(self, onset: Onset) -> ResidualSums:
         """Return the sums since a change began; all but the first parameters are what they were when it ended."""
-        if grown.end_s <= self._settled.begin_s:
+        if onset.end_s <= self._settled.begin_s:
             return total([self._settled, *self.kept])
         ages_s, plain, once, twice, freedom = self._sums()
-        begin, end = np.minimum(np.searchsorted(ages_s, np.array(grown) - self.kept[-1].begin_s), len(ages_s) - 1)
+        begin, end = np.minimum(np.searchsorted(ages_s, np.array(onset) - self.kept[-1].begin_s), len(ages_s) - 1)
         first, rest = slice(0, 1 + self._size), slice(1 + self._size, None)
-        found = ResidualSums(plain.shape[1] - 1, grown.begin_s)
+        found = ResidualSums(plain.shape[1] - 1, onset.begin_s)
         found.M, found.freedom = plain[end].copy(), float(freedom[begin]) + self._settled.freedom
         found.M[first, first] = self._settled.M[first, first] + plain[0, first, first]
         if begin:
@@ -490,7 +490,7 @@ class History:
             found.M[first, first] -= mixed.M[first, first]
             found.freedom += float(freedom[0] - freedom[begin]) - mixed.freedom
         if end > begin:
-            began_s = grown.begin_s - self.kept[-1].begin_s
+            began_s = onset.begin_s - self.kept[-1].begin_s
             span_s, M = ages_s[end] - began_s, plain[begin, rest] - plain[end, rest]
             by = once[begin] - once[end] - began_s * M
             more = twice[begin] - twice[end] - began_s * (once[begin] - once[end] + by)[:, rest]
@@ -499,13 +499,13 @@ class History:
             found.M[rest, rest] += more / span_s**2
         return found
 
-    def reduced(self, grown: Grown) -> ResidualSums:
+    def reduced(self, onset: Onset) -> ResidualSums:
         """Return the same of all but the first parameters, which are eliminated."""
-        if grown not in self._reduced:
-            self._reduced[grown] = self.since(grown).reduced(self._size)
-        return self._reduced[grown]
+        if onset not in self._reduced:
+            self._reduced[onset] = self.since(onset).reduced(self._size)
+        return self._reduced[onset]
 
-    def dated(self, count: int, oldest_s: float | None = None) -> tuple[float, Grown]:
+    def dated(self, count: int, oldest_s: float | None = None) -> tuple[float, Onset]:
         """Return the least that a change of the next parameters leaves, and when that began and ended.
 
         The test before its beginning, which may be of both times, counts as noise.
@@ -522,7 +522,7 @@ class History:
         def left(begin: int, end: int) -> tuple[float, int, int]:
             if begin != end and (end - begin < STEPS or times_s[begin] <= settled_s < times_s[1]):
                 return np.inf, begin, end
-            sums = self.since(Grown(times_s[begin], times_s[end])).of(self._size + count).reduced(self._size)
+            sums = self.since(Onset(times_s[begin], times_s[end])).of(self._size + count).reduced(self._size)
             gained = float(sums.b @ np.linalg.solve(sums.H + np.eye(count), sums.b))
             return sums.square - gained + (self.kept[begin - 2].freedom if begin > 1 else 0.0), begin, end
 
@@ -536,4 +536,4 @@ class History:
         ramp = min(ramp, best(lambda k: (ramp[1], k)))
         ramp = min(ramp, best(lambda k: (k, ramp[2])))
         least, begin, end = min(best(lambda k: (k, k)), ramp)
-        return least, Grown(times_s[begin], np.inf if begin < end == tests else times_s[end])
+        return least, Onset(times_s[begin], np.inf if begin < end == tests else times_s[end])

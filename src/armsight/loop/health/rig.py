@@ -48,8 +48,8 @@ from armsight.loop.health.fixed import Unrest
 from armsight.loop.health.passing import TOGETHER, Apart, Leftover, Passes, Passing, Times, apart, eliminate, nodding
 from armsight.loop.health.residuals import (
     STEPS,
-    Grown,
     History,
+    Onset,
     ResidualSums,
     ShotReader,
     ShotResiduals,
@@ -254,7 +254,7 @@ class RigWatch:
         self._alarms = 0  # in a row
         self.suspected: RigChange | None = None
         # When the newest change began, and the test before it, s; and what the newest alarm found.
-        self._grown, self._since_s = Grown(0.0), 0.0
+        self._onset, self._since_s = Onset(0.0), 0.0
         self._found: RigChange | None = None
         self.noise, self._unrest, self._newest_added = np.zeros((6, 6)), Unrest(4), np.zeros((6, 6))
         self._images: dict[bytes, None] = {}  # detections of shots that were summed, the newest last
@@ -495,7 +495,7 @@ class RigWatch:
         """Keep the newest test, or keep it again where something that passes explains it."""
         if newest.every is not newest.fits and self._every is self._fits:
             self._every = self._fits[0].copied(), self._fits[1].copied()
-        changed_s = min(self._shape.changed_s, self._grown.begin_s if self._alarms else np.inf)
+        changed_s = min(self._shape.changed_s, self._onset.begin_s if self._alarms else np.inf)
         kept = [(self._fits, newest.fits), (self._every, newest.every)][: 1 if self._every is self._fits else 2]
         for watched, sums in kept:
             for tests, each in zip(watched, sums, strict=True):
@@ -505,9 +505,9 @@ class RigWatch:
     def _doubted(self) -> RigChange:
         """Return the change that the newest tests show most clearly, of those that began at some times."""
         tests = self._fits[0]
-        windows = [self._grown] if self._alarms else tests.windows(every=self.suspected is not None)
+        windows = [self._onset] if self._alarms else tests.windows(every=self.suspected is not None)
         changes = [(self._estimated(tests.reduced(each)), each) for each in windows]
-        change, self._grown = max(changes, key=lambda each: each[0].chi_square)
+        change, self._onset = max(changes, key=lambda each: each[0].chi_square)
         return change
 
     def _decided(self, change: RigChange) -> None:
@@ -515,7 +515,7 @@ class RigWatch:
         costs = self._cost_m(self._of_part(change, slice(None))) > COSTS_M
         matters = change.chi_square > _SUSPECTED and self._matters(change, slice(None))
         certain = costs and matters and _certain(change)
-        self.alarm = certain and _certain(self._estimated(self._fits[1].reduced(self._grown)))
+        self.alarm = certain and _certain(self._estimated(self._fits[1].reduced(self._onset)))
         self.alarmed = self.alarmed or self.alarm
         self._alarms = self._alarms + 1 if self.alarm else 0
         if self.alarm:
@@ -526,13 +526,13 @@ class RigWatch:
         """Return the change as all shots show it, dated anew while the alarm is new, and now and then."""
         tests, fresh = self._fits[0], self._alarms <= _FRESH
         if fresh or tests.count % STEPS == 0:
-            _, self._grown = tests.dated(len(_WIDE), None if fresh else self._grown.begin_s)
+            _, self._onset = tests.dated(len(_WIDE), None if fresh else self._onset.begin_s)
         if fresh:
-            self._since_s = tests.before_s(self._grown.begin_s)
-        change, (begin_s, end_s) = self._estimated(tests.reduced(self._grown)), self._grown
+            self._since_s = tests.before_s(self._onset.begin_s)
+        change, (begin_s, end_s) = self._estimated(tests.reduced(self._onset)), self._onset
         if end_s > begin_s:  # it is known to a test when it began, and what that does is no noise
-            off = change.f - self._estimated(tests.reduced(Grown(tests.before_s(begin_s), end_s))).f
-            change = replace(change, cov=change.cov + np.outer(off, off), slow=self._grown.goes_on)
+            off = change.f - self._estimated(tests.reduced(Onset(tests.before_s(begin_s), end_s))).f
+            change = replace(change, cov=change.cov + np.outer(off, off), slow=self._onset.goes_on)
         return change
 
     def _tested(self, stays: Sequence[Sequence[ShotResiduals]]) -> tuple[_Newest, RigChange]:

@@ -42,7 +42,7 @@ from armsight.data import Array, Ids, Record
 from armsight.estimate.chance import chi_square_limit
 from armsight.geometry.rotation import skew
 from armsight.loop.finding import HealthFinding, alarm_limit
-from armsight.loop.health.residuals import FURTHEST_M, STEPS, UNLIKE, Grown, History, ResidualSums, eliminated
+from armsight.loop.health.residuals import FURTHEST_M, STEPS, UNLIKE, History, Onset, ResidualSums, eliminated
 
 #: A focal length may change so much, as a share.
 _FOCAL = 0.05
@@ -87,7 +87,7 @@ class ShapeError(Record):
         chi_square: by how much the first explains more than a change of the seven numbers does.
         seven: by how much the seven numbers explain more than they all do.
         alike: what explains nearly as much as the first.
-        grown: since when.
+        onset: since when.
     """
 
     chosen: tuple[int, ...]
@@ -96,12 +96,12 @@ class ShapeError(Record):
     chi_square: float
     seven: float
     alike: tuple[int, ...]
-    grown: Grown
+    onset: Onset
 
     @property
     def begin_s(self) -> float:
         """Since when, s."""
-        return self.grown.begin_s
+        return self.onset.begin_s
 
     @property
     def seven_needed(self) -> bool:
@@ -288,7 +288,7 @@ class ShapeWatch:
     def _suspected(self, before: ShapeError | None) -> ShapeError | None:
         """Return what the tests show now, since when; ``before`` is what they showed last time."""
         tests = self._tests
-        windows = tests.windows(every=True) if before is None else [before.grown]
+        windows = tests.windows(every=True) if before is None else [before.onset]
         shown = next(filter(None, map(self._shown, windows)), None)
         if shown is not None and (self._alarms < _FRESH or tests.count % STEPS == 0):
             return self._shown(
@@ -310,7 +310,7 @@ class ShapeWatch:
         if self.found.chosen != (FOCAL,):
             return self.found.begin_s, None
         # Cameras that moved cannot be excluded.
-        return self.found.begin_s, self._mixture(self._usual.reduced(self.found.grown), self._hypotheses[:1])[1]
+        return self.found.begin_s, self._mixture(self._usual.reduced(self.found.onset), self._hypotheses[:1])[1]
 
     def _tolerated(self) -> Array | None:
         """Return the second moment (7 + C, 7 + C) of the body's shape within its tolerance, where it matters, else None.
@@ -376,19 +376,19 @@ class ShapeWatch:
         excess = max((float(M[0, 0]) - gain) / max(sums.freedom, 1.0), 1.0)  # what all together do not explain is noise
         return self._with_smooth.T @ M @ self._with_smooth, excess
 
-    def _shown(self, grown: Grown) -> ShapeError | None:
+    def _shown(self, onset: Onset) -> ShapeError | None:
         """Return what the tests show for certain of a change that began at some time; None where that is nothing."""
-        sums = self._tests.reduced(grown)
-        views = np.array([view for t_s, view in self._views if t_s >= grown.begin_s])
+        sums = self._tests.reduced(onset)
+        views = np.array([view for t_s, view in self._views if t_s >= onset.begin_s])
         if len(views) < _LEAST_POSES or not _differ(views):
             return None
         found, newest = _reduced(sums), _reduced(self._tests.kept[-1].reduced(self._size))
-        error = self._focal_alone(found, grown)
+        error = self._focal_alone(found, onset)
         if error is not None and _one_is_enough(newest):
             return error
-        return self._deformed(sums, grown) or self._displaced(found, newest.whole, grown)
+        return self._deformed(sums, onset) or self._displaced(found, newest.whole, onset)
 
-    def _deformed(self, sums: ResidualSums, grown: Grown) -> ShapeError | None:
+    def _deformed(self, sums: ResidualSums, onset: Onset) -> ShapeError | None:
         """Return a smooth deformation of the body that tests show for certain, beside any change of the seven numbers.
 
         And better than a single point does.
@@ -412,9 +412,9 @@ class ShapeWatch:
         value, cov = columns @ found.size[row], columns @ found.cov[row] @ columns.T
         if not self._matters(value):
             return None
-        return ShapeError((SMOOTH,), value, cov, 2.0 * max(most), 0.0, (), grown)
+        return ShapeError((SMOOTH,), value, cov, 2.0 * max(most), 0.0, (), onset)
 
-    def _displaced(self, found: _Reduced, newest: _ShapeSums, grown: Grown) -> ShapeError | None:
+    def _displaced(self, found: _Reduced, newest: _ShapeSums, onset: Onset) -> ShapeError | None:
         """Return the points that are displaced by what all tests together say, and the newest; None where none is."""
         whole = found.whole
         if not self._candidates or not (whole.gains(self._candidates) > self._limit).any():
@@ -432,9 +432,9 @@ class ShapeWatch:
                 break
             scores = scores or {each: gain / excess for each, gain in gains.items()}
             chosen.append(best)
-        return self._error(found, tuple(chosen), scores, grown) if chosen else None
+        return self._error(found, tuple(chosen), scores, onset) if chosen else None
 
-    def _focal_alone(self, found: _Reduced, grown: Grown) -> ShapeError | None:
+    def _focal_alone(self, found: _Reduced, onset: Onset) -> ShapeError | None:
         """Return the focal lengths' change where that one number explains as much as the seven do; else None."""
         columns, without = _columns([FOCAL]), found.without
         gain = without.gain(columns)
@@ -445,10 +445,10 @@ class ShapeWatch:
         if abs(value[0]) < _LEAST_FOCAL:
             return None
         cov[1, 1] = (value[0] / 2.0) ** 2 / excess  # one of the two may have changed alone
-        return ShapeError((FOCAL,), value, excess * cov, gain / excess, 0.0, (), grown)
+        return ShapeError((FOCAL,), value, excess * cov, gain / excess, 0.0, (), onset)
 
     def _error(
-        self, found: _Reduced, chosen: tuple[int, ...], scores: dict[int, float], grown: Grown
+        self, found: _Reduced, chosen: tuple[int, ...], scores: dict[int, float], onset: Onset
     ) -> ShapeError | None:
         """Return the record of what was chosen; None where it is too small to matter."""
         (whole, without), columns = found, _columns(chosen)
@@ -462,7 +462,7 @@ class ShapeWatch:
         seven = (without.square - without.gain(columns) - (whole.square - gain)) / excess
         best = chosen[0]
         alike = tuple(each for each, score in scores.items() if each != best and score > scores[best] - _ALIKE)
-        return ShapeError(chosen, value, excess * cov, scores[best], seven, alike, grown)
+        return ShapeError(chosen, value, excess * cov, scores[best], seven, alike, onset)
 
     def _values(self, whole: _ShapeSums, columns: Ids, others_m: float) -> tuple[Array, Array]:
         """Return the displacements (C,) of columns, and of all other points if these have a prior, and cov (C, C)."""
@@ -659,7 +659,7 @@ def _differ(views: Array) -> bool:
 def _focal_finding(error: ShapeError, since_s: float | None) -> HealthFinding:
     """Return the finding of a focal length that changed."""
     share, sigma = 100.0 * float(error.value[0]), 100.0 * float(np.sqrt(error.cov[0, 0]))
-    goes_on = " so far, and it goes on" if error.grown.goes_on else ""
+    goes_on = " so far, and it goes on" if error.onset.goes_on else ""
     longer, shorter = ("left", "right") if share > 0 else ("right", "left")
     return HealthFinding(
         "lens",
