@@ -114,14 +114,9 @@ def hidden(count: int) -> None:
 def said_and_read(kind: str, seed: int, truth: dict[str, np.ndarray], folder: Path, wrong: str) -> Path:
     """Write a recording of a unit on the tool, and the file that a calibration would leave; return that."""
     rng, c = np.random.default_rng([seed, 77]), INERTIAL_CLASSES[kind]
-    noise, rate_hz = np.repeat([c.gyro_noise, c.noise], 3), 200.0 if kind == "phone" else 1000.0
-    good = kind == "icm-42688"
-    errors = InertialErrors(
-        noise, np.repeat([c.gyro_bias, c.bias], 3) * rng.normal(size=6), noise / 10,
-        np.repeat([2e-4 if good else 1e-3, 0.02], 3) * rng.normal(size=6), 200.0, rng.normal(size=(6, 3)) * c.scale / 2,
-        rng.normal(size=(3, 3)) * c.g_sensitivity / 2, step=np.repeat([7e-5 if good else 2.7e-4, 1.2e-3], 3),
-        bandwidth_hz=rate_hz / 4, rate_hz=rate_hz, lost=0.002, hum=np.repeat([1e-3, 0.02], 3), hum_hz=97.0,
-    )  # fmt: skip
+    rate_hz = 200.0 if kind == "phone" else 1000.0
+    drawn = (c.gyro_noise, c.noise), (c.gyro_bias, c.bias), c.scale, c.g_sensitivity, rng
+    errors = InertialErrors.typical(*drawn, good=kind == "icm-42688", rate_hz=rate_hz)
     t_s, z = record(truth["t"], truth["Ts"] @ MOUNT, errors, rng)
     np.savetxt(
         folder / "imu.csv",
@@ -145,7 +140,7 @@ def said_and_read(kind: str, seed: int, truth: dict[str, np.ndarray], folder: Pa
     late_s += np.sqrt(2.0) / (2 * np.pi * errors.bandwidth_hz) + rng.normal() * SWEPT_S
     sensor = replace(sensor, cov=np.diag(SWEPT**2), delay_s=late_s, sigma_delay_s=SWEPT_S)
     file = folder / "references.toml"
-    file.write_text(written(Entry(sensor, "inertial", kind, folder / "imu.csv", rate_hz, True), folder))
+    file.write_text(written(Entry(sensor, "inertial", kind, folder / "imu.csv", None, rate_hz, True), folder))
     return file
 
 

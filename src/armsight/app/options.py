@@ -33,6 +33,12 @@ def output(metavar: str, text: str, *name: str, **attributes: Any) -> Callable[.
     )
 
 
+def references_option() -> Callable[[_Command], _Command]:
+    """Give a command ``--references``."""
+    said = "Fuse an inertial unit, too (docs/howto/references.md)."
+    return click.option("--references", metavar="REFERENCES.toml", type=PATH, help=said)
+
+
 def stream_option(name: str = "stream") -> Callable[[_Command], _Command]:
     """Give a command ``--stream``; its argument ``name`` is the tuple of all that is published to."""
     return click.option("--stream", name, multiple=True, metavar="STREAM", callback=_checked, help=_HELP)

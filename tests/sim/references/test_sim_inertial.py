@@ -10,7 +10,7 @@ from armsight.loop.references.calibrate import PosePath, calibrate
 from armsight.loop.references.inertial import Inertial
 from armsight.loop.references.reference import Reading
 from armsight.loop.references.stream import check_stream
-from armsight.sim.references.inertial import InertialErrors, record
+from armsight.sim.references.inertial import InertialErrors, InertialUnit, record
 
 T_S = np.arange(0.0, 16.0, 1e-3)
 RATES = np.array([1.1, 1.7, 2.3, 0.9, 1.3, 1.9])
@@ -34,6 +34,25 @@ def test_at_rest_it_reads_gravity_and_in_motion_the_rate():
         for channel in (0, 1):
             due = sensor.expected(path(t[k] - 1 / (np.sqrt(2) * np.pi * 400)), channel).z  # the chip's filter is late
             np.testing.assert_allclose(z[k, 3 * channel : 3 * channel + 3], due, atol=(2e-3, 2e-2)[channel])
+
+
+def test_a_unit_that_is_read_as_time_passes_reads_what_it_records():
+    """The same but for the order of random numbers: none is drawn that counts."""
+    whole = record(T_S, poses(T_S) @ MOUNT, replace(QUIET, scale=np.full((6, 3), 0.01), clock=0.003), Random())
+    unit = InertialUnit(replace(QUIET, scale=np.full((6, 3), 0.01), clock=0.003), Random())
+    parts = [unit.read(T_S[k : k + 7], poses(T_S[k : k + 7]) @ MOUNT) for k in range(0, len(T_S), 7)]
+    np.testing.assert_allclose(np.concatenate([t for t, _ in parts]), whole[0], atol=1e-12)
+    np.testing.assert_allclose(np.concatenate([z for _, z in parts]), whole[1], atol=2e-8)
+
+
+class Random:
+    """No noise, nothing lost or repeated."""
+
+    def normal(self, size):
+        return np.zeros(size)
+
+    def uniform(self, size):
+        return np.full(size, 0.5)
 
 
 def test_each_error_does_what_it_says():

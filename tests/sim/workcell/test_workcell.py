@@ -10,7 +10,8 @@ from armsight.errors import DeviceError, InputError
 from armsight.geometry.pose import inverse
 from armsight.robot.boards.codes import BoardState
 from armsight.robot.trajectories import point_to_point
-from armsight.sim.workcell.workcell import Workcell
+from armsight.sim.references.inertial import InertialErrors, InertialUnit
+from armsight.sim.workcell.workcell import _T_TOOL_UNIT, Workcell
 from armsight.vision.markers.board import open_board
 
 pytestmark = pytest.mark.usefixtures("host_firmware")
@@ -35,6 +36,21 @@ def go(workcell, q_from, q_to, rest_s=0.4, each=lambda: None):
         readings.append(states.q)
         each()
     return np.concatenate(times), np.concatenate(readings)
+
+
+def test_a_unit_on_the_tool_is_read_as_time_passes(workcell):
+    """At rest it reads gravity along what is up in its axes; each reading comes once, none of later than was asked for."""
+    unit = InertialUnit(InertialErrors(rate_hz=500.0, noise=np.full(6, 1e-9)), np.random.default_rng(0))
+    read = workcell.carry(unit)
+    parts = []
+    for end_s in workcell.t_s + np.array([0.1, 0.104, 0.2]):
+        workcell.advance(end_s + 0.01 - workcell.t_s)
+        parts.append(read(end_s))
+        assert parts[-1][0][-1] <= end_s
+    t_s, z = (np.concatenate(each) for each in zip(*parts, strict=True))
+    np.testing.assert_allclose(np.diff(t_s), 2e-3, atol=1e-9)
+    R = workcell.truth.T_base_tool[-1, :3, :3] @ _T_TOOL_UNIT[:3, :3]
+    np.testing.assert_allclose(z[-10:].mean(axis=0), [0, 0, 0, *(9.80665 * R[2])], atol=0.05)  # held, it still swings
 
 
 def test_the_arm_follows_and_comes_to_rest(workcell):

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from armsight.app.options import output
+from armsight.app.options import output, references_option
 from armsight.app.show.messages import require
 
 
@@ -51,6 +51,7 @@ from armsight.app.show.messages import require
     help="The arm model to compute with, such as corrected.toml of armsight identify; by default the nominal table.",
 )
 @click.option("--sync-led", is_flag=True, help="Put an LED on the board's clock in view: it gives delay and skew.")
+@references_option()
 @click.option("--quick", is_flag=True, help="Fewer calibration shots and motions, no studies.")
 @click.option("--json", "as_json", is_flag=True, help="Print the summary as one JSON object.")
 def command(
@@ -63,6 +64,7 @@ def command(
     layout: str,
     nominal_arm: str | None,
     sync_led: bool,
+    references: Path | None,
     quick: bool,
     as_json: bool,
 ) -> None:
@@ -86,7 +88,7 @@ def command(
 
     gc.freeze()  # what was imported stays: no collection has to look at it
     nominal = None if nominal_arm is None else open_arm(nominal_arm)
-    demo = Demo(output, arm, cameras, seed, emulator, layout, model, quick, nominal, nominal_arm, sync_led)
+    demo = Demo(output, arm, cameras, seed, emulator, layout, model, quick, nominal, nominal_arm, sync_led, references)
     try:
         with steps() as progress:
             report = run_demo(demo, progress=progress)

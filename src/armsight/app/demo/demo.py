@@ -19,17 +19,19 @@ from typing import Any
 import numpy as np
 
 from armsight.app.demo.studies import rate_study, true_track, vision_studies
-from armsight.app.run.devices import setup_of
+from armsight.app.run.devices import setup_of, simulated_unit
 from armsight.app.run.experiment import RunResult, run_experiment
 from armsight.app.run.folder import finish, make_room, open_folder
 from armsight.app.run.metrics import Study
 from armsight.app.run.motion_file import DEFAULT_MOTION, QUICK, read_motions
 from armsight.app.show.report import Report
 from armsight.app.stream.datum import Published
-from armsight.app.stream.mcap_file import LazyMcap, properties
+from armsight.app.stream.mcap_file import REFERENCES, LazyMcap, properties
 from armsight.data import Array, Shot
 from armsight.errors import ArmsightError
-from armsight.files import write_text
+from armsight.files import read_text, write_text
+from armsight.loop.references.file import read_references
+from armsight.loop.running.beside import the_one
 from armsight.loop.running.calibrate import Progress, handeye_poses
 from armsight.processes import Process, caller
 from armsight.robot.arm_file import open_arm
@@ -70,6 +72,7 @@ class Demo:
     nominal_arm: Arm | None = None
     nominal_arm_name: str | None = None  #: its name in the summary; by default the arm's own
     sync_led: bool = False  #: whether an LED on the board's clock is in view
+    references: Path | None = None  #: names an inertial unit, which is simulated on the tool
 
 
 def run_demo(demo: Demo, *, progress: Progress = lambda line: None) -> Report:
@@ -81,6 +84,7 @@ def run_demo(demo: Demo, *, progress: Progress = lambda line: None) -> Report:
     """
     began = time.perf_counter()
     pairs, handeyes, study_shots = _AMOUNTS[demo.quick]
+    unit = None if demo.references is None else the_one(read_references(demo.references), demo.references)
     folder = demo.folder
     open_folder(folder)
     progress("building the workcell")
@@ -101,8 +105,12 @@ def run_demo(demo: Demo, *, progress: Progress = lambda line: None) -> Report:
         rig.save(folder / "rig.json")
         write_text(folder / "body.toml", workcell.body_text)
         targets = handeye_poses(workcell.model, np.vstack([workcell.model.home, workcell.poses]), handeyes, demo.seed)
-        setup = setup_of(workcell)
-        texts = properties(rig, workcell.body_text, setup.arm, command="demo")
+        setup, more = setup_of(workcell), dict[str, str]()
+        if demo.references is not None and unit is not None:
+            setup = replace(setup, beside=simulated_unit(workcell, unit, demo.seed))
+            more[REFERENCES] = read_text(demo.references)
+            write_text(folder / REFERENCES, more[REFERENCES])
+        texts = properties(rig, workcell.body_text, setup.arm, command="demo", **more)
         published = Published(rig, setup.target.body, setup.arm, texts)
         with contextlib.closing(LazyMcap(folder, published, progress, process=True)) as file:
             result = run_experiment(

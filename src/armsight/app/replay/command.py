@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from armsight.app.options import PATH, output, stream_option
+from armsight.app.options import PATH, output, references_option, stream_option
 
 if TYPE_CHECKING:
     from armsight.app.replay.run import Replayed
@@ -27,7 +27,7 @@ _REASONS = 3
 @click.option("--target", metavar="SPEC|BODY", help="Another body: needs images or tags in the recording.")
 @click.option("--arm", metavar="ARM", help="Another arm model.")
 @click.option("--estimator", type=click.Choice(["kalman", "latest"]), default="kalman", show_default=True)
-@click.option("--references", metavar="REFERENCES.toml", type=PATH, help="Fuse an inertial unit, too.")
+@references_option()
 @click.option(
     "--rate", type=click.FloatRange(min=0), default=0.0, help="1 is real time; by default as fast as possible."
 )

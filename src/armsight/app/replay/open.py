@@ -9,12 +9,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from armsight.app.replay.recorded import RecordedRun, read_run, run_file
-from armsight.app.replay.run import Fused, Pace, Replayed, replay_run, replay_source, replay_tags
+from armsight.app.replay.run import Pace, Replayed, replay_run, replay_source, replay_tags
 from armsight.app.stream.datum import Published
-from armsight.app.stream.mcap_file import ARM, BODY, arm_of
+from armsight.app.stream.mcap_file import ARM, BODY, REFERENCES, arm_of
 from armsight.app.stream.streams import open_streams
 from armsight.data import Body
 from armsight.errors import InputError
+from armsight.loop.references.file import entries_of, read_references
+from armsight.loop.running.beside import Fused, recorded, the_one
 from armsight.robot.arm_file import open_arm
 from armsight.vision.markers.marker import Target
 from armsight.vision.markers.targets import open_body, open_target
@@ -61,27 +63,31 @@ def replay(request: Request, say: Callable[[str], None]) -> Replayed:
     return _of_source(request, recorded, say)
 
 
-def _of_run(request: Request, recorded: RecordedRun, say: Callable[[str], None]) -> Replayed:
+def _of_run(request: Request, run: RecordedRun, say: Callable[[str], None]) -> Replayed:
     """Run the estimators of a run again."""
-    for note in recorded.notes:
+    for note in run.notes:
         say(f"note: {note}")
     if request.rig is not None or request.target is not None:
         raise InputError(
             f"{request.recording}: another --rig or --target needs the images of every shot, which a run does not keep; "
             "its estimators can be replayed, with another --arm or --estimator"
         )
-    if ARM not in recorded.properties or BODY not in recorded.properties:
-        raise InputError(f"{recorded.path}: its metadata name no arm or no body: it was written by another version")
-    arm = arm_of(recorded.properties[ARM]) if request.arm is None else open_arm(request.arm)
-    body = _body_of(recorded)
-    rig = StereoRig.from_text(recorded.properties["rig.json"], f"{recorded.path}: rig.json")
+    if ARM not in run.properties or BODY not in run.properties:
+        raise InputError(f"{run.path}: its metadata name no arm or no body: it was written by another version")
+    arm = arm_of(run.properties[ARM]) if request.arm is None else open_arm(request.arm)
+    body = _body_of(run)
+    rig = StereoRig.from_text(run.properties["rig.json"], f"{run.path}: rig.json")
     changed = request.arm is not None or request.estimator != "kalman"
     if request.references is not None and changed:
         raise InputError("--references goes with the run's own arm and estimator; leave out --arm and --estimator")
-    beside = None if request.references is None else Fused.of(request.references)
+    beside, text = None, run.properties.get(REFERENCES)
+    if request.references is not None:
+        beside = recorded(the_one(read_references(request.references), request.references))
+    elif text is not None and request.estimator == "kalman":
+        beside = Fused(the_one(entries_of(text, run.path), run.path))
     with contextlib.closing(open_streams(request.streams, Published(rig, body, arm, _PROPERTIES), say)) as publisher:
         return replay_run(
-            recorded,
+            run,
             arm,
             body,
             estimator=request.estimator,
@@ -89,6 +95,7 @@ def _of_run(request: Request, recorded: RecordedRun, say: Callable[[str], None])
             publisher=publisher,
             changed=changed,
             beside=beside,
+            own=request.references is None,
         )
 
 

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from armsight.app.stream.mcap_file import RUN_MCAP, TOPICS
-from armsight.data import JointStates, Missed, PoseEstimate
+from armsight.app.stream.ros import IMU
+from armsight.data import Array, JointStates, Missed, PoseEstimate
 from armsight.errors import InputError
+from armsight.loop.references.file import reading_of
 from armsight.loop.running.data import NO_POINTS, EventDatum, JointsDatum
 from armsight.vision.sources.bag import Bag
 from armsight.vision.sources.bag.camera_info import METADATA
@@ -25,6 +27,8 @@ class RecordedDatum:
 
     kind: type  #: ShotDatum, JointsDatum or EventDatum: what was published
     content: dict[str, Any]  #: its JSON; docs/reference/data.md describes the keys
+    #: of joints: times (N,), s, and readings (N, 6) of an inertial unit that were given with them.
+    felt: tuple[Array, Array] = (np.empty(0), np.empty((0, 6)))
 
     @property
     def result(self) -> PoseEstimate | Missed:
@@ -84,10 +88,17 @@ def read_run(path: Path) -> RecordedRun | None:
     bag = Bag(path)
     if METADATA not in bag.metadata:
         return None
-    data = []
-    for message in bag.messages([topic for topic in _KINDS if topic in bag.topics]):
+    data, felt = list[RecordedDatum](), list[tuple[float, Array]]()
+    for message in bag.messages([topic for topic in (*_KINDS, IMU) if topic in bag.topics]):
+        if message.topic == IMU:
+            felt.append(reading_of(message))
+            continue
         content = message.decode()
         if not isinstance(content, dict):
             raise InputError(f"{path}: a datum on {message.topic} is no JSON object")
-        data.append(RecordedDatum(_KINDS[message.topic], content))
+        datum = RecordedDatum(_KINDS[message.topic], content)
+        if felt and datum.kind is JointsDatum:
+            datum = replace(datum, felt=(np.array([t for t, _ in felt]), np.array([z for _, z in felt])))
+            felt.clear()
+        data.append(datum)
     return RecordedRun(path, bag.metadata[METADATA], tuple(data), tuple(bag.notes))

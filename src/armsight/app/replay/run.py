@@ -11,30 +11,24 @@ import contextlib
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
 from armsight.app.replay.recorded import RecordedDatum, RecordedRun
-from armsight.data import Body, JointStates, Missed, PoseEstimate, Shot
+from armsight.data import Array, Body, JointStates, Missed, PoseEstimate, Shot
 from armsight.errors import InputError
-from armsight.estimate.solve import squares_of
 from armsight.loop.estimators import (
     ArmEstimate,
     Delay,
     Estimator,
-    Innovation,
     KalmanEstimator,
     LatestEstimator,
     Mounting,
-    Outcome,
     Prior,
     Remembered,
 )
-from armsight.loop.references.file import Entry, read_recording, read_references
-from armsight.loop.references.inertial import INERTIAL_CLASSES
-from armsight.loop.references.strapdown import GAP_S, Samples
+from armsight.loop.running.beside import Fused, FusedRow
 from armsight.loop.running.data import EventDatum, JointsDatum, Publisher, ShotDatum
 from armsight.robot.kinematics.arm import Arm
 from armsight.vision.detections import SeenShot
@@ -49,45 +43,6 @@ from armsight.vision.sources.bag.states import JointStream
 _Seen = TypeVar("_Seen", Shot, SeenShot)
 #: Every estimator; each takes the arm, and by name ``prior`` and ``delay``.
 ESTIMATORS: dict[str, Callable[..., Estimator]] = {"kalman": KalmanEstimator, "latest": LatestEstimator}
-
-#: Residuals over their sigma below which a unit agrees (as links count as loose, 1/3 is usual), and the share of outliers;
-#: half: chance is a fault, double: a loose mount agrees.
-HONEST, OUTLIERS = 1.0, 0.01
-#: Samples that are given at once at most: older ones are of before the estimator began.
-MOST = 1000
-
-
-@dataclass(frozen=True)
-class FusedRow:
-    """What a reference beside vision did to the estimates of a run."""
-
-    name: str  #: of the reference
-    windows: int  #: of its readings that were used or rejected
-    outliers: int  #: of them rejected
-    begin_s: float  #: since when it was used, s: before, the camera's delay is learned
-    residual_over_sigma: (
-        float  #: root mean square; 1/3 is usual, as links count as loose; from ``HONEST`` on it disagrees
-    )
-    agrees: bool  #: whether it agrees with joints and vision
-    rejected_s: float | None  #: when it was dropped as images contradict it, s; None where it was not
-    moved_rms_m: float  #: distance of the estimates from those without it, m
-    sigma_rms_m: float  #: of the position with it, root of the trace, m
-    sigma_without_rms_m: float  #: and without, m
-
-    @property
-    def line(self) -> str:
-        """It as a line for people."""
-        moved, sigma, without = (1e3 * x for x in (self.moved_rms_m, self.sigma_rms_m, self.sigma_without_rms_m))
-        found = "agrees" if self.agrees else "disagrees"
-        dropped = (
-            "" if self.rejected_s is None else f"; it was dropped at {self.rejected_s:.1f} s: images contradict it"
-        )
-        return (
-            f"with {self.name} from {self.begin_s:.1f} s on: the estimates move by {moved:.3f} mm RMS, sigma "
-            f"{sigma:.3f} mm, without {without:.3f}; it {found} with joints and vision: residuals "
-            f"{self.residual_over_sigma:.2f} of their sigma, {self.outliers} of {self.windows} windows are outliers"
-            f"{dropped}"
-        )
 
 
 @dataclass(frozen=True)
@@ -120,92 +75,6 @@ class Pace:
         time.sleep(max(0.0, self._began[0] + (t_s - self._began[1]) / self._rate - now))
 
 
-class Fused:
-    """A recorded unit in an estimator.
-
-    Args:
-        entry: calibrated, with its recording.
-
-    Attributes:
-        windows: used so far, outliers included.
-        outliers: of them.
-        begin_s: time of the first window, s.
-        rejected_s: when images contradicted it so that it was used no more, s; None where they did not.
-
-    Raises:
-        InputError: it is not calibrated, or its recording cannot be read.
-    """
-
-    def __init__(self, entry: Entry) -> None:
-        self.sensor, name = entry.reference, entry.reference.name
-        if not entry.calibrated or entry.source is None:
-            lacks = "source" if entry.calibrated else "parameters"
-            raise InputError(f"[{name}]: has no {lacks}; armsight references calibrate writes a file that has them")
-        self._t_s, self._z = read_recording(entry.source)
-        kind = INERTIAL_CLASSES[entry.sensor_class]
-        self._density = np.repeat([kind.gyro_noise, kind.noise], 3)
-        self._next, self._squares = 0, 0.0
-        self.windows, self.outliers = 0, 0
-        self.begin_s = np.inf
-        self.rejected_s: float | None = None
-
-    @staticmethod
-    def of(path: Path) -> Fused:
-        """Return the one of a file.
-
-        Raises:
-            InputError: the file has several.
-        """
-        first, *others = read_references(path)
-        if others:
-            raise InputError(
-                f"{path}: [{others[0].reference.name}]: one inertial unit is fused; leave one table in the file"
-            )
-        return Fused(first)
-
-    def give(self, estimator: KalmanEstimator, end_s: float) -> None:
-        """Give an estimator the samples up to a time, s, as the unit stamps them."""
-        end = int(np.searchsorted(self._t_s, end_s, side="right"))
-        first, self._next = max(self._next, end - MOST), end
-        if end > first:
-            estimator.on_reading = self._heard
-            outcome = estimator.take(self.sensor, Samples(self._t_s[first:end], self._z[first:end], self._density))
-            if outcome is Outcome.OUTLIER and self.rejected_s is None:
-                self.rejected_s = end_s
-
-    def _heard(self, name: str, innovation: Innovation) -> None:
-        """Take a window's residual."""
-        z, self.begin_s = innovation.z, min(self.begin_s, innovation.t_s)
-        self.windows += 1
-        self.outliers += innovation.outcome is Outcome.OUTLIER
-        if innovation.outcome is not Outcome.OUTLIER:
-            self._squares += float(squares_of(z[None], innovation.cov[None])[0]) / len(z)
-
-    @property
-    def ratio(self) -> float:
-        """Root mean square of the residuals that were used, over their sigma."""
-        return float(np.sqrt(self._squares / max(self.windows - self.outliers, 1)))
-
-    @property
-    def agrees(self) -> bool:
-        """Whether the residuals are as small as the filter expects."""
-        few = self.windows > 0 and self.outliers < OUTLIERS * self.windows
-        return few and self.rejected_s is None and self.ratio < HONEST
-
-    def unused(self, begin_s: float, end_s: float) -> InputError:
-        """Return why no window was used of a run between two times, s."""
-        t_s = self._t_s[(self._t_s >= begin_s) & (self._t_s <= end_s)]
-        apart = float(np.median(np.diff(t_s))) if len(t_s) > 1 else 0.0
-        why = "the run ended before its mounting and the camera's delay were known; a unit is used from then on"
-        if not len(t_s):
-            why = "no reading is of the run's times; do both have one clock?"
-        elif apart > GAP_S:
-            why = (
-                f"samples are {1e3 * apart:.0f} ms apart, at most {1e3 * GAP_S:.0f} are integrated over; record faster"
-            )
-        return InputError(f"[{self.sensor.name}]: {why}")
-
-
 def replay_run(
     recorded: RecordedRun,
     arm: Arm,
@@ -216,11 +85,12 @@ def replay_run(
     publisher: Publisher,
     changed: bool,
     beside: Fused | None = None,
+    own: bool = False,
 ) -> Replayed:
     """Run the estimators of a run again, with an arm and a body; the publisher is given what comes out.
 
     ``changed``: whether arm or estimator are others, whose estimates are not compared with the recorded ones; ``beside``: a
-    reference whose readings are fused.
+    reference whose readings are fused; ``own``: whether these are the run's own, which it recorded.
 
     Raises:
         InputError: they are, and the rig was put right during the run.
@@ -233,7 +103,7 @@ def replay_run(
         elif each.kind is JointsDatum:
             states = each.states
             pace.wait(float(states.t_s[-1]))
-            if (estimate := state.joints(states)) is not None:
+            if (estimate := state.joints(states, each.felt if own else None)) is not None:
                 live.append(JointsDatum(states, estimate.T_base_tool, estimate.cov, estimate.vision_age_s))
                 before.append(each)
                 publisher.put(live[-1])
@@ -243,25 +113,21 @@ def replay_run(
             poses.append(shot_pose(name, t_s, body, result))
             shot = Shot(name, None, None, t_s)
             publisher.put(ShotDatum(shot, result, each.content["arrival_s"], each.content["sigma_t_s"], outcome))
-    same = None if changed or beside is not None else _differences(before, live, body)
-    return Replayed(
-        body, tuple(poses), tuple(live), None, same, None if beside is None else _row(beside, before, live, body)
-    )
+    same = None if changed or (beside is not None and not own) else _differences(before, live, body)
+    row = None if beside is None or own else _row(beside, before, live, body)
+    return Replayed(body, tuple(poses), tuple(live), None, same, row)
 
 
 def _row(beside: Fused, before: list[RecordedDatum], live: list[JointsDatum], body: Body) -> FusedRow:
     """Return what a reference did to the estimates since the first of its windows."""
     rows = [(was, now) for was, now in zip(before, live, strict=True) if now.states.t_s[-1] >= beside.begin_s]
-    if not rows:
-        times = [now.states.t_s for now in live] or [np.zeros(1)]
-        raise beside.unused(float(times[0][0]), float(times[-1][-1]))
-    p_was, cov_was = (np.array([was.content[key] for was, _ in rows]) for key in ("tool_position_m", "tool_covariance"))
     fused = [now.to_json(body) for _, now in rows]
-    p, cov = (np.array([each[key] for each in fused]) for key in ("tool_position_m", "tool_covariance"))
-    sigma, sigma_was = (float(np.sqrt(np.einsum("nii->ni", one)[:, :3].sum(axis=1).mean())) for one in (cov, cov_was))
-    moved = float(np.sqrt(((p - p_was) ** 2).sum(axis=1).mean()))
-    said = beside.windows, beside.outliers, beside.begin_s, beside.ratio, beside.agrees, beside.rejected_s
-    return FusedRow(beside.sensor.name, *said, moved, sigma, sigma_was)
+    p_was, cov_was = (np.array([was.content[key] for was, _ in rows]) for key in ("tool_position_m", "tool_covariance"))
+    p, covs = (np.array([each[key] for each in fused]) for key in ("tool_position_m", "tool_covariance"))
+    if not len(rows):
+        return beside.row(covs)
+    without = float(np.sqrt(np.einsum("nii->ni", cov_was)[:, :3].sum(axis=1).mean()))
+    return beside.row(covs, (float(np.sqrt(((p - p_was) ** 2).sum(axis=1).mean())), without))
 
 
 class _RunAgain:
@@ -312,13 +178,15 @@ class _RunAgain:
                     t_s, pose = seen.pop(0)
                     self._estimator.vision(self._mounting.pose_measurement(pose, t_s))
 
-    def joints(self, states: JointStates) -> ArmEstimate | None:
+    def joints(self, states: JointStates, felt: tuple[Array, Array] | None) -> ArmEstimate | None:
         self._batches.append(states)
         if self._estimator is None:
             return None
         self._estimator.joints(states)
-        if self._beside is not None and self._mounting is not None and isinstance(self._estimator, KalmanEstimator):
-            self._beside.give(self._estimator, float(states.t_s[-1]))
+        if self._beside is not None and felt is not None:
+            self._beside.give(self._estimator, *felt)
+        elif self._beside is not None:
+            self._beside.poll(self._estimator, float(states.t_s[-1]))
         return self._estimator.estimate()
 
     def vision(self, result: PoseEstimate | Missed, t_s: float | None, content: dict[str, Any]) -> str | None:

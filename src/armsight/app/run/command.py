@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from armsight.app.options import LOGGED, PATH, SIM, output, stream_option
+from armsight.app.options import LOGGED, PATH, SIM, output, references_option, stream_option
 from armsight.app.show.messages import UNTRUSTED, require
 from armsight.errors import InputError
 from armsight.files import read_text, write_text
@@ -72,6 +72,7 @@ _CYCLES, _SPEED_M_S = 3, 0.1
     is_flag=True,
     help="The board's sync LED (docs/howto/board.md) is in view of both cameras: it gives delay and skew.",
 )
+@references_option()
 @click.option("--open-loop", is_flag=True, help="Control by the joint sensors alone; do not close the loop on vision.")
 @click.option(
     "--follow-rig",
@@ -91,6 +92,7 @@ def command(
     sync_ms: float,
     stream: tuple[str, ...],
     sync_led: bool,
+    references: Path | None,
     open_loop: bool,
     follow_rig: bool,
     output: Path,
@@ -105,10 +107,10 @@ def command(
     name of the shot or by time, for shots of a recording. Exit code 3: the result must not be trusted.
     """
     if board_spec.startswith(LOGGED):
-        if motion is not None or open_loop or fixed or follow_rig or sync_led:
+        if motion is not None or open_loop or fixed or follow_rig or sync_led or references is not None:
             raise InputError(
-                f"--board {board_spec} commands no motion: leave out --motion, --open-loop, --fixed, --follow-rig and "
-                "--sync-led"
+                f"--board {board_spec} commands no motion: leave out --motion, --open-loop, --fixed, --follow-rig, "
+                "--references and --sync-led"
             )
         _run_logged(
             source_spec, Path(board_spec.removeprefix(LOGGED)), rig_path, target_spec, arm_spec, output, as_json
@@ -121,6 +123,8 @@ def command(
     from armsight.app.run.folder import finish, open_folder, run_in
     from armsight.app.run.motion_file import read_motions
     from armsight.app.run.report import show
+    from armsight.loop.references.file import read_references
+    from armsight.loop.running.beside import the_one
     from armsight.loop.running.calibrate import handeye_poses
     from armsight.robot.arm_file import open_arm
     from armsight.vision.follow.follower import follows
@@ -144,8 +148,11 @@ def command(
         motions = read_motions(arm, motion)
     targets = handeye_poses(arm, motions.ends, _HANDEYE_POSES, 0)
     files = {"motion.toml": text, "body.toml": read_text(target_spec)}
+    unit = None if references is None else the_one(read_references(references), references)
+    if references is not None:
+        files["references.toml"] = read_text(references)
     open_folder(output)
-    devices = Devices(source_spec, board_spec, arm, target, 1e-3 * sync_ms, sync_led)
+    devices = Devices(source_spec, board_spec, arm, target, 1e-3 * sync_ms, sync_led, unit)
     begun = False
     try:
         with steps() as progress:

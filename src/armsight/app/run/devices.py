@@ -11,12 +11,17 @@ import click
 import numpy as np
 
 from armsight.app.options import SIM
+from armsight.app.run.readings import LiveReadings
 from armsight.errors import InputError
+from armsight.loop.references.file import Entry
+from armsight.loop.references.inertial import INERTIAL_CLASSES
+from armsight.loop.running.beside import Fused
 from armsight.loop.running.setup import HostClock, LiveShots, Setup
 from armsight.robot.board_registry import EMULATED, check_board, emulator_name, open_motion_board, slowed
 from armsight.robot.boards.board import Board
 from armsight.robot.boards.contract import MotionBoard
 from armsight.robot.kinematics.arm import Arm
+from armsight.sim.references.inertial import InertialErrors, InertialUnit
 from armsight.vision.markers.targets import Composite
 from armsight.vision.sources import open_source
 
@@ -25,6 +30,7 @@ if TYPE_CHECKING:
 
 #: The workcell's arm and cameras where ``sim:`` names none: those of ``armsight demo``.
 _SIM_ARM, _SIM_CAMERAS = "worn", "1280x720@60"
+_UNIT_HZ = 1000.0  # of an inertial unit in the workcell whose table does not say
 _RATE_HZ = 60.0  # of cameras whose times show none; half: the loop expects shots late, double: early
 
 
@@ -42,6 +48,14 @@ def setup_of(workcell: Workcell) -> Setup:
         sync_s,
         sync_led_bit_s=sync_led_bit_s(workcell.board, "the workcell") if workcell.source.shows_led else None,
     )
+
+
+def simulated_unit(workcell: Workcell, entry: Entry, seed: int) -> Fused:
+    """Return an inertial unit of a class on the workcell's tool, with errors beyond what its calibration knows."""
+    c, rng = INERTIAL_CLASSES[entry.sensor_class], np.random.default_rng([seed, 77])
+    drawn = (c.gyro_noise, c.noise), (c.gyro_bias, c.bias), c.scale, c.g_sensitivity, rng
+    errors = InertialErrors.typical(*drawn, good=entry.sensor_class == "icm-42688", rate_hz=entry.rate_hz or _UNIT_HZ)
+    return Fused(entry, workcell.carry(InertialUnit(errors, rng)))
 
 
 def sync_led_bit_s(board: MotionBoard, name: str) -> float:
@@ -71,6 +85,7 @@ class Devices:
     target: Composite  #: the body on the tool
     sync_s: float  #: standard deviation of the time between the two exposures of a shot, s
     sync_led: bool = False  #: whether an LED on the board's clock is in view
+    reference: Entry | None = None  #: an inertial unit that is fused and recorded
 
 
 def require_joints(board: MotionBoard, name: str, arm: Arm) -> None:
@@ -111,7 +126,8 @@ def open_devices(devices: Devices) -> Iterator[Setup]:
             workcell = stack.enter_context(
                 Workcell.open(arm=_SIM_ARM, cameras=cameras, emulator=emulator, model=devices.arm, sync_led=led)
             )
-            yield replace(setup_of(workcell), target=devices.target)
+            beside = None if devices.reference is None else simulated_unit(workcell, devices.reference, 0)
+            yield replace(setup_of(workcell), target=devices.target, beside=beside)
             return
         check_board(board)  # a mistake is said before the cameras are waited for
         shots = LiveShots(open_source(source))
@@ -123,6 +139,11 @@ def open_devices(devices: Devices) -> Iterator[Setup]:
         opened = stack.enter_context(open_motion_board(board))
         require_joints(opened, board, devices.arm)
         bit_s = sync_led_bit_s(opened, f"--board {board}") if devices.sync_led else None
+        beside, clock = None, HostClock()
+        if devices.reference is not None:
+            readings = LiveReadings(devices.reference, clock)
+            stack.callback(readings.close)
+            beside = Fused(devices.reference, readings)
         yield Setup(
             devices.arm,
             opened,
@@ -131,6 +152,7 @@ def open_devices(devices: Devices) -> Iterator[Setup]:
             np.zeros_like,
             rate_hz or _RATE_HZ,
             devices.sync_s,
-            HostClock(),
+            clock,
             sync_led_bit_s=bit_s,
+            beside=beside,
         )

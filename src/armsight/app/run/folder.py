@@ -36,7 +36,7 @@ from armsight.app.run.tracks import NAMES, Part, Tracks, columns, joint_columns,
 from armsight.app.show.page import PAGE, writable_folder
 from armsight.app.show.report import Report
 from armsight.app.stream.datum import Published
-from armsight.app.stream.mcap_file import RUN_MCAP, LazyMcap, properties
+from armsight.app.stream.mcap_file import REFERENCES, RUN_MCAP, LazyMcap, properties
 from armsight.app.stream.streams import open_streams
 from armsight.data import Array, Image, PoseEstimate, Shot
 from armsight.errors import ArmsightError, InputError
@@ -74,14 +74,16 @@ def run_in(
 ) -> RunResult:
     """Run the experiment on real devices, with run.mcap in its folder and streams beside.
 
-    ``files`` are the texts of motion.toml and body.toml, which are written first; run.mcap says which ``command`` made it;
+    ``files`` are the texts of motion.toml and body.toml, perhaps of references.toml, which are written first; run.mcap says
+    which ``command`` made it;
     ``say`` is given what could not be recorded or published; ``how`` and the rest is as :func:`run_experiment` takes it.
     """
     make_room(folder)
     for name, text in files.items():
         write_text(folder / name, text)
     rig.save(folder / "rig.json")
-    texts = properties(rig, files["body.toml"], setup.arm, command=command)
+    more = {REFERENCES: files[REFERENCES]} if REFERENCES in files else {}
+    texts = properties(rig, files["body.toml"], setup.arm, command=command, **more)
     hold = _interrupt if command == "run" else None
     published = Published(rig, setup.target.body, setup.arm, texts, hold, lambda: setup.board.joints.temperature_c)
     with contextlib.ExitStack() as stack:

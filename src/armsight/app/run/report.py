@@ -33,8 +33,11 @@ from armsight.app.show.page import PAGE
 from armsight.app.show.report import Block, Fact, Grade, Lines, Plot, Report, Section, Text
 from armsight.app.show.table import TextTable
 from armsight.data import Image
+from armsight.errors import InputError
 from armsight.loop.health import health_lines, unseen_lines
 from armsight.loop.health.follow import correction_lines
+from armsight.loop.running.beside import Fused
+from armsight.loop.running.log import Log
 
 #: Track -> its name in tables.
 TRACKS = {
@@ -235,6 +238,9 @@ def _measured(result: RunResult, values: dict[str, Any], led: Any, studies: Sequ
         lines.append(
             f"search of the body: median {1e3 * t.p50:.0f} ms, longest {1e3 * t.max:.0f} ms; commands continue meanwhile"
         )
+    if result.setup.beside is not None:
+        values["reference"], line = _beside(result.setup.beside, log)
+        lines.append(line)
     position, angle = result.handeye.found.held_out.rms()
     values["handeye"] = {
         "held_out_position_rms_m": position,
@@ -250,6 +256,16 @@ def _measured(result: RunResult, values: dict[str, Any], led: Any, studies: Sequ
     kept = ("name", "unit", "values", "position_rms_m", "predicted_m")
     values["studies"] = [{key: getattr(study, key) for key in kept} for study in studies]
     return [*lines, f"{_shots_line(result)}; run.log has the reasons"]
+
+
+def _beside(beside: Fused, log: Log) -> tuple[dict[str, Any] | None, str]:
+    """Return what a reference did to the live estimates, and the line of it; None where it was not used."""
+    lives = log.lives.array(53)
+    try:
+        row = beside.row(lives[lives[:, 0] >= beside.begin_s, 17:].reshape(-1, 6, 6))
+    except InputError as error:
+        return None, str(error)
+    return vars(row), row.line
 
 
 def _shots_line(result: RunResult) -> str:

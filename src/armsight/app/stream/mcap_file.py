@@ -24,6 +24,7 @@ from armsight import __version__
 from armsight.app.stream.datum import Published, json_text
 from armsight.app.stream.foxglove import LookedAt, Messages, nanoseconds, require_foxglove
 from armsight.app.stream.mcap_writer import McapWriter
+from armsight.app.stream.ros import IMU, IMU_KIND, IMU_SCHEMA, imu_messages
 from armsight.app.stream.sink import Sink
 from armsight.data import Shot
 from armsight.errors import InputError
@@ -36,8 +37,8 @@ from armsight.vision.sources.bag.camera_info import METADATA, RIG
 
 #: Name of the file in the folder of a run.
 RUN_MCAP = "run.mcap"
-#: Keys of its metadata beside the rig file: the body file, and the nominal arm.
-BODY, ARM = "body.toml", "arm.json"
+#: Keys of its metadata beside the rig file: the body file, the nominal arm, the references that are recorded.
+BODY, ARM, REFERENCES = "body.toml", "arm.json", "references.toml"
 #: Topics of the data as JSON, by kind.
 TOPICS: dict[type, str] = {ShotDatum: "/armsight/shot", JointsDatum: "/armsight/joints", EventDatum: "/armsight/event"}
 _WAKES = 64  # data that are written together, where they come fast
@@ -81,6 +82,9 @@ class McapSink(Sink):
         stamp_ns = nanoseconds(datum.time_s)
         for topic, message in self._messages.of(datum):
             self._writer.add_message(self._channel(topic, message), log_ns, stamp_ns, message.SerializeToString())
+        if isinstance(datum, JointsDatum) and datum.felt is not None:
+            for imu_ns, data in imu_messages(*datum.felt):
+                self._writer.add_message(self._imu_channel(), log_ns, imu_ns, data)
         if not isinstance(datum, NoteDatum):
             content: Mapping[str, Any] = (
                 datum.content if isinstance(datum, EventDatum) else datum.to_json(self._published.body)
@@ -99,6 +103,12 @@ class McapSink(Sink):
             images = name == "foxglove.CompressedImage"
             self._channels[topic] = self._writer.register_channel(topic, "protobuf", self._schemas[name], images=images)
         return self._channels[topic]
+
+    def _imu_channel(self) -> int:
+        if IMU not in self._channels:
+            schema = self._writer.register_schema(IMU_KIND, "ros2msg", IMU_SCHEMA.encode())
+            self._channels[IMU] = self._writer.register_channel(IMU, "cdr", schema)
+        return self._channels[IMU]
 
     def _json_channel(self, topic: str) -> int:
         if topic not in self._channels:

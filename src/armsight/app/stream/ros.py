@@ -2,16 +2,18 @@
 
 In: a decoded message of a Foxglove type. Out: the ROS type and a message of it, made with the classes of rosbags.
 CompressedImage, CameraInfo, Odometry and PoseStamped, JointState, TFMessage, and Log as rcl_interfaces/Log. Annotations and
-scenes have no counterpart.
+scenes have no counterpart. And readings of an inertial unit as ``sensor_msgs/msg/Imu``: schema, and bytes in CDR.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import struct
+from collections.abc import Callable, Iterator
 from typing import Any, TypeAlias
 
 import numpy as np
 
+from armsight.loop.references.strapdown import Samples
 from armsight.vision.sources.bag.reader import Decoded
 
 _Types: TypeAlias = Any
@@ -108,3 +110,35 @@ TO_ROS: dict[str, Callable[[_Types, Decoded], _Made]] = {
     "foxglove.FrameTransforms": _tf,
     "foxglove.Log": _log,
 }
+
+#: Topic and type of a run's readings.
+IMU, IMU_KIND = "/imu", "sensor_msgs/msg/Imu"
+_PARTS = {
+    "std_msgs/Header": "builtin_interfaces/Time stamp\nstring frame_id",
+    "builtin_interfaces/Time": "int32 sec\nuint32 nanosec",
+    "geometry_msgs/Quaternion": "float64 x\nfloat64 y\nfloat64 z\nfloat64 w",
+    "geometry_msgs/Vector3": "float64 x\nfloat64 y\nfloat64 z",
+}
+_FIELDS = """std_msgs/Header header
+geometry_msgs/Quaternion orientation
+float64[9] orientation_covariance
+geometry_msgs/Vector3 angular_velocity
+float64[9] angular_velocity_covariance
+geometry_msgs/Vector3 linear_acceleration
+float64[9] linear_acceleration_covariance"""
+#: What encoding "ros2msg" has: the type, and those that it is made of.
+IMU_SCHEMA = _FIELDS + "".join(f"\n{'=' * 80}\nMSG: {name}\n{text}" for name, text in _PARTS.items())
+#: Orientation, which is not measured (its covariance begins with -1), then the rest; covariances are not known.
+_VALUES = struct.Struct("<37d")
+_BEFORE = (0.0, 0.0, 0.0, 1.0, -1.0, *[0.0] * 8)
+
+
+def imu_messages(name: str, samples: Samples) -> Iterator[tuple[int, bytes]]:
+    """Yield the time, ns, and the bytes of the message of each sample; ``name`` is its frame."""
+    frame = name.encode() + b"\0"
+    frame = struct.pack("<I", len(frame)) + frame
+    frame += b"\0" * (-(8 + len(frame)) % 8)  # numbers stand at multiples of their size, from the stamp on
+    zero = (0.0,) * 9
+    for t_ns, z in zip(np.round(1e9 * samples.t_s).astype(np.int64).tolist(), samples.z.tolist(), strict=True):
+        stamp = struct.pack("<4siI", b"\0\1\0\0", *divmod(t_ns, 1_000_000_000))
+        yield t_ns, stamp + frame + _VALUES.pack(*_BEFORE, *z[:3], *zero, *z[3:], *zero)

@@ -47,7 +47,7 @@ from armsight.loop.estimators.readings import GAP_RAD, Readings, Smoothed
 from armsight.loop.estimators.smoothing import Interval, blended, by_state, intervals
 from armsight.loop.references.inertial import Inertial
 from armsight.loop.references.reference import Reading, Reference, ToolMotion
-from armsight.loop.references.strapdown import Samples, Strapdown
+from armsight.loop.references.strapdown import Advanced, Samples, Strapdown, Window
 from armsight.loop.references.update import Considered, Shares, gained, passed
 from armsight.robot.kinematics.arm import Arm
 
@@ -137,7 +137,7 @@ class KalmanEstimator:
         no_reference: Reference | None = None
         self._unit: Strapdown | None = None
         self._without: Remembered | None = None
-        self._against, self._rejected = 0, no_reference
+        self._against, self._rejected = dict[type, int](), no_reference
         self._outliers: list[Array] = []
         self._backlash_set = True  # whether the readings have the newest estimate of the backlash
         # At the newest reading, until something is heard: the state, the joints and what came of the state, and the tool.
@@ -239,9 +239,9 @@ class KalmanEstimator:
 
         The reference's parameters and delay are considered by their covariance, not estimated. An outlier is never used,
         however often it comes back: which of reference and vision is wrong is not the filter's to say. Samples of an
-        inertial unit come in order of time; its parameters and delay are estimated. A unit that so many images in a row
-        contradict as reopen a filter is used no more, and what was learned with it is forgotten: they are outliers then.
-        While the camera's delay is learned, none are used: they would shift it by several of its sigma.
+        inertial unit come in order of time; its parameters and delay are estimated. A unit that so many images, or windows,
+        in a row contradict as reopen a filter is used no more, and what was learned with it is forgotten: they are outliers
+        then. While the camera's delay is learned, none are used: they would shift it by several of its sigma.
 
         Raises:
             InputError: the reference has no such channel, or samples are not of an inertial unit, or not in order.
@@ -271,6 +271,8 @@ class KalmanEstimator:
         end = min(self._unit.newest_s, self.span_s[1])
         for t_s in begin + WINDOW_S * np.arange(1, int((end - begin) / WINDOW_S) + 1):
             self._hear(Until(float(t_s)))
+            if self._unit is None:
+                return Outcome.OUTLIER
         return Outcome.USED if end - begin >= WINDOW_S else Outcome.WAITING
 
     def _hear(self, measurement: PoseMeasurement | Taken | Until) -> Outcome:
@@ -291,7 +293,7 @@ class KalmanEstimator:
         later = self._states[row:]
         newest_heard = all(isinstance(state.measurement, Until) for state in later)
         after, outcome = self._used(before, measurement, report=newest_heard)
-        contradicted = isinstance(measurement, PoseMeasurement) and self._contradicted(outcome)
+        contradicted = not isinstance(measurement, Taken) and self._contradicted(type(measurement), outcome)
         if after is None or contradicted:
             return outcome
         self._states[row:] = [after]
@@ -304,12 +306,12 @@ class KalmanEstimator:
             del self._states[0]
         return outcome
 
-    def _contradicted(self, outcome: Outcome) -> bool:
-        """Count an image's outcome; return whether so many contradict the inertial unit that it was dropped."""
+    def _contradicted(self, kind: type, outcome: Outcome) -> bool:
+        """Count outcomes of a kind, images or windows; return whether so many are against the unit that it was dropped."""
         if self._unit is None or self._without is None:
             return False
-        self._against = 0 if outcome is Outcome.USED else self._against + 1
-        if self._against < STUBBORN:
+        self._against[kind] = 0 if outcome is Outcome.USED else self._against.get(kind, 0) + 1
+        if self._against[kind] < STUBBORN:
             return False
         self._rejected, self._unit = self._unit.sensor, None
         self.restore(self._without)
@@ -320,9 +322,9 @@ class KalmanEstimator:
     ) -> tuple[ErrorState | None, Outcome]:
         """Return the state after a measurement, None where it is an outlier."""
         if isinstance(measurement, Until):
-            after = self._felt(before, measurement.t_s, report=report)
+            after, outcome = self._felt(before, measurement.t_s, report=report)
             after = self._alone(before, measurement.t_s) if after is before else after
-            return after._replace(taken=measurement), Outcome.USED
+            return after._replace(taken=measurement), outcome
         if isinstance(measurement, Taken):
             return self._take_reading(before, measurement, report=report)
         return self._take(before, measurement, self._report if report else None)
@@ -342,7 +344,7 @@ class KalmanEstimator:
         """Return the state after the newest measurement, the joints at the newest reading, and the propagation to it."""
         if self._here is None:
             newest = np.array([self.span_s[1]])
-            state, joints = self._anew(self._felt(self._states[-1], self.span_s[1]), newest)
+            state, joints = self._anew(self._felt(self._states[-1], self.span_s[1])[0], newest)
             self._here = state, joints, self._model.moved(state, joints, newest)
         return self._here
 
@@ -446,7 +448,7 @@ class KalmanEstimator:
         """Return the state after a measurement, None where it is an outlier; report how it came about."""
         t_s = max(self._seen_s(pose_measurement, before), before.t_s)
         times, jitter_s = np.array([t_s]), self._delay.jitter_s
-        before, joints = self._anew(self._felt(before, t_s), times)
+        before, joints = self._anew(self._felt(before, t_s)[0], times)
         step = self._model.moved(before, joints, times, learning=LEARNING)
         at, chi = self._model.predicted(before, step, joints, pose_measurement, jitter_s)
         outcome = self._gate(at, chi)
@@ -474,10 +476,12 @@ class KalmanEstimator:
         considered = passed(_carried(before.considered, step), K, at.H) if before.considered else NONE_CONSIDERED
         return ErrorState(t_s, x, P, joints, pose_measurement, considered=considered, beside=beside), outcome
 
-    def _alone(self, before: ErrorState, t_s: float) -> ErrorState:
-        """Return the state at a time by the joints alone."""
-        before, joints = self._anew(before, np.array([t_s]))
-        step = self._model.moved(before, joints, np.array([t_s]), learning=LEARNING)
+    def _alone(self, before: ErrorState, t_s: float, by: tuple[Smoothed, Propagation] | None = None) -> ErrorState:
+        """Return the state at a time by the joints alone; ``by``: the joints then, and what the motion does to it."""
+        if by is None:
+            before, joints = self._anew(before, np.array([t_s]))
+            by = joints, self._model.moved(before, joints, np.array([t_s]), learning=LEARNING)
+        joints, step = by
         x, P = self._propagated(before, step)
         beside, considered = before.beside, _carried(before.considered, step)
         if beside is not None:
@@ -491,40 +495,51 @@ class KalmanEstimator:
         P[np.diag_indices(len(P))] += step.added[0]
         return before.x * step.kept[0], P
 
-    def _felt(self, before: ErrorState, t_s: float, *, report: bool = False) -> ErrorState:
-        """Return the state at a time by the joints and what an inertial unit felt; as it is where that is not known."""
+    def _felt(self, before: ErrorState, t_s: float, *, report: bool = False) -> tuple[ErrorState, Outcome]:
+        """Return the state at a time by the joints and what a unit felt, as it is where that is not known; if likely."""
         window = None if self._unit is None else self._unit.window(before.t_s, t_s)
         if self._unit is None or window is None:
-            return before
+            return before, Outcome.USED
         before, joints = self._anew(before, np.array([t_s]))
         step, loose = self._model.moved(before, joints, np.array([t_s]), learning=LEARNING), self._loose
         share = float(np.exp(-window.length_s / LOOSE_S))
         step.kept[:, loose] *= share
         step.added[:, loose] += LOOSE_RAD**2 * (1.0 - share**2)
-        kept, added = step.kept[0], step.added[0]
         q, unseen = (
             np.concatenate([getattr(end, part) for end in (before.joints, joints)]) for part in ("q", "unseen")
         )
-        Ts, Hs = self._model.poses(np.stack([before.x, before.x * kept]), q, unseen)
+        got, Ts, outcome = self._advanced(self._unit, window, before, step, q, unseen)
+        kept, added = step.kept[0], step.added[0]
+        if report and self.on_reading is not None:
+            said = got.z, got.S, got.by, kept.copy(), got.gain, outcome
+            self.on_reading(self._unit.sensor.name, Innovation(t_s, Ts[1], *said, added=added.copy()))
+        if outcome is Outcome.OUTLIER:  # an impact: links may be anywhere within their gaps
+            kept[loose], added[loose] = 0.0, self._model.sigmas[loose] ** 2
+            got, _, again = self._advanced(self._unit, window, before, step, q, unseen)
+            if again is Outcome.OUTLIER:
+                return self._alone(before, t_s, (joints, step)), outcome
+        considered = {name: C * kept[:, None] - got.gain @ (got.by @ C) for name, C in before.considered.items()}
+        last = before.pose_measurement, None, before.seen_s, considered, got.beside._replace(t_s=t_s)
+        return ErrorState(t_s, got.x, got.P, joints, *last), outcome
+
+    def _advanced(
+        self, unit: Strapdown, window: Window, before: ErrorState, step: Propagation, q: Array, unseen: Array
+    ) -> tuple[Advanced, Array, Outcome]:
+        """Return what a window does, the tool's poses (2, 4, 4) at its ends, and whether it is likely; q (2, n) there."""
+        Ts, Hs = self._model.poses(np.stack([before.x, before.x * step.kept[0]]), q, unseen)
         beside = before.beside
         if beside is None or beside.t_s != before.t_s:
             twist = Hs[0][:, self._at.zeros] * self._arm.direction @ before.joints.qd[0]
-            beside = self._unit.started(beside, before.t_s, Ts[0], twist, len(before.x))
-        got = self._unit.advanced(window, beside, (before.x, before.P), (kept, added), (Ts, Hs), self._at.delay)
-        outcome = Outcome.USED if chi_square(np.ascontiguousarray(got.S), got.z) < _GATE else Outcome.OUTLIER
-        if report and self.on_reading is not None:
-            said = got.z, got.S, got.by, kept, got.gain, outcome
-            self.on_reading(self._unit.sensor.name, Innovation(t_s, Ts[1], *said, added=added))
-        if outcome is Outcome.OUTLIER or not (np.abs(got.x) < self._furthest).all():
-            return self._alone(before, t_s)
-        considered = {name: C * kept[:, None] - got.gain @ (got.by @ C) for name, C in before.considered.items()}
-        last = before.pose_measurement, None, before.seen_s, considered, got.beside._replace(t_s=t_s)
-        return ErrorState(t_s, got.x, got.P, joints, *last)
+            beside = unit.started(beside, before.t_s, Ts[0], twist, len(before.x))
+        change = step.kept[0], step.added[0]
+        got = unit.advanced(window, beside, (before.x, before.P), change, (Ts, Hs), self._at.delay)
+        likely = chi_square(np.ascontiguousarray(got.S), got.z) < _GATE and (np.abs(got.x) < self._furthest).all()
+        return got, Ts, Outcome.USED if likely else Outcome.OUTLIER
 
     def _take_reading(self, before: ErrorState, taken: Taken, *, report: bool) -> tuple[ErrorState | None, Outcome]:
         """Return the state after a reading of a reference, None where it is an outlier; report it."""
         (reference, reading), t_s = taken, max(taken.t_s, before.t_s)
-        before, joints = self._anew(self._felt(before, t_s), np.array([t_s]))
+        before, joints = self._anew(self._felt(before, t_s)[0], np.array([t_s]))
         step = self._model.moved(before, joints, np.array([t_s]), learning=LEARNING)
         kept, added = step.kept[0], step.added[0]
         x, P = self._propagated(before, step)

@@ -2,7 +2,8 @@
 
 [imu]
 kind = "inertial"
-source = "imu.csv"          # CSV or JSON lines: t_s, gyro_x_rad_s .., accelerometer_x_m_s2 ..
+source = "imu.csv"          # CSV or JSON lines: t_s, gyro_x_rad_s .., accelerometer_x_m_s2 ..; a bag of ROS, a run
+live = "udp:5005"           # where `armsight run` reads it, JSON lines of the same keys; or serial:PORT
 class = "mpu-6050"          # what is not known is left out
 rate_hz = 100.0
 delay_s = 0.004
@@ -15,6 +16,7 @@ from __future__ import annotations
 
 import json
 import os
+import tomllib
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -29,14 +31,18 @@ from armsight.geometry.pose import pose
 from armsight.geometry.rotation import exp_so3
 from armsight.loop.references.inertial import Inertial
 from armsight.tables.columns import Columns
+from armsight.vision.sources.bag.reader import S_NS, SUFFIXES, Bag, BagMessage
 
 #: Keys of a reference's table.
-_KEYS = ("kind", "source", "class", "rate_hz", "delay_s", "sigma_delay_s", "parameters", "covariance")
+_KEYS = ("kind", "source", "live", "class", "rate_hz", "delay_s", "sigma_delay_s", "parameters", "covariance")
 #: The columns of an inertial unit's recording.
 INERTIAL_COLUMNS = tuple(
     f"{sensor}_{axis}_{unit}" for sensor, unit in (("gyro", "rad_s"), ("accelerometer", "m_s2")) for axis in "xyz"
 )
 _MOST_MB = 200  # of a recording
+#: Numbers at the end of a message of ``sensor_msgs/Imu``: orientation, angular velocity and acceleration, each with its
+#: covariance (9); and where among them a reading stands.
+_IMU_BYTES, _IMU_VALUES = 37 * 8, np.r_[13:16, 25:28]
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +54,7 @@ class Entry(Record):
         kind: of sensor.
         sensor_class: what it is like.
         source: its recording; None where none is named.
+        live: where it is read in a run; None where that is not said.
         rate_hz: readings a second, as the file says; None where it does not.
         calibrated: whether the file has its parameters.
     """
@@ -56,6 +63,7 @@ class Entry(Record):
     kind: str
     sensor_class: str
     source: Path | None
+    live: str | None
     rate_hz: float | None
     calibrated: bool
 
@@ -72,6 +80,11 @@ def read_references(path: Path) -> list[Entry]:
     return [_entry(path, name, table) for name, table in tables.items()]
 
 
+def entries_of(text: str, where: Path) -> list[Entry]:
+    """Return the references of the text of such a file, which a run keeps; ``where``: the run's file, for messages."""
+    return [_entry(where, name, table) for name, table in tomllib.loads(text).items()]
+
+
 def _entry(path: Path, name: str, table: dict[str, Any]) -> Entry:
     where = f"{path}: [{name}]"
     if unknown := [key for key in table if key not in _KEYS]:
@@ -85,7 +98,7 @@ def _entry(path: Path, name: str, table: dict[str, Any]) -> Entry:
         # The poses' clock may be the later one: then a delay is below zero.
         if value < {"rate_hz": 1e-3, "delay_s": -np.inf, "sigma_delay_s": 0.0}[key]:
             raise InputError(f"{where}: {key} is {value:g}; expected more")
-    for key in ("source", "class"):
+    for key in ("source", "live", "class"):
         if not isinstance(table.get(key, ""), str):
             raise InputError(f"{where}: {key} is {table[key]!r}; expected a text")
     kind = table.get("class", "mpu-6050")
@@ -95,7 +108,7 @@ def _entry(path: Path, name: str, table: dict[str, Any]) -> Entry:
     if "parameters" in table:
         sensor = _known(where, sensor, table["parameters"], table.get("covariance"))
     source = path.parent / table["source"] if "source" in table else None
-    return Entry(sensor, "inertial", kind, source, table.get("rate_hz"), "parameters" in table)
+    return Entry(sensor, "inertial", kind, source, table.get("live"), table.get("rate_hz"), "parameters" in table)
 
 
 def _known(where: str, sensor: Inertial, given: object, covariance: object) -> Inertial:
@@ -118,6 +131,8 @@ def written(entry: Entry, folder: Path) -> str:
     sensor, lines = entry.reference, [f"[{json.dumps(entry.reference.name)}]", f'kind = "{entry.kind}"']
     if entry.source is not None:
         lines.append(f"source = {json.dumps(os.path.relpath(entry.source, folder))}")
+    if entry.live is not None:
+        lines.append(f"live = {json.dumps(entry.live)}")
     lines.append(f'class = "{entry.sensor_class}"')
     if entry.rate_hz is not None:
         lines.append(f"rate_hz = {entry.rate_hz:g}")
@@ -133,8 +148,34 @@ def read_recording(path: Path) -> tuple[Array, Array]:
     Raises:
         InputError: the file, the line and what was expected.
     """
+    if path.is_dir() or path.suffix.lower() in SUFFIXES:
+        return _of_bag(Bag(path))
     columns = Columns.of_csv(path) if path.suffix.lower() not in (".jsonl", ".ndjson") else _json_lines(path)
     return columns.numbers(["t_s"])[:, 0], columns.numbers(INERTIAL_COLUMNS)
+
+
+def _of_bag(bag: Bag) -> tuple[Array, Array]:
+    """Return the readings of a recording of ROS, or of a run.mcap: of its one topic of ``sensor_msgs/Imu``."""
+    topics = [topic.name for topic in bag.of_kind("sensor_msgs/Imu")]
+    if len(topics) != 1:
+        listed = ", ".join(topics) or bag.holds()
+        raise InputError(f"{bag.path}: expected one topic of sensor_msgs/Imu; there are {len(topics)}: {listed}")
+    found = [reading_of(message) for message in bag.messages(topics)]
+    return np.array([t for t, _ in found]), np.array([z for _, z in found])
+
+
+def reading_of(message: BagMessage) -> tuple[float, Array]:
+    """Return the time, s, and the reading (6,), rad/s and m/s2, of a message of ``sensor_msgs/Imu``.
+
+    Raises:
+        InputError: it is too short.
+    """
+    stamp = message.stamp_ns() or message.arrival_ns
+    if len(message.data) < _IMU_BYTES:
+        raise InputError(f"{message.topic}: message {message.index + 1} is cut short: {len(message.data)} bytes")
+    order = ">" if message.encoding == "cdr" and not message.data[1] & 1 else "<"
+    values = np.frombuffer(message.data[-_IMU_BYTES:], f"{order}f8").astype(float)
+    return stamp / S_NS, values[_IMU_VALUES]
 
 
 def _json_lines(path: Path) -> Columns:

@@ -20,6 +20,7 @@ from armsight.vision.pose.shot_pose import shot_pose
 if TYPE_CHECKING:
     from armsight.loop.estimators import KalmanEstimator, Mounting, Remembered
     from armsight.loop.finding import HealthFinding
+    from armsight.loop.references.strapdown import Samples
 
 #: The points of a pose that was recorded without them.
 NO_POINTS = Points(
@@ -87,6 +88,8 @@ class JointsDatum(Record):
     )
     cov: Array | None = None  #: (6, 6) its covariance, right tangent [m; rad]
     vision_age_s: float = np.inf  #: time since the newest measurement used, s; infinite before the first
+    #: name and samples of the inertial unit that the estimator was given after these readings; None without.
+    felt: tuple[str, Samples] | None = None
 
     @property
     def time_s(self) -> float:

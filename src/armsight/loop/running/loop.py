@@ -264,9 +264,12 @@ class Loop:
         self.log.read(states)
         self._read.append(states.t_s)
         self.estimator.joints(states)
+        beside = self.setup.beside
+        samples = None if beside is None else beside.poll(self.estimator, self.t_s)
+        felt = None if beside is None or samples is None else (beside.entry.reference.name, samples)
         estimate = self.estimator.estimate()
         self.log.estimated(estimate)
-        self.publisher.put(JointsDatum(states, estimate.T_base_tool, estimate.cov, estimate.vision_age_s))
+        self.publisher.put(JointsDatum(states, estimate.T_base_tool, estimate.cov, estimate.vision_age_s, felt))
         if self.t_s - RECORD_LAG_S - self._noted_s >= _RECORD_EVERY_S:
             self._note(self.t_s - RECORD_LAG_S)  # with pose measurements on both sides of a time
 

@@ -17,6 +17,7 @@ import numpy as np
 
 from armsight.data import Array, Shot
 from armsight.errors import ArmsightError, DeviceError
+from armsight.loop.running.beside import Fused
 from armsight.robot.boards.contract import MotionBoard
 from armsight.robot.kinematics.arm import Arm
 from armsight.vision.markers.marker import Target
@@ -68,6 +69,12 @@ class HostClock:
         elif difference < self._minima[-1][1]:
             self._minima[-1] = board_s, difference
 
+    @property
+    def offset_s(self) -> float:
+        """What is added to a time of the board for one of the host, s; a reading must have been heard before."""
+        assert self._least_s is not None
+        return self._least_s
+
     def _highest_rate(self) -> float:
         """Return how fast the offset rises, at most: the line under the minima, and what their scatter leaves open."""
         if len(self._minima) < 2:
@@ -85,7 +92,6 @@ class HostClock:
         Raises:
             DeviceError: no live camera stamped it, by this computer's clock.
         """
-        assert self._least_s is not None
         if shot.t_s is None and shot.problem is not None:
             return shot
         t_s = shot.t_s if shot.t_s is not None and math.isfinite(shot.t_s) else None
@@ -96,7 +102,7 @@ class HostClock:
                 f"shot {shot.name} {problem}: is it of a recording? A run needs live cameras (usb:..., url:...)"
             )
         self._live = True
-        return replace(shot, t_s=t_s - self._least_s)
+        return replace(shot, t_s=t_s - self.offset_s)
 
 
 @dataclass(frozen=True)
@@ -117,6 +123,7 @@ class Setup:
     fixed: tuple[Target, ...] = ()  #: bodies in view that do not move
     #: how long each bit of the sync LED's code lasts, s; None where no LED is to be looked for.
     sync_led_bit_s: float | None = None
+    beside: Fused | None = None  #: a reference beside vision whose readings are fused and recorded; None without
 
 
 class LiveShots:

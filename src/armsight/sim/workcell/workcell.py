@@ -29,6 +29,7 @@ from armsight.robot.boards.link import TICK_S
 from armsight.robot.kinematics.arm import Arm
 from armsight.sim.camera.stages import CameraPipeline
 from armsight.sim.example_rig import board_poses
+from armsight.sim.references.inertial import InertialUnit
 from armsight.sim.render.optics import Sensor
 from armsight.sim.render.scene import chessboard
 from armsight.sim.workcell.arm import Imperfections, imperfections, sample_arm
@@ -58,6 +59,8 @@ NEAR_M = 0.6
 #: The chessboard that is shown to the cameras.
 CHESSBOARD = "chessboard:9x6:30mm"
 _CHESSBOARD_FILL = (0.35, 1.0)  # of the image's height
+#: Where an inertial unit is on the tool.
+_T_TOOL_UNIT = exp_se3(np.array([0.02, -0.015, -0.03, 0.3, -0.2, 1.0]))
 #: The body on the tool: rotated by 180 degrees about y, so that its z runs into the plate, on a bracket to the cameras.
 _MOUNT_M, _MOUNT_RAD = np.array([0.003, -0.004, 0.035]), np.radians([-10.0, 12.0, 4.0])
 #: Five poses, seen from home: the tool's shift, m, base axes, and its rotation vector about its own axes, degrees.
@@ -351,6 +354,20 @@ class Workcell:
             InputError: the arm does not reach one.
         """
         return workcell_poses(self.model, default=self._default)
+
+    def carry(self, unit: InertialUnit) -> Callable[[float], tuple[Array, Array]]:
+        """Return what reads an inertial unit on the tool: stamps (N,) up to a time, s, and readings (N, 6), each once."""
+        at = self.plant.travelled.ticks
+
+        def read(end_s: float) -> tuple[Array, Array]:
+            nonlocal at
+            begin, at = at, max(min(round(end_s / TICK_S), self.plant.travelled.ticks), at)
+            first = self.plant.travelled.begin
+            q = self.plant.path[begin + 1 - first : at + 1 - first, self.plant.arm.joints :]
+            t_s = np.asarray(TICK_S * np.arange(begin + 1, at + 1), np.float64)
+            return unit.read(t_s, self.plant.arm.forward(q) @ _T_TOOL_UNIT)
+
+        return read
 
     def chessboard_shots(self, count: int) -> Iterator[Shot]:
         """Show a chessboard in many poses, as a person would who calibrates, past the arm; no time passes.
