@@ -64,7 +64,7 @@ def known_unit():
 def made(folder, text=""):
     """Write a run to a folder and return that; with the text of references.toml its unit was fused."""
     from armsight.loop.references.file import entries_of
-    from armsight.loop.running.beside import Fused
+    from armsight.loop.running.setup import Fused
     from strategies import ordinary_rig
 
     stamps, z, _ = known_unit()

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from armsight.app.run.readings import LiveReadings
+from armsight.app.run.devices import LiveReadings
 from armsight.errors import ArmsightError
 from armsight.loop.references.file import INERTIAL_COLUMNS, Entry
 from armsight.loop.references.inertial import Inertial
@@ -53,7 +53,7 @@ def test_udp_lines_are_on_the_boards_clock_and_rise(board, monkeypatch):
     port, now = free_port(), [105.0]
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         wait, send = time.sleep, lambda data: sender.sendto(data, ("127.0.0.1", port))
-        monkeypatch.setattr("armsight.app.run.readings.time.sleep", lambda s: (wait(s), send(line(7.0))))
+        monkeypatch.setattr("armsight.app.run.devices.time.sleep", lambda s: (wait(s), send(line(7.0))))
         readings = LiveReadings(replace(ENTRY, live=f"udp:{port}"), board, lambda: now[0])
         now[0] = 105.02
         for data in (line(7.001) + b"\n" + line(7.002), line(7.001), b"[1]", line(np.nan), line(7.003, 2.0)):
@@ -71,7 +71,7 @@ def test_lines_of_a_serial_port_may_be_cut(board, monkeypatch):
 
     tty.setraw(port)
     wait, cut = time.sleep, line(1.0)[20:] + b"\n" + line(2.0) + b"\n" + line(2.001)[:30]
-    monkeypatch.setattr("armsight.app.run.readings.time.sleep", lambda s: (wait(s), os.write(controller, cut)))
+    monkeypatch.setattr("armsight.app.run.devices.time.sleep", lambda s: (wait(s), os.write(controller, cut)))
     readings = LiveReadings(replace(ENTRY, live=f"serial:{os.ttyname(port)}"), board)
     monkeypatch.undo()
     os.write(controller, line(2.001)[30:] + b"\n")
@@ -94,7 +94,7 @@ def test_lines_of_a_serial_port_may_be_cut(board, monkeypatch):
     ],
 )
 def test_bad_input_is_one_line(board, monkeypatch, live, sent, said):
-    monkeypatch.setattr("armsight.app.run.readings.FIRST_S", 0.3)
+    monkeypatch.setattr("armsight.app.run.devices.FIRST_S", 0.3)
     port = free_port()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         wait = time.sleep
@@ -104,6 +104,6 @@ def test_bad_input_is_one_line(board, monkeypatch, live, sent, said):
             if sent:
                 sender.sendto(sent, ("127.0.0.1", port))
 
-        monkeypatch.setattr("armsight.app.run.readings.time.sleep", sleep)
+        monkeypatch.setattr("armsight.app.run.devices.time.sleep", sleep)
         with pytest.raises(ArmsightError, match=said):
             LiveReadings(replace(ENTRY, live=live and live.format(port)), board)

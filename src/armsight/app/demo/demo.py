@@ -31,8 +31,8 @@ from armsight.data import Array, Shot
 from armsight.errors import ArmsightError
 from armsight.files import read_text, write_text
 from armsight.loop.references.file import read_references
-from armsight.loop.running.beside import the_one
 from armsight.loop.running.calibrate import Progress, handeye_poses
+from armsight.loop.running.setup import the_one
 from armsight.processes import Process, caller
 from armsight.robot.arm_file import open_arm
 from armsight.robot.kinematics.arm import Arm

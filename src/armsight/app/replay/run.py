@@ -28,8 +28,8 @@ from armsight.loop.estimators import (
     Prior,
     Remembered,
 )
-from armsight.loop.running.beside import Fused, FusedRow
 from armsight.loop.running.data import EventDatum, JointsDatum, Publisher, ShotDatum
+from armsight.loop.running.setup import Fused, FusedRow
 from armsight.robot.kinematics.arm import Arm
 from armsight.vision.detections import SeenShot
 from armsight.vision.follow.follower import Follower, follows

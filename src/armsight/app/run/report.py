@@ -36,8 +36,8 @@ from armsight.data import Image
 from armsight.errors import InputError
 from armsight.loop.health import health_lines, unseen_lines
 from armsight.loop.health.follow import correction_lines
-from armsight.loop.running.beside import Fused
 from armsight.loop.running.log import Log
+from armsight.loop.running.setup import Fused
 
 #: Track -> its name in tables.
 TRACKS = {
