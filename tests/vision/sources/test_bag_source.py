@@ -479,7 +479,7 @@ def test_recorded_tags_are_detections_in_our_order_of_corners(tmp_path):
     )
     sent = []
     for k in range(4):
-        for topic, corners in (("/left/tags", ours[::-1]), ("/right/tags", ours - [5.0, 0.0])):  # both orders
+        for topic, corners in (("/left/tags", ours[::-1] + 0.5), ("/right/tags", ours - [5.0, 0.0])):  # both orders
             found = [] if k == 2 else [(7, corners), (99, corners)]
             sent.append(Sent(topic, EPOCH_NS + k * STEP_NS, Tags(found)))
     for container in ("ros1", "sqlite3", "mcap"):
@@ -494,6 +494,22 @@ def test_recorded_tags_are_detections_in_our_order_of_corners(tmp_path):
         read_tags(f"bag:{tmp_path / 'mcap'}", Body("b", ("P1", "P2", "P3"), np.zeros((3, 3))))
     with pytest.raises(InputError, match="no tag of body other is in it; it has tag36h11 7"):
         read_tags(f"bag:{tmp_path / 'mcap'}", Body("other", tuple(f"1.{k}" for k in range(4)), np.zeros((4, 3))))
+
+
+def test_recorded_tags_of_the_apriltag_library_are_in_our_pixels(tmp_path):
+    # What pupil-apriltags 1.0.4 finds of a tag whose outline is the pixels 100 to 179 of both axes, blurred by 0.8 px.
+    library = np.array([[179.857, 99.943], [100.127, 99.850], [99.798, 179.913], [179.913, 179.857]])
+    sent = [
+        Sent(f"/{side}/tags", EPOCH_NS + k * STEP_NS, Tags([(5, library)]))
+        for k in range(3)
+        for side in ("left", "right")
+    ]
+    body = Body("plate", tuple(f"5.{k}" for k in range(4)), np.eye(4, 3))
+    found, _ = read_tags(f"bag:{write_bag(tmp_path / 'tags', 'mcap', sent)}", body)
+    edges = np.array([[99.5, 179.5], [99.5, 99.5], [179.5, 99.5], [179.5, 179.5]])  # of pixels whose centres are whole
+    for uv in (found[0].uv[0], found[2].uv[1]):
+        off = (uv[:, None] - edges)[np.arange(4), np.linalg.norm(uv[:, None] - edges, axis=2).argmin(axis=1)]
+        np.testing.assert_allclose(off.mean(axis=0), 0.0, atol=0.15)  # a corner is 0.2 px off here; half a pixel is 0.5
 
 
 def test_the_real_bags_of_tags_are_read(data_dir):

@@ -5,8 +5,11 @@ In: a recording with two topics of AprilTag detections, one a camera, and the bo
 ApriltagArrayStamped and AprilTagDetectionArray, and isaac_ros's. apriltag_ros of ROS 1 publishes poses alone.
 
 Order of the corners: counter-clockwise in the image is the AprilTag library's, from the lower left; clockwise is OpenCV's,
-from the upper left. A body's points are called as :mod:`~armsight.vision.markers.tag` calls them, NAME.0 to NAME.3 from the
-upper left; a body of points (CSV) calls a tag by its number: 12.0 to 12.3.
+from the upper left. The library's pixels count from the corner of the first one, so 0.5 px is subtracted where its corners
+are sent as they are: by apriltag_ros of ROS 2 (AprilTagNode.cpp, 011db4ee) as apriltag_msgs' AprilTagDetectionArray. The
+detectors behind the other types may refine corners by OpenCV, whose pixels are ours. A body's points are called as
+:mod:`~armsight.vision.markers.tag` calls them, NAME.0 to NAME.3 from the upper left; a body of points (CSV) calls a tag by
+its number: 12.0 to 12.3.
 """
 
 from __future__ import annotations
@@ -29,6 +32,8 @@ TAGS = (
     "apriltag_msgs/AprilTagDetectionArray",
     "isaac_ros_apriltag_interfaces/AprilTagDetectionArray",
 )
+#: That of apriltag_ros, which sends what the AprilTag library finds, and what its pixels count more than ours, px.
+_LIBRARY, _LIBRARY_MORE = "apriltag_msgs/AprilTagDetectionArray", 0.5
 #: Types that hold their poses alone.
 _WITHOUT_CORNERS = ("apriltag_ros/AprilTagDetectionArray", "apriltag_ros_msgs/AprilTagDetectionArray")
 
@@ -119,7 +124,7 @@ def _corners(message: BagMessage, points: dict[int, int], unknown: dict[str, int
             name = f"{tag.family} {number}".strip()
             unknown[name] = unknown.get(name, 0) + 1
             continue
-        corners = _ordered(tag)
+        corners = _ordered(tag, _LIBRARY_MORE if message.kind == _LIBRARY else 0.0)
         if np.isfinite(corners).all():
             ids.append(points[number] + np.arange(4))
             uv.append(corners)
@@ -128,9 +133,9 @@ def _corners(message: BagMessage, points: dict[int, int], unknown: dict[str, int
     return np.concatenate(ids), np.concatenate(uv)
 
 
-def _ordered(tag: Decoded) -> Array:
-    """Return corners (4, 2) from the upper left, clockwise as one looks at the upright tag."""
+def _ordered(tag: Decoded, more: float) -> Array:
+    """Return corners (4, 2) from the upper left, clockwise as one looks at the tag; the library's less ``more``, px."""
     corners = np.array([[float(point.x), float(point.y)] for point in tag.corners])
     ahead = np.roll(corners, -1, axis=0)
     clockwise = float(np.sum(corners[:, 0] * ahead[:, 1] - corners[:, 1] * ahead[:, 0])) > 0.0  # rows count downwards
-    return corners if clockwise else corners[::-1]
+    return corners if clockwise else corners[::-1] - more
