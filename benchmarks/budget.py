@@ -29,7 +29,7 @@ from armsight.files import write_text
 from armsight.geometry.pose import exp_se3, inverse, log_se3, pose, transform
 from armsight.geometry.rigid import fit_rigid
 from armsight.sim.budget.chart import marker_noise
-from armsight.sim.budget.plan import MOST_SQUARE_PX, RigPlan, catalogue, length_m, planned
+from armsight.sim.budget.plan import MOST_SQUARE_PX, PRICES, RigPlan, catalogue, length_m, planned
 from armsight.sim.budget.result import BOUNDS, CHANGES, RigBudget, best
 from armsight.sim.camera.pipeline import SimulatedCamera
 from armsight.sim.example_rig import board_poses
@@ -73,7 +73,7 @@ KITS = {
     ),
     "Machine vision": (
         {"camera": "machine-vision-2mp", "baseline": "250mm"},
-        "At this distance it is no better than the global shutters: the print decides. It is for small, far discs.",
+        "At this distance the print decides; it is for small, far discs.",
     ),
 }
 #: Board and body, measured after printing.
@@ -179,25 +179,25 @@ def buying_page() -> str:
         found, better = armsight.budget(**BOUGHT, **kit), armsight.budget(**BOUGHT, **kit, **CALIPERS)
         at, cameras = found.states, found.plan.cameras
         moving = (at["at_rest"], at["moving"], found.causes[0].cause)
-        cells = (title, cameras.price, *moving, better.at_rest, at["one_camera"], at["three_cameras"])
+        lens = f"{found.plan.focal_mm:.2g} mm ({found.plan.focal_px / found.plan.image_size_px[0]:.2g})"
+        cells = (title, cameras.price, lens, *moving, better.at_rest, at["one_camera"], at["three_cameras"])
         rows.append("| " + " | ".join(map(str, cells)) + " |")
-        text = f"The kit is {cameras.text}, {kit['baseline']} apart. {limits}"
+        text = f"{cameras.text[0].upper()}{cameras.text[1:]}, {kit['baseline']} apart. {limits}"
         kits += ["", f"## {title}", "", *textwrap.wrap(text, 116)]
     intro = (
-        f"[`armsight budget`](howto/budget.md) predicts these figures for a volume of {BOUGHT['volume']} at "
-        f"{BOUGHT['distance']}: 95 % of the errors are within them at the worst position. In motion the body moves at "
-        f"{BOUGHT['speed']}; the next column says what that is mostly due to. Price classes reach from 1 (tens of "
-        "euros a pair) to 5 (thousands). `python benchmarks/budget.py page` writes this page."
+        "[`armsight budget`](howto/budget.md) predicts what 95 % of the errors are within at the worst position of "
+        f"{BOUGHT['volume']} at {BOUGHT['distance']}; in motion at {BOUGHT['speed']}. "
+        f"Lens: focal length (over the sensor's width). Price classes: {PRICES}."
     )
     printed = (
         "Print the board with `armsight body draw chessboard:9x6:25mm -o board.pdf` and glue it to a stiff plate. "
         "`armsight budget -o kit` draws the body. Measure both after printing: that gains more than better cameras."
     )
     head = (
-        "| kit | price class | at rest | in motion | mostly due to | at rest, print measured | one camera, at rest | "
-        "three, at rest |"
+        "| kit | price class | lens | at rest | in motion | mostly due to | at rest, print measured | "
+        "one camera, at rest | three, at rest |"
     )
-    lines = ["# What to buy", "", *textwrap.wrap(intro, 116), "", head, "|" + "---|" * 8, *rows]
+    lines = ["# What to buy", "", *textwrap.wrap(intro, 116), "", head, "|" + "---|" * 9, *rows]
     lines += ["", *textwrap.wrap(printed, 116)]
     return "\n".join([*lines, *kits]) + "\n"
 

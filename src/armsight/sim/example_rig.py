@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from armsight.data import Array
 from armsight.errors import InputError
@@ -22,6 +23,7 @@ from armsight.vision.camera import Camera
 from armsight.vision.rig import StereoRig
 
 _TRIES = 400  # for one pose before giving up
+_AT_ONCE = 16  # of them; half: more calls, double: more that are not used
 _SLANT_MAX = np.radians(62.0)  # beyond it a board is hard to read
 _MARGIN_PX = 4.0
 
@@ -70,26 +72,29 @@ def example_rig(
     return StereoRig(left, right, T_left_right, np.zeros((count, count)), 0.0, {"source": "armsight.sim.example_rig"})
 
 
-def in_view(rig: StereoRig, T_left_pattern: Array, pattern: Pattern) -> bool:
-    """Return whether both cameras see all of a pattern, at a readable slant."""
+def in_view(rig: StereoRig, Ts_left_pattern: Array, pattern: Pattern) -> NDArray[np.bool_]:
+    """Return for poses (A, 4, 4) whether both cameras see all of a pattern, at a readable slant: (A,)."""
     p_pattern = np.column_stack([outline(pattern), np.zeros(4 * OUTLINE)])
-    T_right_left = inverse(rig.T_left_right)
-    for camera, T in ((rig.left, T_left_pattern), (rig.right, T_right_left @ T_left_pattern)):
-        p = transform(T, p_pattern)
-        uv = camera.project(p)
-        away = p / np.linalg.norm(p, axis=1, keepdims=True)
+    rows = np.arange(len(Ts_left_pattern))
+    for camera, T_camera_left in ((rig.left, np.eye(4)), (rig.right, inverse(rig.T_left_right))):
+        Ts = T_camera_left @ Ts_left_pattern[rows]
+        p = transform(Ts[:, None], p_pattern)
+        uv = camera.project(p.reshape(-1, 3)).reshape(*p.shape[:2], 2)
         high = np.array(camera.image_size_px) - 1 - _MARGIN_PX
+        away = p / np.linalg.norm(p, axis=-1, keepdims=True)
+        slant = (away * Ts[:, None, :3, 2]).sum(axis=-1).min(axis=1)
+        inside = ((uv >= _MARGIN_PX) & (uv <= high)).all(axis=(1, 2)) & (slant >= np.cos(_SLANT_MAX))
+        rows, uv, away = rows[inside], uv[inside], away[inside]
         # Where a distortion polynomial folds back, a point far outside is projected inside: its ray shows that.
-        seen = (uv >= _MARGIN_PX).all() and (uv <= high).all() and np.abs(camera.unproject(uv) - away).max() < 1e-6
-        if not seen or (away @ T[:3, 2]).min() < np.cos(_SLANT_MAX):
-            return False
-    return True
+        folded = np.abs(camera.unproject(uv.reshape(-1, 2)).reshape(away.shape) - away).max(axis=(1, 2), initial=0.0)
+        rows = rows[folded < 1e-6]
+    return np.isin(np.arange(len(Ts_left_pattern)), rows)
 
 
-def _between(rig: StereoRig, distance_m: float) -> Array:
-    """Return the point (3,) between both optical axes at a distance from the cameras, m, left camera's frame."""
-    ahead = np.array([0.0, 0.0, distance_m, 1.0])
-    return np.asarray(0.5 * (ahead[:3] + (rig.T_left_right @ ahead)[:3]))
+def _between(rig: StereoRig, distances_m: Array) -> Array:
+    """Return the points (A, 3) between both optical axes at distances from the cameras, m, left camera's frame."""
+    ahead = distances_m[:, None] * np.array([0.0, 0.0, 1.0])
+    return np.asarray(0.5 * (ahead + transform(rig.T_left_right, ahead)))
 
 
 def board_poses(
@@ -117,34 +122,56 @@ def board_poses(
     Raises:
         InputError: no such pose was found.
     """
-    width, height = rig.left.image_size_px
-    corners = outline(pattern)
-    diagonal = float(np.linalg.norm(np.ptp(corners, axis=0)))
-    p_middle = np.append((corners.min(axis=0) + corners.max(axis=0)) / 2, 0.0)
     cells = rng.permutation(count)
     poses = []
     for n in range(count):
-        for attempt in range(_TRIES):
-            # The image is divided into 4 x 3 cells, used in turn; where no pose is in view, the next one is nearer in.
-            cell = np.array([cells[n] % 4, cells[n] // 4 % 3])
-            uv = (cell + rng.uniform(0, 1, 2)) / (4, 3) * (width, height)
-            distance = float(rig.left.intrinsics[0] * diagonal / (rng.uniform(*fill) * height))
-            side = n % 2
-            p = transform(rig.T_left_right if side else np.eye(4), distance * rig.cameras[side].unproject(uv[None])[0])
-            p += attempt / _TRIES * (_between(rig, distance) - p)
-            about, tilt = rng.uniform(0, 2 * np.pi), np.radians(tilt_deg) * np.sqrt(rng.uniform(0, 1))
-            R = exp_so3(np.array([0.0, 0.0, rng.uniform(-0.4, 0.4)])) @ exp_so3(
-                tilt * np.array([np.cos(about), np.sin(about), 0.0])
-            )
-            T_left_pattern = pose(R, p - R @ p_middle)
-            if in_view(rig, T_left_pattern, pattern):
-                poses.append(T_left_pattern @ inverse(pattern.T_body_pattern))
+        for first in range(0, _TRIES, _AT_ONCE):
+            state = rng.bit_generator.state
+            Ts = _tried(rng.random((_AT_ONCE, 6)), rig, pattern, int(cells[n]), n % 2, first, fill, tilt_deg)
+            seen = np.flatnonzero(in_view(rig, Ts, pattern))
+            if len(seen):  # what comes next is drawn as if nothing had been tried beyond it
+                rng.bit_generator.state = state
+                rng.random((seen[0] + 1, 6))
+                poses.append(Ts[seen[0]] @ inverse(pattern.T_body_pattern))
                 break
         else:
             raise InputError(
                 "no pose of the board is in full view of both cameras: it is too large, or they look apart"
             )
     return np.array(poses)
+
+
+def _tried(
+    draws: Array,
+    rig: StereoRig,
+    pattern: Pattern,
+    number: int,
+    side: int,
+    first: int,
+    fill: tuple[float, float],
+    tilt_deg: float,
+) -> Array:
+    """Return poses (A, 4, 4) of a pattern in a cell of the image of one side, of draws (A, 6) in 0 to 1.
+
+    The image is divided into 4 x 3 cells; the poses of later attempts, of which ``first`` is the first's number, are
+    nearer to the middle.
+    """
+    width, height = rig.left.image_size_px
+    corners = outline(pattern)
+    diagonal = float(np.linalg.norm(np.ptp(corners, axis=0)))
+    p_middle = np.append((corners.min(axis=0) + corners.max(axis=0)) / 2, 0.0)
+    uv = (np.array([number % 4, number // 4 % 3]) + draws[:, :2]) / (4, 3) * (width, height)
+    distances = rig.left.intrinsics[0] * diagonal / ((fill[0] + (fill[1] - fill[0]) * draws[:, 2]) * height)
+    p = distances[:, None] * rig.cameras[side].unproject(uv)
+    p = transform(rig.T_left_right, p) if side else p
+    p += (first + np.arange(len(draws)))[:, None] / _TRIES * (_between(rig, distances) - p)
+    about, tilt = 2 * np.pi * draws[:, 3], np.radians(tilt_deg) * np.sqrt(draws[:, 4])
+    none = np.zeros(len(draws))
+    about_z = np.stack([none, none, -0.4 + 0.8 * draws[:, 5]], axis=1)
+    R = exp_so3(about_z) @ exp_so3(np.stack([tilt * np.cos(about), tilt * np.sin(about), none], axis=1))
+    Ts = np.tile(np.eye(4), (len(draws), 1, 1))
+    Ts[:, :3, :3], Ts[:, :3, 3] = R, p - R @ p_middle
+    return Ts
 
 
 def path(
@@ -165,7 +192,7 @@ def path(
     Raises:
         InputError: the target is not in view even at rest in the middle.
     """
-    middle = _between(rig, distance_m)
+    middle = _between(rig, np.array([distance_m]))[0]
     rates = speed * np.array([0.7, 1.1, 0.5, 0.9, 0.6, 0.8])
     phases = np.array([0.0, 0.4, 1.0, 0.2, 1.7, 2.5])
     ranges = np.array([0.35 * distance_m, 0.2 * distance_m, 0.2 * distance_m, 0.5, 0.5, 0.4])
@@ -178,7 +205,7 @@ def path(
         return T
 
     size, step = 1.0, 1e-4
-    while not all(in_view(rig, T @ p.T_body_pattern, p) for T in at(times_s, size) for p in patterns):
+    while not all(in_view(rig, at(times_s, size) @ p.T_body_pattern, p).all() for p in patterns):
         size *= 0.9
         if size < 0.05:
             raise InputError(f"the target is not in full view of both cameras at {distance_m:g} m")

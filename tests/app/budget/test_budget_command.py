@@ -21,7 +21,7 @@ def test_answer_table_and_page(armsight, tmp_path, monkeypatch):
     given = (*SMALL, "--want", "0.5mm", "--speed", "0.2m/s", "--arm", "ar4", "-o", tmp_path / "out")
     said = armsight("budget", *given, "--json")
     found = json.loads(said.out)
-    assert said.code == 0
+    assert said.code == (found["results"]["moving"]["level_m"] >= 5e-4)
     assert found["results"]["moving"]["level_m"] > found["results"]["at_rest"]["level_m"] > 0
     assert found["results"]["closed_loop_at_rest"]["level_m"] > found["results"]["at_rest"]["level_m"]
     shares = sum(cause["share"] for cause in found["causes"])
@@ -34,6 +34,14 @@ def test_answer_table_and_page(armsight, tmp_path, monkeypatch):
     )
     assert len(page) < 1_000_000
     assert json.loads((tmp_path / "out" / "budget.json").read_text())["causes"] == found["causes"]
+
+
+def test_a_wish_that_is_not_reached_is_exit_code_1(armsight, monkeypatch):
+    monkeypatch.setattr(result, "CHANGES", {})
+    said = armsight("budget", *SMALL, "--want", "0.02mm")
+    assert said.code == 1
+    assert "0.02 mm requested: not reached" in said.out
+    assert armsight("budget", *SMALL, "--want", "5mm").code == 0
 
 
 def test_the_best_of_a_class_with_what_to_build(armsight, tmp_path, monkeypatch):

@@ -31,7 +31,8 @@ from armsight.errors import InputError
 def command(path: str, optimise: bool, output: str | None, as_json: bool, **given: str | None) -> int:
     """Say before a rig is bought what it will measure, what limits it, and what would make it better.
 
-    What is left out is chosen, and said. PLAN.toml has the same keys and more: docs/howto/budget.md.
+    What is left out is chosen, and said. PLAN.toml has the same keys and more: docs/howto/budget.md. Exit code 1: what
+    --want asks for is not reached.
     """
     from armsight.app.body.draw import draw_body
     from armsight.app.budget.report import REPORT_FILES, budget_report, to_build
@@ -64,4 +65,4 @@ def command(path: str, optimise: bool, output: str | None, as_json: bool, **give
         written = str(report.write(Path(output), {"budget.json": report.json_text(), **files}))
         if "body.toml" in files:
             draw_body([Path(output) / "body.toml"], Path(output) / "body.pdf", split=True)
-    return report.echo(as_json=as_json, written=written)
+    return report.echo(as_json=as_json, written=written) or int(not found.reached(found.moving))

@@ -17,7 +17,7 @@ from armsight.app.show.page import PAGE
 from armsight.app.show.plotting import new_figure
 from armsight.app.show.report import Fact, Grade, Plot, Report, Section, figure_files
 from armsight.app.show.table import TextTable
-from armsight.sim.budget.plan import RigPlan
+from armsight.sim.budget.plan import PRICES, RigPlan
 from armsight.sim.budget.result import NOT_MODELLED, Alternative, RigBudget
 from armsight.sim.workcell.body import body_text
 from armsight.vision.calibrate.budget import Budget
@@ -52,7 +52,7 @@ def budget_report(found: RigBudget, alternatives: Sequence[Alternative] = (), ru
     )
     table = TextTable("causes, RMS over the volume", ("cause", "mm", "deg", "share", "halved: 95 % within"), rows)
     more = TextTable(
-        "what changes it most for least money, in motion",
+        f"what changes it most for least money, in motion (price class: {PRICES})",
         ("change", "price class", "95 % within"),
         tuple((text, str(price), f"{1e3 * m:.2g} mm") for text, price, m in found.changes),
     )
@@ -89,6 +89,7 @@ def _asked(plan: RigPlan) -> dict[str, Any]:
     lens = round(plan.focal_px / plan.image_size_px[0], 3)
     return {key: getattr(plan, key) for key in keys} | {
         "focal_widths": lens,
+        "focal_mm": round(plan.focal_mm, 1),
         "verging_deg": round(plan.stereo_rig.convergence_deg, 1),
         "exposure_ms": round(1e3 * plan.timing["exposure"], 3),
     }
@@ -138,7 +139,7 @@ def _chosen(plan: RigPlan) -> str:
     """Say what was left out."""
     left = [each.name for each in plan.settings() if each.name not in (*plan.named, *plan.of_rig)]
     shown = {
-        "focal_widths": f"{plan.focal_px / plan.image_size_px[0]:.2f}",
+        "focal_widths": f"{plan.focal_px / plan.image_size_px[0]:.2f} ({plan.focal_mm:.2g} mm)",
         "verging_deg": f"{plan.stereo_rig.convergence_deg:.0f}",
         "rate_hz": f"{plan.timing['rate']:g}",
         **{f"{name}_ms": f"{1e3 * plan.timing[name]:.2g}" for name in ("skew", "start", "exposure")},

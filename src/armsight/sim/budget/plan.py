@@ -70,6 +70,10 @@ _RANGES = {
 }  # fmt: skip
 
 
+#: What a class of price means, euros for a pair of cameras with lenses.
+PRICES = "0 nothing, 1 below 100, 2 to 300, 3 to 800, 4 to 2,000, 5 above, in euros the pair"
+
+
 @dataclass(frozen=True)
 class CameraClass:
     """A class of the catalogue; ``catalogue.toml`` says what its keys mean."""
@@ -315,6 +319,11 @@ class RigPlan:
         near, body = self.distance_m - self.size_m[2] / 2, np.ptp(self.layout.body.points, axis=0).max()
         sees = 0.97 * near * min(width / (self.size_m[0] + body), height / (self.size_m[1] + body))
         return self.focal_widths * width or min(self.cameras.focal_widths * width, max(sees, _WIDEST * width))
+
+    @property
+    def focal_mm(self) -> float:
+        """The same in mm, on the sensor of the class."""
+        return self.cameras.focal_mm * self.focal_px / (self.image_size_px[0] * self.cameras.focal_widths)
 
     @cached_property
     def pipeline(self) -> CameraPipeline:
