@@ -108,7 +108,9 @@ def test_a_finding_that_costs_about_a_sigma_is_noted_once():
     monitor, notes, made = HealthMonitor(faults.TRUE, faults.BODY, 0.0), HealthNotes(), []
     for k, sigma_m in enumerate((3.5e-4, 2.5e-4) * 5):
         found = HealthFinding("rig", "moved by x", None, 0.02, 0.001, "deg", "y", cost_mm=0.3)
-        monitor._rig = SimpleNamespace(findings=lambda found=found: (found,), pose_sigma_m=sigma_m, wrong_at_rest=False)
+        monitor._rig = SimpleNamespace(
+            findings=lambda found=found, **_: (found,), pose_sigma_m=sigma_m, wrong_at_rest=False
+        )
         made += list(notes.of(float(k), monitor.findings()))
     assert [each.level for each in made] == ["info", "warning"]  # it forbids from the least sigma on
 

@@ -21,7 +21,7 @@ from armsight.app.stream.datum import json_text
 from armsight.data import JointStates, Shot
 from armsight.geometry.pose import exp_se3, inverse, log_se3, pose
 from armsight.loop.estimators import Delay, KalmanEstimator, Mounting
-from armsight.loop.health import base_motion, closure, fixed, monitor, rig, shape
+from armsight.loop.health import base_motion, closure, fixed, monitor, residuals, rig, shape
 from armsight.loop.health.follow import RigFollower
 from armsight.loop.running import log
 from armsight.loop.running.calibrate import find_delay
@@ -201,8 +201,9 @@ def test_what_a_loop_holds_does_not_grow_with_its_shots(monkeypatch):
         log: {"NEWEST_SHOTS": 20, "_MOST_SHOTS": 10, "_BLOCK": 512, "_NEWEST_LIVE": 20},
         closure: {"_MOST_KEPT": 14},
         fixed: {"MOST": 6, "_NEWEST": 4},
-        rig: {"_MOST_KEPT": 6, "_IMAGES": 30, "_POSES": 10},
-        shape: {"_KEPT": 4, "_ASKED": 8, "_POSES": 10},
+        residuals: {"KEPT": 4},
+        rig: {"_IMAGES": 30, "_POSES": 10},
+        shape: {"_VIEWS": 20, "_ASKED": 8, "_POSES": 10},
         monitor: {"_ALL_S": 2.0, "_RATIO": 2.0},
         base_motion: {"_KEPT": 20},
     }

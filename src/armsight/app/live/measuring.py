@@ -294,7 +294,7 @@ class MeasureStep(PageStep[MeasureState]):
             self._write(live, result)
             self._streams.put(ShotDatum(live.shot, result, now))
             if now - self._health_s > 1.0:
-                findings = self._monitor.findings()
+                findings = self._monitor.findings(ends=False)
                 self.show(health=tuple(found.line() for found in findings))
                 for note in self._notes.of(now, findings):
                     self._streams.put(note)

@@ -167,7 +167,7 @@ class MeasureRun:
                 publisher.put(ShotDatum(shot, result, arrival_s))
                 if arrival_s is not None and arrival_s - looked_s > _HEALTH_S:
                     looked_s = arrival_s
-                    for note in notes.of(arrival_s, self.monitor.findings()):
+                    for note in notes.of(arrival_s, self.monitor.findings(ends=False)):
                         if note.level == "warning":
                             _warn(note.text)
                         else:

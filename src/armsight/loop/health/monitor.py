@@ -424,8 +424,12 @@ class HealthMonitor:
         changes = self.changes or small
         return changes if self._shakes.change is None else (*changes, self._shakes.change)
 
-    def findings(self) -> tuple[HealthFinding, ...]:
-        """Return what was found so far; nothing while all is well."""
+    def findings(self, *, ends: bool = True) -> tuple[HealthFinding, ...]:
+        """Return what was found so far; nothing while all is well.
+
+        Args:
+            ends: whether the shots of the newest second count, too, for which their test is made at once.
+        """
         self.work()
         sigma_s = 0.0 if self._estimator is None else self._estimator.settings[1].sigma_s
         late = () if self._clock is None else _clock_findings(self._clock, self._newest_s, sigma_s)
@@ -433,7 +437,7 @@ class HealthMonitor:
         if self.stamps is not None and self.stamps.stepped is not None:
             late = (_stamps_finding(*self.stamps.stepped, self.stamps.rate),)
         now = (
-            *(() if self._rig is None else self._rig.findings()),
+            *(() if self._rig is None else self._rig.findings(ends=ends)),
             *self._moved(),
             *self._shakes.findings(),
             *late,

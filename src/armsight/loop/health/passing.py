@@ -38,7 +38,7 @@ import numpy as np
 
 from armsight.data import Array
 from armsight.loop.finding import HealthFinding, displacement_m
-from armsight.loop.health.residuals import UNKNOWN_SHARE, ExposedShot, History, Onset, ResidualSums, eliminated
+from armsight.loop.health.residuals import UNKNOWN_SHARE, ExposedShot, ResidualSums, eliminated
 
 #: Standard deviations that are tried of the times that each shot has of its own, s, and that of the times that all share.
 _APART_S, _SHARED_S = (0.0, *(1e-3 * 2.0**k for k in range(-2, 7))), 0.03
@@ -239,40 +239,38 @@ def _occam(information: Array) -> float:
 
 
 def _without(
-    tests: Sequence[_Doubtful], cause: Passes, excess: float, size: int
-) -> tuple[tuple[ResidualSums, ResidualSums], float]:
-    """Return the sums of tests with a cause eliminated, of steps and of ramps, and what chance explains with it.
-
-    The latter is twice its logarithm; ``size``: how many parameters there are.
+    tests: Sequence[_Doubtful], cause: Passes | None, excess: float, shares: Array
+) -> tuple[ResidualSums, float]:
+    """Return the sums of tests with a cause eliminated, and twice the logarithm of what chance explains with it.
 
     A focal length is another in each test, the times that shots share are the same in all: what differs, shots have of
     their own.
+
+    Args:
+        tests: they.
+        cause: it.
+        excess: variance of the noise.
+        shares: (N, 1 + K) what the parameters of the sums are in each test, as a share of what they are in the newest.
     """
-    some = [each.shows(cause, excess) for each in tests]
-    both = _summed(
-        [each.rests[cause].sums if shows else each.every for each, shows in zip(tests, some, strict=True)], size
-    )
-    occam = sum(each.rests[cause].occam for each, shows in zip(tests, some, strict=True) if shows)
-    times = [each.times for each, shows in zip(tests, some, strict=True) if shows and each.times is not None]
-    if cause == "lens" or not times:
-        return both, occam
-    prior = np.eye(len(_TIMES)) / _SHARED_S**2
-    information = prior + np.sum([each.found.information - prior for each in times], axis=0)
-    shared = np.sum([each.shared for each in times], axis=0)
-    for sums in both:
-        for each in times:
-            sums.M += each.shared.T @ np.linalg.solve(each.found.information, each.shared)
-        sums.M -= shared.T @ np.linalg.solve(information, shared)
-    return both, occam + _occam(information)
-
-
-def _summed(tests: Sequence[ResidualSums], size: int) -> tuple[ResidualSums, ResidualSums]:
-    """Return the sums of tests of what is the same in all, and of what grows in them, from nothing; but the parameters."""
-    both = History(size, len(tests[0].b))
-    for each in tests:
-        both.keep(each, np.inf)
-    begin_s = tests[0].begin_s
-    return both.since(Onset(begin_s, begin_s)), both.since(Onset(begin_s))
+    sums, occam, prior = tests[0].every.copied(), 0.0, np.eye(len(_TIMES)) / _SHARED_S**2
+    sums.scale(0.0)
+    information, shared = prior, np.zeros((len(_TIMES), len(sums.M)))
+    for each, share in zip(tests, shares, strict=True):
+        M = each.every.M
+        if cause is not None and each.shows(cause, excess):
+            M, occam = each.rests[cause].sums.M, occam + each.rests[cause].occam
+            if cause == "time" and each.times is not None:
+                M = M + each.times.shared.T @ np.linalg.solve(each.times.found.information, each.times.shared)
+                information, shared = (
+                    information + each.times.found.information - prior,
+                    shared + share * each.times.shared,
+                )
+        sums.M += M if share.min() == 1.0 else share[:, None] * M * share
+        sums.freedom += each.every.freedom
+    if not shared.any():
+        return sums, occam
+    sums.M -= shared.T @ np.linalg.solve(information, shared)
+    return sums, occam + _occam(information)
 
 
 class _Weighed(NamedTuple):
@@ -293,21 +291,33 @@ class _Weighed(NamedTuple):
     @classmethod
     def of(cls, tests: Sequence[_Doubtful], stays: Staying, size: int) -> _Weighed:
         """Weigh tests; ``size``: how many parameters there are."""
-        none = _summed([each.every for each in tests], size)
-        without = [_without(tests, cause, 1.0, size)[0][0] for cause in _PASSES]
-        lefts = [_left(each, len(each.b)) for each in (none[0], *without)]
-        excess, of_none = max(min(lefts) / max(none[0].freedom, 1.0), 1.0), _left(none[0], size)
+        begins_s, columns = np.array([each.every.begin_s for each in tests]), len(tests[0].every.M)
+        same = np.ones((len(tests), columns))
+        none = _without(tests, None, 1.0, same)[0]
+        lefts = [
+            _left(each, len(each.b)) for each in (none, *(_without(tests, cause, 1.0, same)[0] for cause in _PASSES))
+        ]
+        excess, of_none = max(min(lefts) / max(none.freedom, 1.0), 1.0), _left(none, size)
+        without = {cause: _without(tests, cause, excess, same) for cause in _PASSES}
+        explained = {
+            each: 0.5 * ((of_none - _left(sums, size)) / excess - occam) for each, (sums, occam) in without.items()
+        }
+        if max(explained.values()) <= _AHEAD:
+            return cls(excess, 0.0, explained, explained)
+        # What stays may have changed at once or grow from test to test.
+        growing = same.copy()
+        growing[:, 1 + size :] = ((begins_s - begins_s[0]) / max(float(np.ptp(begins_s)), 1e-9))[:, None]
 
-        def best(both: Sequence[ResidualSums], skewed: bool) -> float:
+        def stay(cause: Passes | None, skewed: bool) -> float:
+            both = (none if cause is None else without[cause][0], _without(tests, cause, excess, growing)[0])
             return max(stays(each, excess, skewed) for each in both[: len(tests)])
 
-        explained, ahead = dict[Passes, float](), dict[Passes, float]()
-        for cause in _PASSES:
-            sums, occam = _without(tests, cause, excess, size)
-            explained[cause] = 0.5 * ((of_none - _left(sums[0], size)) / excess - occam)
+        stay_best, ahead = stay(None, True), dict[Passes, float]()
+        for cause, log in explained.items():
             skewed = cause != "time"  # cameras that are apart by the same time always are no rival of times
-            ahead[cause] = explained[cause] + best(sums, skewed) - best(none, skewed)
-        return cls(excess, best(none, True), explained, ahead)
+            rival = stay_best if skewed else stay(None, False)
+            ahead[cause] = log + stay(cause, skewed) - rival if log > _AHEAD else -np.inf
+        return cls(excess, stay_best, explained, ahead)
 
     def best(self, shown: Passes | None, *, one: bool) -> Passes | None:
         """Return what passes that explains most; None where it is what stays.

@@ -11,6 +11,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Sequence
 from copy import copy
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -366,16 +367,18 @@ class ResidualSums:
 
 def eliminated(M: Array, rows: slice) -> Array:
     """Return sums M (N, N) with parameters eliminated, of which each has a prior of variance 1."""
-    across = np.delete(M[rows], rows, axis=1)
-    kept = np.delete(np.delete(M, rows, axis=0), rows, axis=1)
-    return np.asarray(kept - across.T @ np.linalg.solve(M[rows, rows] + np.eye(len(across)), across))
+    kept = np.delete(np.arange(len(M)), rows)
+    across, inner = M[rows][:, kept], M[rows, rows].copy()
+    inner.flat[:: len(inner) + 1] += 1.0
+    return np.asarray(M[np.ix_(kept, kept)] - across.T @ np.linalg.solve(inner, across))
 
 
-def total(tests: Sequence[ResidualSums]) -> ResidualSums:
-    """Return the sums of tests."""
-    found = tests[0].of(len(tests[0].b))
-    for each in tests[1:]:
-        found.add(each, 1.0)
+def total(tests: Sequence[ResidualSums], size: int) -> ResidualSums:
+    """Return the sums of tests, of so many first parameters."""
+    found = ResidualSums(size, tests[0].begin_s)
+    for each in tests:
+        found.M += each.M[: 1 + size, : 1 + size]
+        found.freedom += each.freedom
     return found
 
 
@@ -468,18 +471,31 @@ class History:
     def _sums(self) -> tuple[Array, ...]:
         """Return times (N,) against the newest test, and sums since each: plain, times the time once, twice; freedom."""
         if self._added is None:
-            M, begins_s = np.array([each.M for each in self.kept]), np.array([each.begin_s for each in self.kept])
-            ages_s = (begins_s - begins_s[-1])[:, None, None]
-            by_age = ages_s * M[:, 1 + self._size :]
-            parts = M, by_age, ages_s * by_age[:, :, 1 + self._size :], np.array([each.freedom for each in self.kept])
-            self._added = (ages_s[:, 0, 0], *(np.cumsum(each[::-1], axis=0)[::-1] for each in parts))
+            tests, rest = len(self.kept), slice(1 + self._size, None)
+            newest = self.kept[-1].M
+            plain, freedom = np.empty((tests, *newest.shape)), np.empty(tests)
+            once, twice = np.empty((tests, *newest[rest].shape)), np.empty((tests, *newest[rest, rest].shape))
+            ages_s = np.array([each.begin_s for each in self.kept]) - self.kept[-1].begin_s
+            for k in reversed(range(tests)):  # a cumulated sum of large arrays takes five times as long
+                M, by_age = self.kept[k].M, ages_s[k] * self.kept[k].M[rest]
+                plain[k], once[k], twice[k], freedom[k] = M, by_age, ages_s[k] * by_age[:, rest], self.kept[k].freedom
+                for each in (plain, once, twice, freedom) if k < tests - 1 else ():
+                    each[k] += each[k + 1]
+            self._added = ages_s, plain, once, twice, freedom
         return self._added
 
-    def since(self, onset: Onset) -> ResidualSums:
-        """Return the sums since a change began; all but the first parameters are what they were when it ended."""
+    def since(self, onset: Onset, count: int | None = None) -> ResidualSums:
+        """Return the sums since a change began; all but the first parameters are what they were when it ended.
+
+        Args:
+            onset: when it began.
+            count: of the parameters after the first, those after these are zero; all if None.
+        """
+        size = self._size + count if count is not None else len(self._settled.b)
         if onset.end_s <= self._settled.begin_s:
-            return total([self._settled, *self.kept])
+            return total([self._settled, *self.kept], size)
         ages_s, plain, once, twice, freedom = self._sums()
+        plain, once, twice = plain[:, : 1 + size, : 1 + size], once[:, :count, : 1 + size], twice[:, :count, :count]
         begin, end = np.minimum(np.searchsorted(ages_s, np.array(onset) - self.kept[-1].begin_s), len(ages_s) - 1)
         first, rest = slice(0, 1 + self._size), slice(1 + self._size, None)
         found = ResidualSums(plain.shape[1] - 1, onset.begin_s)
@@ -519,10 +535,11 @@ class History:
         ages = np.geomspace(1.0, tests, _BEGINS).round().astype(int)
         coarse = sorted({0 if times_s[0] < times_s[1] else 1, *(tests + 1 - ages).tolist()})
 
+        @cache
         def left(begin: int, end: int) -> tuple[float, int, int]:
             if begin != end and (end - begin < STEPS or times_s[begin] <= settled_s < times_s[1]):
                 return np.inf, begin, end
-            sums = self.since(Onset(times_s[begin], times_s[end])).of(self._size + count).reduced(self._size)
+            sums = self.since(Onset(times_s[begin], times_s[end]), count).reduced(self._size)
             gained = float(sums.b @ np.linalg.solve(sums.H + np.eye(count), sums.b))
             return sums.square - gained + (self.kept[begin - 2].freedom if begin > 1 else 0.0), begin, end
 
@@ -534,6 +551,6 @@ class History:
 
         ramp = best(lambda k: (k, tests))
         ramp = min(ramp, best(lambda k: (ramp[1], k)))
-        ramp = min(ramp, best(lambda k: (k, ramp[2])))
+        ramp = min(left(k, ramp[2]) for k in range(max(ramp[1] - 1, 0), ramp[1] + 2))
         least, begin, end = min(best(lambda k: (k, k)), ramp)
         return least, Onset(times_s[begin], np.inf if begin < end == tests else times_s[end])

@@ -540,7 +540,8 @@ class RigWatch:
         newest, every = self._newest(stays, None, None)
         self._keep(newest, again=False)
         change = self._doubted()
-        if not self.passing.now and change.chi_square <= _SUSPECTED:
+        known = self._alarms > _FRESH and self._fits[0].count % STEPS > 0  # what stays did explain some tests
+        if not self.passing.now and (known or change.chi_square <= _SUSPECTED):
             return newest, change
         passes, own = self._passes(stays, every)
         if passes is not None:
@@ -719,9 +720,9 @@ class RigWatch:
         cov = excess * np.linalg.inv(S) * np.outer(_WIDE, _WIDE)
         return RigChange(_WIDE * f, cov, float(s @ f) / excess, alone, without, excess)
 
-    def findings(self) -> tuple[HealthFinding, ...]:
-        """Return what was found so far, the shots of the running test included: nothing where no test gave an alarm."""
-        ended = self._ended()
+    def findings(self, *, ends: bool = True) -> tuple[HealthFinding, ...]:
+        """Return what was found so far, where the running test ``ends`` by that one as well: nothing without an alarm."""
+        ended = self._ended() if ends and self._stays else self
         return ended.passing.among(ended._stays_changed(), timed=self._timed)
 
     def _stays_changed(self) -> tuple[HealthFinding, ...]:

@@ -489,7 +489,7 @@ class Loop:
         """Publish what the health monitor finds, and what it takes back, if it is time."""
         if self.t_s - self._health_s >= _HEALTH_EVERY_S:
             self._health_s = self.t_s
-            for note in self._health_notes.of(self.t_s, self.health.findings()):
+            for note in self._health_notes.of(self.t_s, self.health.findings(ends=False)):
                 self.publisher.put(note)
 
     def _look_at_fixed(self, shot: Shot) -> None:
