@@ -2,11 +2,12 @@
 
     python cells.py 50 --seconds 60    latency and cost of states; then kill -9 of half, a frozen cell, a cut
                                        cable, a killed hub
+    python cells.py 200 --rate 1       latency and cost alone, with a shot a second of each cell
     python cells.py 50 --drift 5       three of them drift: where they stand in the list after 5 minutes
     python cells.py --alarms 7         false alarms of healthy cells in so many days, without any process
 
 Cells are processes of their own with the sink that commands have; they are fed with measured poses of a simulated rig
-at 10 Hz. The hub runs in a process of its own, and is looked at through its pages, as a person and Prometheus do.
+at 10 Hz, or --rate. The hub runs in a process of its own, and is looked at through its pages.
 """
 
 import argparse
@@ -27,7 +28,6 @@ import numpy as np
 
 #: Noise of detections, px; slow motion of the cameras' mounts that no model has: sigma, rad, and correlation time, s.
 NOISE_PX, BREATH_RAD, BREATH_S = 0.05, 3e-6, 40.0
-RATE_HZ = 10.0
 DRIFT_DEG_H = 0.05
 #: From a block's middle to the hub's look at it, s: the next block is being filled.
 LATE_S = 12.0
@@ -66,7 +66,7 @@ def cell(number, spec, seed, drifts):
     sink.start()
     ended = []
     signal.signal(signal.SIGTERM, lambda *_: ended.append(True))
-    image, count, keep = np.zeros((480, 640), np.uint8), 0, np.exp(-1.0 / (RATE_HZ * BREATH_S))
+    image, count, keep = np.zeros((480, 640), np.uint8), 0, np.exp(-1.0 / (ARGUMENTS.rate * BREATH_S))
     while not ended:
         now = time.monotonic() - began
         breath = keep * breath + BREATH_RAD * np.sqrt(1 - keep**2) * rng.standard_normal(3)
@@ -79,7 +79,7 @@ def cell(number, spec, seed, drifts):
         if not drifts and now > 5.0 * (count + 1) and not ARGUMENTS.drift:
             count += 1
             sink.put(NoteDatum(now, f"{number}-{count}", "warning"))
-        time.sleep(1.0 / RATE_HZ)
+        time.sleep(1.0 / ARGUMENTS.rate)
     sink.close()
     used = time.process_time()
     print(json.dumps({"cell": number, "sink_cpu_s": sink.cpu_s, "process_cpu_s": used, "seconds": now}), flush=True)
@@ -308,6 +308,7 @@ if __name__ == "__main__":
     PARSER = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     PARSER.add_argument("cells", type=int, nargs="?", default=50)
     PARSER.add_argument("--seconds", type=float, default=60.0)
+    PARSER.add_argument("--rate", type=float, default=10.0, help="shots a second of a cell")
     PARSER.add_argument("--drift", type=int, default=0)
     PARSER.add_argument("--alarms", type=int, default=0)
     PARSER.add_argument("--seed", type=int, default=4301)

@@ -12,7 +12,7 @@ To open: ``open_source`` images or cameras, ``open_board`` a board, ``open_targe
 what was measured there, ``read_pose_table`` poses alone, those of ``write_csv`` too.
 To compute: ``calibrate``, ``calibrate_boards``, ``calibrate_bodies`` the pair of cameras; ``measure``, ``measure_all``,
 ``Follower`` the pose of a body; ``handeye`` where rig and body are on the arm; ``identify`` what the arm really is,
-``validate`` how far off it is on other poses; ``budget`` what a rig would measure.
+``validate`` how far off it is on other poses; ``time_between`` the clocks of two rigs; ``budget`` what a rig would measure.
 To exchange: ``as_transform`` reads a transform of pinocchio, SciPy, spatialmath or ROS, ``ros_fields`` writes ROS' fields.
 Records: ``Shot``, ``Body``, ``PoseEstimate`` or ``Missed``, ``Pair``, ``Camera``, ``StereoRig``, ``Arm``, ``Corrected``;
 ``Measured`` joint angles with what was measured there, as ``identify`` takes them from arrays.
@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from armsight.data import Body, Missed, PoseEstimate, Shot
     from armsight.errors import ArmsightError
     from armsight.geometry.convert import as_transform, ros_fields
+    from armsight.loop.delay import time_between
     from armsight.loop.handeye.handeye import calibrate_handeye as handeye
     from armsight.loop.identify.corrected import Corrected, open_corrected
     from armsight.loop.identify.identify import identify
@@ -97,6 +98,7 @@ __all__ = [
     "read_pose_table",
     "read_poses",
     "ros_fields",
+    "time_between",
     "validate",
 ]
 
@@ -117,6 +119,7 @@ _HOME = {
     "Measured": "armsight.loop.identify.measured",
     "read_poses": "armsight.loop.identify.read",
     "read_pose_table": "armsight.tables.poses",
+    "time_between": "armsight.loop.delay",
     "validate": "armsight.loop.identify.validate",
     "open_arm": "armsight.robot.arm_file",
     "open_board": "armsight.vision.markers.board",

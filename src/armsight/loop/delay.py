@@ -12,15 +12,21 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+from scipy.signal import correlate, find_peaks
 
 from armsight.data import Array, JointStates
 from armsight.errors import CalibrationError, InputError
 from armsight.estimate.chance import chi_square_limit
 from armsight.geometry.check import checked
-from armsight.geometry.rotation import log_so3
+from armsight.geometry.pose import transform
+from armsight.geometry.rigid import fit_rigid
+from armsight.geometry.rotation import log_so3, skew
 from armsight.loop.estimators import Delay, KalmanEstimator, Outcome, PoseMeasurement, Prior
 from armsight.loop.estimators.clock import SYSTEMATIC_S
 from armsight.robot.kinematics.arm import Arm
+from armsight.tables.poses import PoseTable
 
 #: Lags that are tried, s: stamps may be early by a clock's offset, and late by a slow camera's buffers.
 LAGS_S = np.arange(-0.1, 0.6, 2e-3)
@@ -34,6 +40,9 @@ MAX_SIGMA_S = 2e-3
 _OUTLIER = 4.0
 #: Readings given to the filter ahead of a measurement, s.
 _AHEAD_S = 0.1
+#: Of two rigs' paths: blocks of time left out in turn; lags that are tried; steps of each; gaps of more intervals are not
+#: bridged; another lag that fits worse by less than this factor is as likely.
+_BLOCKS, _CANDIDATES, _STEPS, _BRIDGED, _ALIKE = 8, 3, 6, 3.0, 2.0
 
 
 def estimate_delay(
@@ -130,3 +139,87 @@ def _filtered(
             "fit; is the hand-eye calibration this arm's, and are both stamped by one clock?"
         )
     return estimator.learned().delay
+
+
+def time_between(first: PoseTable, second: PoseTable) -> Delay:
+    """Find how late one rig's stamps are on another's clock, from a motion of a body that both measured.
+
+    Each rig's poses are in its own frame; where the rigs are to each other is fitted beside. Speeds do not depend on it:
+    their correlation says where to begin.
+
+    Args:
+        first: poses of the body with times, by the rig whose clock is the measure.
+        second: the same, by the other rig; its clock may have any zero.
+
+    Returns:
+        The delay; its sigma is by leaving out blocks of time in turn (Kunsch, Ann. Statist. 17, 1989), and so holds for
+        errors that last for a while.
+
+    Raises:
+        InputError: tables without times, or too few poses.
+        CalibrationError: the motion does not determine the delay, or repeats itself.
+    """
+    (t_a, p_a), (t_b, p_b) = (_positions(each) for each in (first, second))
+    path, fits = CubicSpline(t_a, p_a), list[tuple[float, float, float]]()
+    for lag in _likely_lags(t_a, p_a, t_b, p_b):
+        at = t_b - lag
+        rows = np.flatnonzero((at > t_a[0] + _AHEAD_S) & (at < t_a[-1] - _AHEAD_S))
+        after = np.searchsorted(t_a, at[rows])
+        rows = rows[t_a[after] - t_a[after - 1] < _BRIDGED * np.median(np.diff(t_a))]
+        if len(rows) >= MIN_MEASUREMENTS:
+            blocks = np.array_split(rows, _BLOCKS)
+            others = [_aligned(path, t_b, p_b, np.setdiff1d(rows, each), lag)[0] for each in blocks]
+            delay, rms = _aligned(path, t_b, p_b, rows, lag)
+            spread = float(np.sum(np.square(np.array(others) - np.mean(others))))
+            fits.append((rms, delay, float(np.sqrt((_BLOCKS - 1) / _BLOCKS * spread))))
+    if not fits:
+        raise InputError(f"the two rigs have fewer than {MIN_MEASUREMENTS} poses of one motion in common")
+    (rms, delay, sigma), *rest = sorted(fits)
+    if any(other < _ALIKE * rms and abs(late - delay) > _AHEAD_S for other, late, _ in rest):
+        raise CalibrationError("the motion repeats itself: move to and fro at different speeds and over different ways")
+    if not sigma < MAX_SIGMA_S:
+        raise CalibrationError(f"the motion determines the delay to {1e3 * sigma:.1f} ms only: move faster, or longer")
+    return Delay(delay, sigma)
+
+
+def _positions(table: PoseTable) -> tuple[Array, Array]:
+    """Return the times (N,) and the positions (N, 3) of the poses of a table that were measured."""
+    if table.t_s is None:
+        raise InputError(f"{table.path}: a column t_s is needed")
+    rows = np.array([not why for why in table.missed]) if table.missed else np.ones(len(table.Ts), np.bool_)
+    t, p = table.t_s[rows], table.Ts[rows, :3, 3]
+    if len(t) < MIN_MEASUREMENTS or not (np.diff(t) > 0).all():
+        raise InputError(f"{table.path}: {MIN_MEASUREMENTS} or more poses in order of time are needed, it has {len(t)}")
+    return t, p
+
+
+def _likely_lags(t_a: Array, p_a: Array, t_b: Array, p_b: Array) -> list[float]:
+    """Return the lags, s, at which the speeds of two paths are most alike, the best first."""
+    step = float(min(np.median(np.diff(t_a)), np.median(np.diff(t_b))))
+    speeds = []
+    for t, p in ((t_a, p_a), (t_b, p_b)):
+        middle, speed = 0.5 * (t[1:] + t[:-1]), np.linalg.norm(np.diff(p, axis=0), axis=1) / np.diff(t)
+        at = np.interp(np.arange(middle[0], middle[-1], step), middle, speed)
+        speeds.append(at - at.mean())
+    a, b = speeds
+    shared = correlate(np.ones(len(b)), np.ones(len(a)))
+    energy = correlate(b**2, np.ones(len(a))) * correlate(np.ones(len(b)), a**2)
+    alike = correlate(b, a) / np.sqrt(np.maximum(energy, 1e-9 * energy.max()))
+    alike[shared < 0.5 * min(len(a), len(b))] = -1.0
+    peaks = find_peaks(alike, distance=max(1, round(_AHEAD_S / step)))[0]
+    best = peaks[np.argsort(-alike[peaks])][:_CANDIDATES]
+    return [float((k - len(a) + 1) * step + t_b[0] - t_a[0]) for k in best]
+
+
+def _aligned(path: CubicSpline, t_b: Array, p_b: Array, rows: NDArray[np.int64], lag: float) -> tuple[float, float]:
+    """Return the lag, s, and the RMS, m, at which a path, moved rigidly, fits positions best (Gauss-Newton)."""
+    t, p = t_b[rows], p_b[rows]
+    for _ in range(_STEPS):
+        at = path(t - lag)
+        T = fit_rigid(at, p)
+        e = p - transform(T, at)
+        v = path(t - lag, 1) @ T[:3, :3].T
+        # Of the velocity only what no rigid motion does shows the lag.
+        by = np.concatenate([np.tile(np.eye(3), (len(t), 1, 1)), -skew(p - p.mean(axis=0)), -v[:, :, None]], axis=2)
+        lag += float(np.linalg.lstsq(by.reshape(-1, 7), e.reshape(-1), rcond=None)[0][6])
+    return lag, float(np.sqrt((e**2).sum(axis=1).mean()))

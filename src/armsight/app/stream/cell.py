@@ -287,7 +287,7 @@ class CellSink(Sink):
                 unheard_s = math.inf if heard else min(unheard_s, time.monotonic())
                 if time.monotonic() - unheard_s > _UNHEARD_S:
                     why = "" if self._cell.ca is None else "its certificate is of another name, or "
-                    note(f"the hub stores no events of it: {why}the hub's disk is full")
+                    note(f"the hub stores no events of it: {why}the hub is busy, or its disk full")
             if ending:
                 return
 
