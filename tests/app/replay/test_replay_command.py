@@ -109,7 +109,7 @@ def made(folder, text=""):
                 continue
             T = (
                 inverse(MOUNTING.T_base_rig)
-                @ ARM.forward(q[0])
+                @ ARM.forward(ARM.home + 0.3 * np.sin(t_s[0] - 0.018) * np.linspace(0.5, 1, 6))  # the camera's delay
                 @ MOUNTING.T_tool_body
                 @ exp_se3(rng.normal(0, 1e-4, 6))
             )

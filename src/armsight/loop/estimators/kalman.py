@@ -47,7 +47,7 @@ from armsight.loop.estimators.readings import GAP_RAD, Readings, Smoothed
 from armsight.loop.estimators.smoothing import Interval, blended, by_state, intervals
 from armsight.loop.references.inertial import Inertial
 from armsight.loop.references.reference import Reading, Reference, ToolMotion
-from armsight.loop.references.strapdown import Advanced, Samples, Strapdown, Window
+from armsight.loop.references.strapdown import Advanced, Samples, Strapdown
 from armsight.loop.references.update import Considered, Shares, gained, passed
 from armsight.robot.kinematics.arm import Arm
 
@@ -67,8 +67,9 @@ WAITING_S = 0.5
 _GATE = chi_square_limit(6, CHANCE)
 #: The tool's acceleration is the difference of its twists so long before and after, s; half: noisier, double: bends cut.
 APART_S = 0.01
-#: Windows of an inertial unit, s; half: twice the cost, double: estimates between them lean on the joints.
-WINDOW_S = 0.01
+#: Windows of an inertial unit are at least so long, s, unless an image ends them; half: twice the cost, double: an impact is
+#: placed worse.
+WINDOW_S = 0.04
 #: While windows are used, a link is loose against its potentiometer by one sigma of so many rad, which lasts so long, s:
 #: in its backlash it keeps its speed when the shaft stops, and stands when that begins. Half: joints overrule what was
 #: felt, double: they bound it later.
@@ -133,11 +134,12 @@ class KalmanEstimator:
         self.clock = None if learns_delay else ClockFollower(at.size, at.delay, delay.sigma_s)
         self._reference: Array | None = None
         self._waiting: list[PoseMeasurement | Taken | Until] = []
-        # The inertial unit, what was known without it, images in a row against it, and the one that they have rejected.
+        # The inertial unit, what was known without it, images and windows in a row against it, the one that they have
+        # rejected, and what became of the newest window.
         no_reference: Reference | None = None
         self._unit: Strapdown | None = None
         self._without: Remembered | None = None
-        self._against, self._rejected = dict[type, int](), no_reference
+        self._against, self._rejected, self._window = dict[type, int](), no_reference, Outcome.WAITING
         self._outliers: list[Array] = []
         self._backlash_set = True  # whether the readings have the newest estimate of the backlash
         # At the newest reading, until something is heard: the state, the joints and what came of the state, and the tool.
@@ -265,15 +267,11 @@ class KalmanEstimator:
         return self._hear(Taken(reference, reading))
 
     def _go_on(self) -> Outcome:
-        """Use windows of the inertial unit as far as its samples and the joints have come; waiting where they have not."""
+        """Use a window of the inertial unit as far as its samples and the joints have come; waiting where it is short."""
         if self._unit is None or not np.isfinite(begin := self._states[-1].t_s):
             return Outcome.WAITING
         end = min(self._unit.newest_s, self.span_s[1])
-        for t_s in begin + WINDOW_S * np.arange(1, int((end - begin) / WINDOW_S) + 1):
-            self._hear(Until(float(t_s)))
-            if self._unit is None:
-                return Outcome.OUTLIER
-        return Outcome.USED if end - begin >= WINDOW_S else Outcome.WAITING
+        return self._hear(Until(end)) if end - begin >= WINDOW_S else Outcome.WAITING
 
     def _hear(self, measurement: PoseMeasurement | Taken | Until) -> Outcome:
         """Use a measurement after those before it in time, and use those after it again."""
@@ -290,10 +288,15 @@ class KalmanEstimator:
             return Outcome.WAITING
         if seen_s < oldest or (row == 1 and before.measurement is not None and self._after(before, measurement)):
             return Outcome.TOO_LATE
-        later = self._states[row:]
-        newest_heard = all(isinstance(state.measurement, Until) for state in later)
+        later = [
+            state for state in self._states[row:] if not isinstance(state.measurement, Until)
+        ]  # one window follows
+        newest_heard = not later
+        self._window = Outcome.WAITING
         after, outcome = self._used(before, measurement, report=newest_heard)
-        contradicted = not isinstance(measurement, Taken) and self._contradicted(type(measurement), outcome)
+        contradicted = self._contradicted(Until, self._window)
+        if isinstance(measurement, PoseMeasurement):
+            contradicted = self._contradicted(PoseMeasurement, outcome) or contradicted
         if after is None or contradicted:
             return outcome
         self._states[row:] = [after]
@@ -308,7 +311,7 @@ class KalmanEstimator:
 
     def _contradicted(self, kind: type, outcome: Outcome) -> bool:
         """Count outcomes of a kind, images or windows; return whether so many are against the unit that it was dropped."""
-        if self._unit is None or self._without is None:
+        if self._unit is None or self._without is None or outcome is Outcome.WAITING:
             return False
         self._against[kind] = 0 if outcome is Outcome.USED else self._against.get(kind, 0) + 1
         if self._against[kind] < STUBBORN:
@@ -322,9 +325,9 @@ class KalmanEstimator:
     ) -> tuple[ErrorState | None, Outcome]:
         """Return the state after a measurement, None where it is an outlier."""
         if isinstance(measurement, Until):
-            after, outcome = self._felt(before, measurement.t_s, report=report)
+            after = self._felt(before, measurement.t_s, report=report)
             after = self._alone(before, measurement.t_s) if after is before else after
-            return after._replace(taken=measurement), outcome
+            return after._replace(taken=measurement), Outcome.USED
         if isinstance(measurement, Taken):
             return self._take_reading(before, measurement, report=report)
         return self._take(before, measurement, self._report if report else None)
@@ -344,7 +347,7 @@ class KalmanEstimator:
         """Return the state after the newest measurement, the joints at the newest reading, and the propagation to it."""
         if self._here is None:
             newest = np.array([self.span_s[1]])
-            state, joints = self._anew(self._felt(self._states[-1], self.span_s[1])[0], newest)
+            state, joints = self._anew(self._felt(self._states[-1], self.span_s[1]), newest)
             self._here = state, joints, self._model.moved(state, joints, newest)
         return self._here
 
@@ -448,7 +451,7 @@ class KalmanEstimator:
         """Return the state after a measurement, None where it is an outlier; report how it came about."""
         t_s = max(self._seen_s(pose_measurement, before), before.t_s)
         times, jitter_s = np.array([t_s]), self._delay.jitter_s
-        before, joints = self._anew(self._felt(before, t_s)[0], times)
+        before, joints = self._anew(self._felt(before, t_s, report=report is not None), times)
         step = self._model.moved(before, joints, times, learning=LEARNING)
         at, chi = self._model.predicted(before, step, joints, pose_measurement, jitter_s)
         outcome = self._gate(at, chi)
@@ -495,14 +498,14 @@ class KalmanEstimator:
         P[np.diag_indices(len(P))] += step.added[0]
         return before.x * step.kept[0], P
 
-    def _felt(self, before: ErrorState, t_s: float, *, report: bool = False) -> tuple[ErrorState, Outcome]:
-        """Return the state at a time by the joints and what a unit felt, as it is where that is not known; if likely."""
+    def _felt(self, before: ErrorState, t_s: float, *, report: bool = False) -> ErrorState:
+        """Return the state at a time by the joints and what an inertial unit felt; as it is where that is not known."""
         window = None if self._unit is None else self._unit.window(before.t_s, t_s)
         if self._unit is None or window is None:
-            return before, Outcome.USED
+            return before
         before, joints = self._anew(before, np.array([t_s]))
         step, loose = self._model.moved(before, joints, np.array([t_s]), learning=LEARNING), self._loose
-        share = float(np.exp(-window.length_s / LOOSE_S))
+        share = float(np.exp(-window[0] / LOOSE_S))
         step.kept[:, loose] *= share
         step.added[:, loose] += LOOSE_RAD**2 * (1.0 - share**2)
         q, unseen = (
@@ -510,6 +513,8 @@ class KalmanEstimator:
         )
         got, Ts, outcome = self._advanced(self._unit, window, before, step, q, unseen)
         kept, added = step.kept[0], step.added[0]
+        if report:
+            self._window = outcome
         if report and self.on_reading is not None:
             said = got.z, got.S, got.by, kept.copy(), got.gain, outcome
             self.on_reading(self._unit.sensor.name, Innovation(t_s, Ts[1], *said, added=added.copy()))
@@ -517,13 +522,13 @@ class KalmanEstimator:
             kept[loose], added[loose] = 0.0, self._model.sigmas[loose] ** 2
             got, _, again = self._advanced(self._unit, window, before, step, q, unseen)
             if again is Outcome.OUTLIER:
-                return self._alone(before, t_s, (joints, step)), outcome
+                return self._alone(before, t_s, (joints, step))
         considered = {name: C * kept[:, None] - got.gain @ (got.by @ C) for name, C in before.considered.items()}
         last = before.pose_measurement, None, before.seen_s, considered, got.beside._replace(t_s=t_s)
-        return ErrorState(t_s, got.x, got.P, joints, *last), outcome
+        return ErrorState(t_s, got.x, got.P, joints, *last)
 
     def _advanced(
-        self, unit: Strapdown, window: Window, before: ErrorState, step: Propagation, q: Array, unseen: Array
+        self, unit: Strapdown, window: Array, before: ErrorState, step: Propagation, q: Array, unseen: Array
     ) -> tuple[Advanced, Array, Outcome]:
         """Return what a window does, the tool's poses (2, 4, 4) at its ends, and whether it is likely; q (2, n) there."""
         Ts, Hs = self._model.poses(np.stack([before.x, before.x * step.kept[0]]), q, unseen)
@@ -539,7 +544,7 @@ class KalmanEstimator:
     def _take_reading(self, before: ErrorState, taken: Taken, *, report: bool) -> tuple[ErrorState | None, Outcome]:
         """Return the state after a reading of a reference, None where it is an outlier; report it."""
         (reference, reading), t_s = taken, max(taken.t_s, before.t_s)
-        before, joints = self._anew(self._felt(before, t_s)[0], np.array([t_s]))
+        before, joints = self._anew(self._felt(before, t_s, report=report), np.array([t_s]))
         step = self._model.moved(before, joints, np.array([t_s]), learning=LEARNING)
         kept, added = step.kept[0], step.added[0]
         x, P = self._propagated(before, step)

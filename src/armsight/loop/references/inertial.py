@@ -31,7 +31,7 @@ from armsight.loop.references.reference import (
 )
 
 GYRO, ACCELEROMETER = 0, 1
-_UPPER, _SIX = np.triu_indices(3), np.arange(6)
+_UPPER = np.triu_indices(3)
 #: Rows of the parameters' tangent: rotation and lever of the mounting, biases, M_a, M_g, G, the base's tilt.
 _ROTATION, _LEVER, _GYRO_BIAS, _BIAS, _M_A, _M_G, _G, _TILT = (
     slice(a, b) for a, b in ((0, 3), (3, 6), (6, 9), (9, 12), (12, 18), (18, 27), (27, 36), (36, 38))
@@ -151,15 +151,6 @@ class Inertial(Reference):
         f = (z[:, 3:] - self._part(_BIAS)) @ np.linalg.inv(force).T
         w = z[:, :3] - self._part(_GYRO_BIAS) - f @ self._part(_G).reshape(3, 3).T
         return np.hstack([w @ np.linalg.inv(gyro).T, f])
-
-    def felt_by(self, felt: Array) -> Array:
-        """Return the derivative (6, P) of what :meth:`felt` returns (6,) of a reading by the parameters; to first order."""
-        by = np.zeros((6, _PARAMETERS))
-        by[_SIX, BIASES.start + _SIX] = 1.0
-        for row in range(3):
-            by[row, _M_G.start + 3 * row :][:3], by[row, _G.start + 3 * row :][:3] = felt[:3], felt[3:]
-        by[3 + _UPPER[0], _M_A.start + _SIX] = felt[3 + _UPPER[1]]
-        return -by
 
     def expected(self, motion: ToolMotion, channel: int) -> ExpectedReading:
         """Return angular velocity (3,), rad/s, or specific force (3,), m/s2, as the sensor reads it."""

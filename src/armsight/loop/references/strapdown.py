@@ -26,6 +26,7 @@ import numpy as np
 
 from armsight.data import Array, Record
 from armsight.errors import InputError
+from armsight.geometry.matrix import applied, product, solved
 from armsight.geometry.pose import left_jacobian
 from armsight.geometry.rotation import exp_so3, skew
 from armsight.kernels import kernel
@@ -44,7 +45,8 @@ START_M_S = 0.1
 CORNER_S = 6.0
 #: Rows of what is estimated beside the arm: velocity, delay, and the unit's parameters.
 _V, _DELAY, _PARAMETERS = slice(0, 3), 3, 4
-_BIASES = np.arange(_PARAMETERS + BIASES.start, _PARAMETERS + BIASES.stop)
+_MOUNTED, _LEVERED, _TILTED = (_PARAMETERS + rows.start for rows in MOUNTING)
+_BIASED = _PARAMETERS + BIASES.start
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,28 +95,6 @@ class Navigated(NamedTuple):
         return Navigated(self.t_s, self.y + gain @ z, C - HP.T @ gain.T, self.Y - gain @ HC)
 
 
-class Window(NamedTuple):
-    """What the unit felt between two times, in its axes at the first.
-
-    Attributes:
-        length_s: between them, s.
-        R: (3, 3) rotation.
-        dv: (3,) integral of the specific force, m/s.
-        dp: (3,) and that of it, m.
-        mean: (6,) of angular velocity and specific force.
-        change: (6,) of them from begin to end.
-        density: (6,) of the noise.
-    """
-
-    length_s: float
-    R: Array
-    dv: Array
-    dp: Array
-    mean: Array
-    change: Array
-    density: Array
-
-
 class Advanced(NamedTuple):
     """A filter's state at the end of a window, the window used.
 
@@ -138,16 +118,28 @@ class Advanced(NamedTuple):
 
 
 @kernel("f8[::1], f8[:, ::1], i8, i8, f8, f8, f8[::1]")
-def _preintegrate(t: Array, z: Array, first: int, count: int, begin: float, end: float, out: Array) -> None:
-    """Write R (9), dv, dp (3 each), and the values at begin and end (6 each) of rows first.. of t (N,), z (N, 6) to out."""
+def _preintegrate(t: Array, z: Array, first: int, last: int, begin: float, end: float, out: Array) -> bool:
+    """Write a window but its density, see :meth:`Strapdown.window`, of rows first to last of t (N,), z (N, 6), if complete.
+
+    The newest sample is held as row last + 1.
+    """
     R, a, b = np.eye(3), np.empty(6), np.empty(6)
     v, p, rotated = np.zeros(3), np.zeros(3), np.empty((3, 3))
-    k = first + np.searchsorted(t[first : first + count], begin, side="right")
+    if last < first or begin < t[first] or end <= begin or end >= t[last] + HELD_S:
+        return False
+    if end > t[last]:
+        last += 1
+        t[last], z[last] = end, z[last - 1]
+    k = last
+    while t[k - 1] > begin:
+        k -= 1
     at = begin
     for i in range(6):
         a[i] = z[k - 1, i] + (z[k, i] - z[k - 1, i]) * (begin - t[k - 1]) / (t[k] - t[k - 1])
-        out[15 + i] = a[i]
+        out[16 + i] = a[i]
     while at < end:
+        if t[k] - t[k - 1] > GAP_S:
+            return False
         to = min(t[k], end)
         for i in range(6):
             b[i] = z[k - 1, i] + (z[k, i] - z[k - 1, i]) * (to - t[k - 1]) / (t[k] - t[k - 1])
@@ -173,12 +165,241 @@ def _preintegrate(t: Array, z: Array, first: int, count: int, begin: float, end:
         a[:] = b
         at = to
         k += 1
+    out[0] = end - begin
     for i in range(9):
-        out[i] = R[i // 3, i % 3]
+        out[1 + i] = R[i // 3, i % 3]
     for i in range(3):
-        out[9 + i], out[12 + i] = v[i], p[i]
+        out[10 + i], out[13 + i] = v[i], p[i]
     for i in range(6):
-        out[21 + i] = a[i]
+        out[16 + i], out[22 + i] = (a[i] + out[16 + i]) / 2, a[i] - out[16 + i]
+    return True
+
+
+@kernel
+def _times_skew(A: Array, a: Array) -> Array:
+    """Return the product (3, 3) of A (3, 3) and the cross product matrix of a (3,)."""
+    out = np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            k, m = (j + 1) % 3, (j + 2) % 3
+            out[i, j] = A[i, k] * a[m] - A[i, m] * a[k]
+    return out
+
+
+@kernel
+def _skew_times(a: Array, A: Array) -> Array:
+    """Return the product (3, 3) of the cross product matrix of a (3,) and A (3, 3)."""
+    out = np.empty((3, 3))
+    for i in range(3):
+        k, m = (i + 1) % 3, (i + 2) % 3
+        for j in range(3):
+            out[i, j] = a[k] * A[m, j] - a[m] * A[k, j]
+    return out
+
+
+@kernel("f8[::1], f8[:, ::1], f8[:, :, ::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[:, ::1]")
+def _constraint(felt: Array, mount: Array, Ts: Array, y: Array, by: Array, by_y: Array, r: Array, noise: Array) -> None:
+    """Write residual and velocity at the end (9,), and their noise (9, 9); derivatives by the tool's tangents, and by y.
+
+    Args:
+        felt: (34,) a window.
+        mount: (9, 3) rotation of the mounting; lever; up, and its derivative by the tilt, both times gravity.
+        Ts: (2, 4, 4) poses of the tool at begin and end.
+        y: (B,) velocity, delay, parameters.
+        by: (9, 12) to be written, zero.
+        by_y: (9, B) to be written, zero.
+        r: (9,) to be written.
+        noise: (9, 9) to be written, zero.
+    """
+    D, dv, dp, mean, change, density = felt[0], felt[10:13], felt[13:16], felt[16:22], felt[22:28], felt[28:34]
+    M, lever, up = mount[:3], mount[3], mount[4]
+    Mt, R0, R1 = M.T.copy(), product(Ts[0, :3, :3], M), product(Ts[1, :3, :3], M)
+    R0t, p = R0.T.copy(), 0.5 * D * D * up - D * y[:3]
+    for i in range(3):
+        p[i] += Ts[1, i, 3] - Ts[0, i, 3]
+        for j in range(3):
+            p[i] += (Ts[1, i, j] - Ts[0, i, j]) * lever[j]
+    s, there, across = applied(R0t, p), product(R0t, Ts[1, :3, :3].copy()), product(R1.T.copy(), R0)
+    rotated, push = product(felt[1:10].copy().reshape(3, 3).T.copy(), across.T.copy()), change[3:]
+    pushed, by_push, by_dv = _times_skew(R0, dv), applied(R0, push), applied(R0, dv)
+    ends, swept = (product(across, Mt), _skew_times(s, Mt)), product(pushed, Mt)
+    swung, levered = _times_skew(Mt, lever), _times_skew(there, lever)
+    for i in range(3):
+        k, m = (i + 1) % 3, (i + 2) % 3
+        r[i], r[3 + i], r[6 + i] = 0.5 * (rotated[m, k] - rotated[k, m]), s[i] - dp[i], y[i] - D * up[i] + by_dv[i]
+        by_y[i, 3], by_y[3 + i, 3], by_y[6 + i, 3], by_y[6 + i, i] = -change[i], -0.5 * D * push[i], by_push[i], 1.0
+        noise[i, i], noise[3 + i, 3 + i] = density[i] ** 2 * D, density[3 + i] ** 2 * D**3 / 3
+        for j in range(3):
+            by[i, 3 + j], by[i, 9 + j], by[3 + i, j] = -ends[0][i, j], Mt[i, j], -Mt[i, j]
+            by[3 + i, 3 + j], by[3 + i, 6 + j] = swung[i, j] + ends[1][i, j], there[i, j]
+            by[3 + i, 9 + j], by[6 + i, 3 + j] = -levered[i, j], -swept[i, j]
+            by_y[i, _MOUNTED + j], by_y[6 + i, _MOUNTED + j] = -across[i, j], -pushed[i, j]
+            by_y[3 + i, j], by_y[3 + i, _LEVERED + j] = -D * R0[j, i], there[i, j] - Mt[i, j]
+            noise[3 + i, 6 + j] = noise[6 + j, 3 + i] = -(density[3 + i] ** 2) * (D * D / 2) * R0[j, i]
+            for n in range(3):
+                noise[6 + i, 6 + j] += R0[i, n] * density[3 + n] ** 2 * D * R0[j, n]
+        by_y[i, _MOUNTED + i] += 1.0
+        by_y[3 + i, _MOUNTED + m], by_y[3 + i, _MOUNTED + k] = s[k], -s[m]
+        for j in range(2):
+            by_y[6 + i, _TILTED + j] = -D * mount[5 + j, i]
+            for n in range(3):
+                by_y[3 + i, _TILTED + j] += 0.5 * D * D * R0[n, i] * mount[5 + j, n]
+    _by_parameters(mean, D, R0, by_y)
+    for i in range(9):
+        for j in range(3, len(y)):
+            r[i] += by_y[i, j] * y[j]
+
+
+@kernel
+def _by_parameters(mean: Array, D: float, R0: Array, by_y: Array) -> None:
+    """Add what biases, scales and sensitivity do to angular velocity and force in a window."""
+    at = _PARAMETERS + 6
+    for row in range(3):
+        by_y[row, at + row] = D
+        for j in range(3):
+            by_y[row, at + 12 + 3 * row + j], by_y[row, at + 21 + 3 * row + j] = D * mean[j], D * mean[3 + j]
+    column = at + 6
+    for row in range(3):
+        for j in range(row - 1, 3):
+            # First the bias, then the row of the upper triangle.
+            where, value = (at + 3 + row, 1.0) if j < row else (column, mean[3 + j])
+            column += j >= row
+            by_y[3 + row, where] = 0.5 * D * D * value
+            for i in range(3):
+                by_y[6 + i, where] = -D * R0[i, row] * value
+
+
+@kernel
+def _add(A: Array, B: Array, out: Array) -> None:
+    """Add the product of A (n, m) and B (m, k) to out (n, k)."""
+    for j in range(A.shape[1]):
+        for i in range(A.shape[0]):
+            factor = A[i, j]
+            if factor != 0.0:
+                for k in range(B.shape[1]):
+                    out[i, k] += factor * B[j, k]
+
+
+@kernel(fastmath={"contract", "reassoc", "nsz"})
+def _add_transposed(A: Array, B: Array, out: Array) -> None:
+    """Add the product of A (n, m) and the transpose of B (k, m) to out (n, k)."""
+    for i in range(A.shape[0]):
+        for k in range(B.shape[0]):
+            total = 0.0
+            for j in range(A.shape[1]):
+                total += A[i, j] * B[k, j]
+            out[i, k] += total
+
+
+@kernel(
+    "f8[::1], f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1], f8[::1], f8[::1], i8, f8[::1], f8[:, ::1], f8[::1], f8[:, ::1], "
+    "f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[:, ::1]",
+    fastmath={"contract"},
+)
+def _advance(
+    felt: Array,
+    mount: Array,
+    Ts: Array,
+    Hs: Array,
+    kept: Array,
+    added: Array,
+    fixed: int,
+    x: Array,
+    P: Array,
+    y: Array,
+    C: Array,
+    Y: Array,
+    gain: Array,
+    D: Array,
+    z: Array,
+    S: Array,
+) -> None:
+    """Overwrite x, P, y, C, Y by the state after a window; write gain (K, 6), derivative (9, K), residual and S.
+
+    Arguments are as for :meth:`Strapdown.advanced` and :func:`_constraint`.
+    """
+    K, B = len(x), len(y)
+    r, by, by_y, W, ends = np.empty(9), np.zeros((9, 12)), np.zeros((9, B)), np.zeros((9, 9)), np.zeros((6, K))
+    _constraint(felt, mount, Ts, y, by, by_y, r, W)
+    D[:] = 0.0
+    _add(by[:, :6], Hs[0], D)
+    _add(by[:6, 6:], Hs[1], ends)
+    for i in range(6):
+        for k in range(K):
+            D[i, k] += ends[i, k] * kept[k]
+    DP, DC, ends_added = np.zeros((9, K)), np.zeros((9, B)), ends * added
+    _add(D, P, DP)
+    _add_transposed(by_y, C, DP)
+    _add(D, C, DC)
+    _add(by_y, Y, DC)
+    _add_transposed(DP, D, W)
+    _add_transposed(DC, by_y, W)
+    _add_transposed(ends_added, ends, W[:6, :6])
+    # The state at the end: the arm's errors, the new velocity and the parameters, before the constraints.
+    right = np.empty((6, K + B + 1))
+    for i in range(6):
+        right[i, K + B] = z[i] = -r[i]
+        for k in range(K):
+            right[i, k] = DP[i, k] * kept[k] + ends_added[i, k]
+        for j in range(B):
+            right[i, K + j] = W[i, 6 + j] if j < 3 else DC[i, j]
+    for k in range(K):
+        for j in range(B):
+            C[k, j] = (DP[6 + j, k] if j < 3 else C[k, j]) * kept[k]
+    for i in range(3):
+        y[i], Y[i], Y[:, i] = r[6 + i], DC[6 + i], DC[6 + i]
+    for i in range(3):
+        for j in range(3):
+            Y[i, j] = W[6 + i, 6 + j]
+    for i in range(6):
+        Y[_BIASED + i, _BIASED + i] += (felt[28 + i] / CORNER_S) ** 2 * felt[0]
+    S[:] = W[:6, :6]
+    solution = solved(S, right)
+    for k in range(K):
+        if kept[k] != 1.0:
+            for j in range(K):
+                P[k, j] *= kept[k]
+                P[j, k] *= kept[k]
+    _subtract(solution, right, z, fixed, kept, added, (x, P, y, C, Y, gain))
+
+
+@kernel(fastmath={"contract"})
+def _subtract(
+    solution: Array,
+    right: Array,
+    z: Array,
+    fixed: int,
+    kept: Array,
+    added: Array,
+    state: tuple[Array, Array, Array, Array, Array, Array],
+) -> None:
+    """Use the constraints: what they do to the arm's errors (K,), to what is beside (B,), and to their covariances."""
+    x, P, y, C, Y, gain = state
+    K, B = len(x), len(y)
+    for k in range(K):
+        x[k] *= kept[k]
+        P[k, k] += added[k]
+        whole = P[k, k]
+        for i in range(6):
+            gain[k, i] = factor = solution[i, k]
+            for j in range(K):
+                P[k, j] -= factor * right[i, j]
+            for j in range(B):
+                C[k, j] -= factor * right[i, K + j]
+            if k != fixed:
+                x[k] += factor * z[i]
+        if k == fixed:  # its row is as it was
+            P[k, k] = whole
+            gain[k] = 0.0
+    for k in range(B):
+        for i in range(6):
+            factor = solution[i, K + k]
+            y[k] += factor * z[i]
+            for j in range(B):
+                Y[k, j] -= factor * right[i, K + j]
+    for k in range(B):
+        for j in range(k):
+            Y[k, j] = Y[j, k] = (Y[k, j] + Y[j, k]) / 2
 
 
 class Strapdown:
@@ -192,10 +413,10 @@ class Strapdown:
         self.sensor, self._density = sensor, np.zeros(6)
         self._t, self._z = np.empty(_ROWS + 1), np.empty((_ROWS + 1, 6))  # and the one that is held
         self._first = self._count = 0
-        self._R, self._lever = sensor.T_tool_sensor[:3, :3], sensor.T_tool_sensor[:3, 3]
-        tilt = np.append(sensor.tilt, 0.0)
-        self._up = exp_so3(tilt)[:, 2]
-        self._up_by_tilt = (-skew(self._up) @ left_jacobian(tilt))[:, :2]
+        self._lever, tilt = sensor.T_tool_sensor[:3, 3], np.append(sensor.tilt, 0.0)
+        up = exp_so3(tilt)[:, 2]
+        gravity = STANDARD_GRAVITY_M_S2 * np.vstack([up, (-skew(up) @ left_jacobian(tilt)).T[:2]])
+        self._mount = np.vstack([sensor.T_tool_sensor[:3, :3], self._lever, gravity])
 
     @property
     def newest_s(self) -> float:
@@ -225,19 +446,16 @@ class Strapdown:
         self._t[rows], self._z[rows] = t, self.sensor.felt(z)
         self._count += len(t)
 
-    def window(self, begin_s: float, end_s: float) -> Window | None:
-        """Return what was felt between two times, s; None where samples are missing."""
-        t = self._t[self._first : self._first + self._count]
-        low, high = int(np.searchsorted(t, begin_s, side="right")) - 1, int(np.searchsorted(t, end_s))
-        if high == len(t) and low >= 0 and end_s < t[-1] + HELD_S:
-            self._t[self._first + high], self._z[self._first + high] = end_s, self._z[self._first + high - 1]
-            t = self._t[self._first : self._first + high + 1]
-        if low < 0 or high >= len(t) or end_s <= begin_s or (t[low + 1 : high + 1] - t[low:high]).max() > GAP_S:
-            return None
-        out, length = np.empty(27), end_s - begin_s
-        _preintegrate(self._t, self._z, self._first, len(t), begin_s, end_s, out)
-        R, dv, dp, a, b = out[:9].reshape(3, 3), out[9:12], out[12:15], out[15:21], out[21:]
-        return Window(length, R, dv, dp, (a + b) / 2, b - a, self._density)
+    def window(self, begin_s: float, end_s: float) -> Array | None:
+        """Return what was felt between two times, s, (34,); None where samples are missing.
+
+        In the axes at the first time: length, s; rotation (9); integral of the specific force, m/s, and of that, m; mean of
+        angular velocity and specific force, their change from begin to end, and the density of the noise (6 each).
+        """
+        felt, rows = np.empty(34), (self._first, self._first + self._count - 1)
+        felt[28:] = self._density
+        there = _preintegrate(self._t, self._z, *rows, begin_s, end_s, felt)
+        return felt if there else None
 
     def started(self, before: Navigated | None, t_s: float, T: Array, twist: Array, rows: int) -> Navigated:
         """Return velocity and parameters where a window begins and the velocity is known by the joints alone.
@@ -265,7 +483,7 @@ class Strapdown:
 
     def advanced(
         self,
-        window: Window,
+        window: Array,
         beside: Navigated,
         state: tuple[Array, Array],
         step: tuple[Array, Array],
@@ -275,80 +493,15 @@ class Strapdown:
         """Use a window.
 
         Args:
-            window: what was felt.
+            window: (34,) what was felt.
             beside: velocity and parameters at its begin.
             state: the arm's error (K,) there, and its covariance (K, K).
             step: what motion makes of it: factors (K,) and variances (K,) that are added.
             poses: of the tool at begin and end (2, 4, 4), and their derivatives (2, 6, K) by the arm's error then.
             fixed: row of the arm's error that no reading changes.
         """
-        (x, P), (kept, added), (_, y, C, Y) = state, step, beside
-        r, at, by_y = self._constraint(window, poses[0], y)
-        H0, ends = poses[1][0], at[:6, 6:] @ poses[1][1]
-        D = at[:, :6] @ H0
-        D[:6] += ends * kept
-        DP, DC = D @ P + by_y @ C.T, D @ C + by_y @ Y
-        W = DP @ D.T + DC @ by_y.T + self._noise(window, poses[0][0])
-        W[:6, :6] += (ends * added) @ ends.T
-        # The state at the end: the arm's errors, the new velocity and the parameters, before the constraints.
-        C, Y, y = C * kept[:, None], Y.copy(), y.copy()
-        C[:, _V], Y[_V], Y[:, _V], Y[_V, _V], y[_V] = (DP[6:] * kept).T, DC[6:], DC[6:].T, W[6:, 6:], r[6:]
-        Y[_BIASES, _BIASES] += (window.density / CORNER_S) ** 2 * window.length_s
-        by_x, by_beside = DP[:6] * kept + ends * added, DC[:6]
-        by_beside[:, _V] = W[:6, 6:]
-        S, z = W[:6, :6], -r[:6]
-        gain, gain_y = np.linalg.solve(S, by_x).T, np.linalg.solve(S, by_beside).T
-        forgets = np.flatnonzero(kept != 1.0)
-        P = P.copy()
-        if len(forgets):  # they stand side by side
-            rows = slice(forgets[0], forgets[-1] + 1)
-            P[rows] *= kept[rows, None]
-            P[:, rows] *= kept[rows]
-        P.flat[:: len(P) + 1] += added
-        P -= gain @ by_x
-        P[fixed, fixed] += gain[fixed] @ by_x[:, fixed]
-        gain[fixed] = 0.0
-        C -= by_x.T @ gain_y.T
-        Y -= gain_y @ by_beside
-        after = Navigated(beside.t_s + window.length_s, y + gain_y @ z, C, (Y + Y.T) / 2)
-        return Advanced(x * kept + gain @ z, P, after, gain, D[:6], z, S)
-
-    def _constraint(self, window: Window, Ts: Array, y: Array) -> tuple[Array, Array, Array]:
-        """Return residual and velocity at the end (9,); derivatives by the tool's tangents (9, 12) and by y (9, B)."""
-        D, gravity = window.length_s, STANDARD_GRAVITY_M_S2 * self._up
-        R_tool_sensor, r = self._R, skew(self._lever)
-        R0, R1 = Ts[0, :3, :3] @ R_tool_sensor, Ts[1, :3, :3] @ R_tool_sensor
-        p0, p1 = Ts[:, :3, :3] @ self._lever + Ts[:, :3, 3]
-        s = R0.T @ (p1 - p0 - y[_V] * D + 0.5 * D * D * gravity)
-        rotated = window.R.T @ R0.T @ R1
-        out = np.empty(9)
-        out[:3] = 0.5 * np.array(
-            [rotated[2, 1] - rotated[1, 2], rotated[0, 2] - rotated[2, 0], rotated[1, 0] - rotated[0, 1]]
-        )
-        out[3:6], out[6:] = s - window.dp, y[_V] - D * gravity + R0 @ window.dv
-        by, by_y, there = np.zeros((9, 12)), np.zeros((9, len(y))), R0.T @ Ts[1, :3, :3]
-        by[:3, 3:6], by[:3, 9:] = -R1.T @ R0 @ R_tool_sensor.T, R_tool_sensor.T
-        by[3:6, :3], by[3:6, 3:6] = -R_tool_sensor.T, R_tool_sensor.T @ r + skew(s) @ R_tool_sensor.T
-        by[3:6, 6:9], by[3:6, 9:] = there, -there @ r
-        by[6:, 3:6] = -R0 @ skew(window.dv) @ R_tool_sensor.T
-        by_y[3:6, _V], by_y[6:, _V] = -D * R0.T, np.eye(3)
-        spin, push = window.change[:3], window.change[3:]
-        by_y[:3, _DELAY], by_y[3:6, _DELAY], by_y[6:, _DELAY] = -spin, -0.5 * D * push, R0 @ push
-        felt = self.sensor.felt_by(window.mean)
-        by_y[:3, _PARAMETERS:], by_y[3:6, _PARAMETERS:] = -D * felt[:3], -0.5 * D * D * felt[3:]
-        by_y[6:, _PARAMETERS:] = D * R0 @ felt[3:]
-        mount, lever, tilt = (slice(_PARAMETERS + rows.start, _PARAMETERS + rows.stop) for rows in MOUNTING)
-        by_y[:3, mount], by_y[3:6, mount] = np.eye(3) - R1.T @ R0, skew(s)
-        by_y[6:, mount], by_y[3:6, lever] = -R0 @ skew(window.dv), there - R_tool_sensor.T
-        by_up = STANDARD_GRAVITY_M_S2 * D * self._up_by_tilt
-        by_y[3:6, tilt], by_y[6:, tilt] = 0.5 * D * R0.T @ by_up, -by_up
-        return out + by_y[:, _DELAY:] @ y[_DELAY:], by, by_y
-
-    def _noise(self, window: Window, T: Array) -> Array:
-        """Return the covariance (9, 9) of what the samples' noise makes of residual and velocity."""
-        D, (gyro, force) = window.length_s, window.density.reshape(2, 3) ** 2
-        R0, out = T[:3, :3] @ self._R, np.zeros((9, 9))
-        out[:3, :3], out[3:6, 3:6] = np.diag(gyro * D), np.diag(force * D**3 / 3)
-        out[3:6, 6:] = -force[:, None] * (D * D / 2) * R0.T
-        out[6:, 3:6], out[6:, 6:] = out[3:6, 6:].T, R0 * (force * D) @ R0.T
-        return out
+        x, P, y, C, Y = (each.copy() for each in (*state, *beside[1:]))
+        gain, D, z, S = np.empty((len(x), 6)), np.empty((9, len(x))), np.empty(6), np.empty((6, 6))
+        _advance(window, self._mount, *poses, *step, fixed, x, P, y, C, Y, gain, D, z, S)
+        after = Navigated(beside.t_s + float(window[0]), y, C, Y)
+        return Advanced(x, P, after, gain, D[:6], z, S)
