@@ -22,6 +22,10 @@ if TYPE_CHECKING:
     from armsight.vision.rig import StereoRig
 
 
+def _unknown() -> None:
+    """Say that no temperatures are known; a lambda cannot be sent to the process that writes run.mcap."""
+
+
 @dataclass(frozen=True, eq=False)
 class Published(Record):
     """What all data of a run have in common.
@@ -40,7 +44,7 @@ class Published(Record):
     arm: Arm | None = None
     properties: Mapping[str, str] = field(default_factory=dict)
     hold: Callable[[str], None] | None = None
-    temperatures_c: Callable[[], Array | None] = lambda: None
+    temperatures_c: Callable[[], Array | None] = _unknown
 
 
 def json_text(content: Mapping[str, Any]) -> bytes:

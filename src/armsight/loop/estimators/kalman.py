@@ -67,8 +67,8 @@ WAITING_S = 0.5
 _GATE = chi_square_limit(6, CHANCE)
 #: The tool's acceleration is the difference of its twists so long before and after, s; half: noisier, double: bends cut.
 APART_S = 0.01
-#: Windows of an inertial unit are at least so long, s, unless an image ends them; half: twice the cost, double: an impact is
-#: placed worse.
+#: Windows of an inertial unit that no image ends are at least so long, s; half: twice the cost, double: impacts are said
+#: late.
 WINDOW_S = 0.04
 #: While windows are used, a link is loose against its potentiometer by one sigma of so many rad, which lasts so long, s:
 #: in its backlash it keeps its speed when the shaft stops, and stands when that begins. Half: joints overrule what was

@@ -35,6 +35,7 @@ from armsight.loop.running.data import (
     Fanout,
     HealthNotes,
     JointsDatum,
+    NoteDatum,
     Publisher,
     ShotDatum,
     estimator_event,
@@ -177,6 +178,7 @@ class Loop:
         self._datum: ShotDatum | None = None
         self._known: Mounting | None = None  # the mounting that was published
         self._shot_s = -np.inf
+        self._impacts = 0  # that were published
         self._stamp_s: float | None = None  # of the shot that is measured, as it was stamped
         self.health = HealthMonitor(follower.rig, setup.target.body, setup.sync_s, printed=is_print(setup.target))
         self._frames = self.health.stamps = FrameClock()
@@ -267,6 +269,12 @@ class Loop:
         beside = self.setup.beside
         samples = None if beside is None else beside.poll(self.estimator, self.t_s)
         felt = None if beside is None or samples is None else (beside.entry.reference.name, samples)
+        if beside is not None and len(beside.impacts) > self._impacts:
+            self._impacts = len(beside.impacts)
+            said = (
+                f"{beside.entry.reference.name}: an impact that joints do not explain: a knock, or links in their gaps"
+            )
+            self.publisher.put(NoteDatum(beside.impacts[-1], said, "warning"))
         estimate = self.estimator.estimate()
         self.log.estimated(estimate)
         self.publisher.put(JointsDatum(states, estimate.T_base_tool, estimate.cov, estimate.vision_age_s, felt))

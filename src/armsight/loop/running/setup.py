@@ -116,6 +116,9 @@ class HostClock:
 HONEST, OUTLIERS = 1.0, 0.01
 #: Samples that are given at once at most: older ones are of before the estimator began.
 MOST = 1000
+#: Outliers so close together are one impact, s; half: one that rings counts twice, double: two knocks count once.
+APART_S = 0.3
+_SAID = 5  # impacts in a line
 #: Returns times (N,), s, and readings (N, 6) up to a time, s, that were not returned before.
 ReadingsSource = Callable[[float], tuple[Array, Array]]
 
@@ -136,6 +139,7 @@ class FusedRow:
     moved_rms_m: float | None  #: distance of the estimates from those recorded before, m; None where there are none
     sigma_rms_m: float  #: of the position with it, root of the trace, m
     sigma_without_rms_m: float | None  #: and of those before, m
+    impacts_s: tuple[float, ...]  #: when the joints did not explain what was felt, s, as after a knock
 
     @property
     def line(self) -> str:
@@ -145,6 +149,8 @@ class FusedRow:
         if self.moved_rms_m is not None and self.sigma_without_rms_m is not None:
             moved = f"the estimates move by {1e3 * self.moved_rms_m:.3f} mm RMS, "
             without = f", without {1e3 * self.sigma_without_rms_m:.3f}"
+        if self.impacts_s:
+            dropped = f"; felt impacts at {', '.join(f'{t:.2f}' for t in self.impacts_s[:_SAID])} s"
         if self.rejected_s is not None:
             dropped = f"; it was dropped at {self.rejected_s:.1f} s: images contradict it"
         return (
@@ -165,6 +171,8 @@ class Fused:
         entry: as given.
         windows: used so far, outliers included.
         outliers: of them.
+        impacts: times of those, s: what was felt within the 40 ms before, the joints do not explain; together within
+            ``APART_S`` they are one.
         begin_s: time of the first window, s.
         rejected_s: when images contradicted it so that it was used no more, s; None where they did not.
     """
@@ -174,8 +182,10 @@ class Fused:
         kind = INERTIAL_CLASSES[entry.sensor_class]
         self._density = np.repeat([kind.gyro_noise, kind.noise], 3)
         self._squares, self.windows, self.outliers = 0.0, 0, 0
+        self.impacts = list[float]()
         self.begin_s = np.inf
         self.rejected_s: float | None = None
+        self._impact_s = -np.inf
         self._apart_s = self._newest_s = np.nan  # the newest reading, and how long it came after the one before, s
 
     def poll(self, estimator: Estimator, end_s: float) -> Samples | None:
@@ -201,7 +211,11 @@ class Fused:
         z, self.begin_s = innovation.z, min(self.begin_s, innovation.t_s)
         self.windows += 1
         self.outliers += innovation.outcome is Outcome.OUTLIER
-        if innovation.outcome is not Outcome.OUTLIER:
+        if innovation.outcome is Outcome.OUTLIER:
+            if innovation.t_s > self._impact_s + APART_S:
+                self.impacts.append(innovation.t_s)
+            self._impact_s = innovation.t_s
+        else:
             self._squares += float(squares_of(z[None], innovation.cov[None])[0]) / len(z)
 
     def row(self, covs: Array, before: tuple[float, float] | None = None) -> FusedRow:
@@ -219,7 +233,7 @@ class Fused:
         sigma = float(np.sqrt(np.einsum("nii->ni", covs)[:, :3].sum(axis=1).mean()))
         moved, without = (None, None) if before is None else before
         said = self.windows, self.outliers, self.begin_s, ratio, agrees, self.rejected_s
-        return FusedRow(self._sensor.name, *said, moved, sigma, without)
+        return FusedRow(self._sensor.name, *said, moved, sigma, without, tuple(self.impacts))
 
     def _unused(self) -> str:
         """Return why no window was used."""
