@@ -84,11 +84,12 @@ def run_in(
     rig.save(folder / "rig.json")
     more = {REFERENCES: files[REFERENCES]} if REFERENCES in files else {}
     texts = properties(rig, files["body.toml"], setup.arm, command=command, **more)
+    published = Published(rig, setup.target.body, setup.arm, texts)  # for another process; functions stay in this one
     hold = _interrupt if command == "run" else None
-    published = Published(rig, setup.target.body, setup.arm, texts, hold, lambda: setup.board.joints.temperature_c)
+    here = replace(published, hold=hold, temperatures_c=lambda: setup.board.joints.temperature_c)
     with contextlib.ExitStack() as stack:
         file = stack.enter_context(contextlib.closing(LazyMcap(folder, published, say)))
-        beside = stack.enter_context(contextlib.closing(open_streams(streams, published, say)))
+        beside = stack.enter_context(contextlib.closing(open_streams(streams, here, say)))
         result = run_experiment(setup, rig, plan, targets, publisher=Fanout((file, beside)), **how)
     result.properties = {"arm": setup.arm.name, "board": setup.board.welcome.board}
     return result

@@ -90,8 +90,9 @@ def _mean(values: Array, unit: float, *, root: bool = False) -> float | None:
     return float(f"{unit * (math.sqrt(mean) if root else mean):.6g}")
 
 
-def _hottest(celsius: Array | None) -> float | None:
+def _hottest(temperatures_c: Callable[[], Array | None] | None) -> float | None:
     """Return the temperature of the hottest motor, degrees Celsius."""
+    celsius = None if temperatures_c is None else temperatures_c()
     return None if celsius is None else round(float(celsius.max()), 1)
 
 
@@ -212,7 +213,7 @@ class CellSink(Sink):
             "rate_hz": round(window.shots / max(now - self._state_at, 1e-3), 2),
             "shots": self._shots,
             **window.state(),
-            "temperature_c": _hottest(self._published.temperatures_c()),
+            "temperature_c": _hottest(self._published.temperatures_c),
             "health": [each[:300] for each in self._findings[:_FINDINGS]],
         }
         self._window, self._state_at = _Window(), now

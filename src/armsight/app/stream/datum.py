@@ -22,10 +22,6 @@ if TYPE_CHECKING:
     from armsight.vision.rig import StereoRig
 
 
-def _unknown() -> None:
-    """Say that no temperatures are known; a lambda cannot be sent to the process that writes run.mcap."""
-
-
 @dataclass(frozen=True, eq=False)
 class Published(Record):
     """What all data of a run have in common.
@@ -36,7 +32,7 @@ class Published(Record):
         arm: the nominal arm; None where there is none.
         properties: texts that are stored with a recording: files, versions, options.
         hold: brings the arm to rest, with the reason; None where nothing moves.
-        temperatures_c: returns those of the motors (n,), degrees Celsius; None where nothing measures them.
+        temperatures_c: returns those of the motors (n,), degrees Celsius, or None; None where there are no motors.
     """
 
     rig: StereoRig | None = None
@@ -44,7 +40,7 @@ class Published(Record):
     arm: Arm | None = None
     properties: Mapping[str, str] = field(default_factory=dict)
     hold: Callable[[str], None] | None = None
-    temperatures_c: Callable[[], Array | None] = _unknown
+    temperatures_c: Callable[[], Array | None] | None = None
 
 
 def json_text(content: Mapping[str, Any]) -> bytes:
