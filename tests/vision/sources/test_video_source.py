@@ -105,23 +105,40 @@ def test_a_file_that_is_cut_short_says_so(film, picture):
     assert found[-1].problem == f"{path} is damaged or cut short: it ends at {(len(found) - 1) / 30:.3f} s of 0.667 s"
 
 
+def recorded(path, codec, kept, late=0):
+    """Write frames of 30 a second, each of which has its number as its grey level, without those that are not kept."""
+    with av.open(str(path), "w") as file:
+        stream = file.add_stream(codec, rate=30)
+        stream.height, stream.width, stream.pix_fmt = 48, 128, "yuvj420p" if codec == "mjpeg" else "yuv420p"
+        for k in kept:
+            frame = av.VideoFrame.from_ndarray(np.full((48, 128, 3), 5 * k, np.uint8), format="bgr24")
+            frame.pts, frame.time_base = k + late, Fraction(1, 30)
+            file.mux(stream.encode(frame))
+        file.mux(stream.encode())
+
+
 @pytest.mark.parametrize(
     ("name", "codec", "late"),
     [("a.avi", "mjpeg", 0), ("a.mkv", "libx264", 0), ("a.mkv", "libx264", 150), ("a.mp4", "libx264", 0)],
 )
 def test_frames_that_the_recorder_dropped_are_no_damage(tmp_path, name, codec, late):
     path, kept = tmp_path / name, [0, 1, 2, 3, 4, 7, 8, 12, 13, 14, 20]
-    with av.open(str(path), "w") as file:
-        stream = file.add_stream(codec, rate=30)
-        stream.height, stream.width, stream.pix_fmt = 48, 128, "yuvj420p" if codec == "mjpeg" else "yuv420p"
-        for k in kept:
-            frame = av.VideoFrame.from_ndarray(np.full((48, 128, 3), 10 * k, np.uint8), format="bgr24")
-            frame.pts, frame.time_base = k + late, Fraction(1, 30)
-            file.mux(stream.encode(frame))
-        file.mux(stream.encode())
+    recorded(path, codec, kept, late)
     found = shots(f"video:{path}")
     assert [shot.problem for shot in found] == [None] * len(kept)
     assert [shot.t_s for shot in found] == pytest.approx([k / 30 for k in kept], abs=1e-3)
+
+
+@pytest.mark.parametrize(("suffix", "codec"), [("avi", "mjpeg"), ("mkv", "libx264"), ("mp4", "libx264")])
+def test_frames_are_not_paired_across_those_that_were_dropped(tmp_path, suffix, codec):
+    kept = [[0, 1, 2, 3, 4, 5, 6, 30, 31, 33, 50], [0, 2, 3, 5, 6, 30, 32, 33, 50]]  # the mean rate is far below 30
+    left, right = (tmp_path / f"{side}.{suffix}" for side in ("left", "right"))
+    for path, numbers in zip((left, right), kept, strict=True):
+        recorded(path, codec, numbers)
+    found = shots(f"video:{left},{right}")
+    both = [shot for shot in found if shot.problem is None]
+    assert [shot.t_s for shot in both] == pytest.approx([k / 30 for k in sorted(set(kept[0]) & set(kept[1]))], abs=1e-3)
+    assert all(abs(float(shot.left.mean()) - float(shot.right.mean())) < 2.5 for shot in both)
 
 
 @pytest.mark.parametrize("codec", ["libsvtav1", "libx264", "mpeg4", "libvpx-vp9", "mjpeg"])

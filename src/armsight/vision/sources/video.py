@@ -125,7 +125,7 @@ class VideoSource(Source):
             problem = self._unexpected_end(grabbed)
             return Shot(name, None, None, None, problem) if problem else None
         first, last = self._files[0], self._files[-1]
-        if abs(first.t_s - last.t_s) > first.period_s / 2:
+        if abs(first.t_s - last.t_s) > min(first.period_s, first.step_s, last.step_s) / 2:
             early, late = sorted((first, last), key=lambda file: file.t_s)
             late.held = True
             problem = (
@@ -173,6 +173,7 @@ class Film:
         frames: how many were decoded.
         undecoded: how many could not be.
         t_s, end_s: when the current frame is shown, from the beginning, and until when, s.
+        step_s: since the frame before it, s; infinite for the first.
     """
 
     def __init__(self, path: str) -> None:
@@ -194,16 +195,18 @@ class Film:
             self._container.close()
             raise InputError(f"{path}: {problem}")
         self._stream.thread_type = "AUTO"
-        rate = self._stream.average_rate or self._stream.guessed_rate
+        average = self._stream.average_rate  # an AVI's may be that of its clock; else the guess may be
+        rate = min(filter(None, (average, self._stream.guessed_rate)), default=None)
         self.period_s = float(1 / rate) if rate else np.inf
         self._time_base: Fraction = self._stream.time_base or Fraction(1)
         self._start = self._stream.start_time or 0
-        if self._stream.frames and rate:
-            self.promised_s = self._stream.frames * self.period_s
+        if self._stream.frames and average:
+            self.promised_s = float(self._stream.frames / average)
         else:  # Matroska's duration counts from zero
             self.promised_s = (self._container.duration or 0) / 1e6 - float(self._start * self._time_base)
         self.frames = self.undecoded = 0
         self.t_s = self.end_s = 0.0
+        self.step_s = np.inf
         self._frame: VideoFrame | None = None
         self._frames: Iterator[VideoFrame] = self._decoded()
         first = list(itertools.islice(self._frames, 1))  # the rotation stands in the frames alone
@@ -235,10 +238,12 @@ class Film:
         self._frame = next(self._frames, None)
         if self._frame is None:
             return False
+        before_s = self.t_s if self.frames else -np.inf
         if self._frame.pts is None:
             self.t_s = self.frames * self.period_s if self.frames else 0.0
         else:
             self.t_s = float((self._frame.pts - self._start) * self._time_base)
+        self.step_s = self.t_s - before_s
         self.end_s = self.t_s + max(self.period_s, float((self._frame.duration or 0) * self._time_base))
         self.frames += 1
         return True
