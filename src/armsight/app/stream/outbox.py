@@ -11,7 +11,7 @@ import os
 import secrets
 import sqlite3
 import time
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
@@ -47,25 +47,28 @@ class Outbox:
     """
 
     def __init__(self, folder: Path, cell: str) -> None:
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            self._db = sqlite3.connect(
-                folder / "events.sqlite", timeout=0.2, check_same_thread=False, isolation_level=None
-            )
-            self._db.execute("PRAGMA locking_mode = EXCLUSIVE")
-            self._db.execute("CREATE TABLE IF NOT EXISTS waiting (n INTEGER PRIMARY KEY AUTOINCREMENT, event TEXT)")
-            self._db.execute("CREATE TABLE IF NOT EXISTS outbox (name TEXT)")
-            found = self._db.execute("SELECT name FROM outbox").fetchone()
-            self.name = str(found[0]) if found else secrets.token_hex(8)
-            self._db.execute("DELETE FROM outbox")  # a write: it takes the lock even where nothing is new
-            self._db.execute("INSERT INTO outbox VALUES (?)", (self.name,))
-        except (sqlite3.Error, OSError) as error:
-            why = (
-                "another command of this cell runs on this computer, or a push: each command needs a name of its own"
-                if "locked" in str(error)
-                else error
-            )
-            raise InputError(f"cell {cell}: {folder}: {why}") from None
+        with ExitStack() as opened:
+            try:
+                folder.mkdir(parents=True, exist_ok=True)
+                self._db = sqlite3.connect(
+                    folder / "events.sqlite", timeout=0.2, check_same_thread=False, isolation_level=None
+                )
+                opened.callback(self._db.close)
+                self._db.execute("PRAGMA locking_mode = EXCLUSIVE")
+                self._db.execute("CREATE TABLE IF NOT EXISTS waiting (n INTEGER PRIMARY KEY AUTOINCREMENT, event TEXT)")
+                self._db.execute("CREATE TABLE IF NOT EXISTS outbox (name TEXT)")
+                found = self._db.execute("SELECT name FROM outbox").fetchone()
+                self.name = str(found[0]) if found else secrets.token_hex(8)
+                self._db.execute("DELETE FROM outbox")  # a write: it takes the lock even where nothing is new
+                self._db.execute("INSERT INTO outbox VALUES (?)", (self.name,))
+            except (sqlite3.Error, OSError) as error:
+                why = (
+                    "another command of this cell runs on this computer, or a push: each command needs a name of its own"
+                    if "locked" in str(error)
+                    else error
+                )
+                raise InputError(f"cell {cell}: {folder}: {why}") from None
+            opened.pop_all()
         self._left = _BURST
         self._at = time.monotonic()
         self.thinned = 0
