@@ -37,6 +37,13 @@ def test_any_column_of_any_table_in_the_folder_is_drawn_and_any_row_shown(tmp_pa
     for wrong, words in ((lambda: step.plot_field("status"), "no column"), (lambda: step.show_row(1e9), "no row")):
         with pytest.raises(InputError, match=words):
             wrong()
+    with monkeypatch.context() as patched:  # of a long table every second row and more
+        patched.setattr("armsight.files.DOCUMENT_MB", 1e-6)
+        patched.setattr(recorded, "_MOST_ROWS", count // 2)
+        step.open_recorded("run/vision.csv")
+        until(lambda: step.state.rows < count or said)
+        assert count // 3 <= step.state.rows <= count // 2
+        assert step.state.across == "t_s"
     step.open_recorded("empty.csv")
     until(lambda: step.state.rows == 0 or said)
     assert (step.state.field, step.state.points, said) == ("", (), [])

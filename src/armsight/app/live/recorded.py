@@ -5,17 +5,20 @@ In: the CSV files of recordings and runs. Out: a :class:`RecordedState`; the pag
 
 from __future__ import annotations
 
+import itertools
 import math
 import time
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 from armsight.app.live.records import asked
 from armsight.app.live.step import PageStep, Shared
 from armsight.errors import InputError
-from armsight.files import read_table
+from armsight.files import is_long, long_rows, read_table
 
 MOST_FILES = 60  # newest tables that are listed; half: of many runs the first are missing, double: a long list
 MOST_POINTS = 1000  # of a curve on the page; half: short events are missed, double: a slow page
+_MOST_ROWS = 20_000  # of a long table; half: the slider is coarse, double: twice the memory
 _LOOK_S = 2.0  # between two looks for new files; half, double: nothing
 TIMES = ("t_s", "time_s")  # columns that are times, s; the first there is goes across
 
@@ -89,7 +92,7 @@ class RecordedStep(PageStep[RecordedState]):
         return tuple(str(path.relative_to(self.folder)) for path in newest)
 
     def _open(self, file: str) -> None:
-        head, *rows = read_table(self.folder / file) or [[]]
+        head, *rows = _table(self.folder / file) or [[]]
         fields = tuple(
             name
             for k, name in enumerate(head)
@@ -115,6 +118,14 @@ class RecordedStep(PageStep[RecordedState]):
         k = self._head.index(field) if field else -1
         points = [(self._across(row), _number(self._rows[row], k)) for row in range(0, len(self._rows), every)]
         self.show(field=field, points=tuple(points) if field else ())
+
+
+def _table(path: Path) -> list[list[str]]:
+    """Return a table's header and rows; of a long one every so many rows."""
+    if not is_long(path):
+        return read_table(path)
+    every = math.ceil(sum(1 for _ in long_rows(path)) / _MOST_ROWS)
+    return list(itertools.islice(long_rows(path), 0, None, every))
 
 
 def _number(row: list[str], column: int) -> float | None:
