@@ -124,6 +124,8 @@ class KalmanEstimator:
         # readings' noise and the pose, which stand side by side.
         whole = np.eye(at.size)
         self._widths = whole[at.backlash : at.floats] + whole[at.floats : at.compliance]
+        # The variances (n,) of links that may be anywhere in their gaps.
+        self._anywhere = self._model.sigmas[at.rest : at.reading] ** 2 + self._widths @ self._model.sigmas**2
         self._forgets, self._loose = slice(at.rest, at.delay), slice(at.rest, at.reading)
         self._opened, self._tight = opened(joints), np.zeros(joints, np.bool_)
         furthest = FURTHEST * np.sqrt(self._model.sigmas**2 + self._opened)
@@ -519,7 +521,7 @@ class KalmanEstimator:
             said = got.z, got.S, got.by, kept.copy(), got.gain, outcome
             self.on_reading(self._unit.sensor.name, Innovation(t_s, Ts[1], *said, added=added.copy()))
         if outcome is Outcome.OUTLIER:  # an impact: links may be anywhere within their gaps
-            kept[loose], added[loose] = 0.0, self._model.sigmas[loose] ** 2
+            kept[loose], added[loose] = 0.0, self._anywhere
             got, _, again = self._advanced(self._unit, window, before, step, q, unseen)
             if again is Outcome.OUTLIER:
                 return self._alone(before, t_s, (joints, step))
