@@ -1,6 +1,7 @@
 """Two USB cameras, played by a stand-in for OpenCV's capture with a queue as V4L2's and a clock of its own."""
 
 import os
+import struct
 import subprocess
 import sys
 
@@ -309,6 +310,11 @@ def test_the_jpeg_of_a_camera_is_kept_as_it_came(usb_pair):
     shot = source.read()
     assert shot.encoded == tuple(frames)
     np.testing.assert_array_equal(shot.left, cv2.imdecode(np.frombuffer(frames[0], np.uint8), cv2.IMREAD_COLOR))
+    rotated = b"Exif\0\0II*\0" + struct.pack("<IHHHIII", 8, 1, 0x0112, 3, 1, 3, 0)  # upside down, says EXIF
+    usb_pair.captures[0].jpeg = (
+        frames[0][:2] + b"\xff\xe1" + struct.pack(">H", len(rotated) + 2) + rotated + frames[0][2:]
+    )
+    np.testing.assert_array_equal(source.read().left, shot.left)
     usb_pair.captures[1].jpeg = frames[1][:4000]  # a frame that was cut short on the bus
     cut = source.read()
     assert cut.left is None

@@ -43,6 +43,8 @@ Settings = dict[int, tuple[str, float]]
 _COMMAND = (
     80  # characters of another process' command in a message; half: its configuration is cut, double: a long line
 )
+#: How a camera's JPEG is decoded: unrotated, as recordings of it are read.
+_FLAGS = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
 
 
 class UsbCamera:
@@ -119,7 +121,7 @@ class UsbCamera:
         encoded: bytes | None = None
         if image.shape[:2] != self._shape and image.size == max(image.shape):  # one row or column: bytes as they came
             encoded = jpeg_in(np.asarray(image, np.uint8).tobytes())
-            decoded = None if encoded is None else cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_COLOR)
+            decoded = None if encoded is None else cv2.imdecode(np.frombuffer(encoded, np.uint8), _FLAGS)
             if decoded is None:
                 return None
             image = decoded
