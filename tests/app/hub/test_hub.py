@@ -136,12 +136,18 @@ def test_one_name_is_one_process(cell_at, port, hub_at, wait, monkeypatch, tmp_p
     assert wait(lambda: (f := shown(hub).get("a", {})).get("level") == 1 and f)["why"].startswith("2 processes")
 
 
-def test_no_thread_of_a_cell_is_in_zenoh_when_its_command_ends(cell_at, port):
+def test_no_thread_of_a_cell_is_in_zenoh_when_its_command_ends(cell_at, hub_at, port, wait):
     """CPython before 3.14 ends such a thread by unwinding it, and Rust aborts the process: exit code 134."""
     cell = cell_at(f"a@127.0.0.1:{port}")  # where no hub is
     time.sleep(0.4)  # it begins to connect after 0.25 s, and tries for a second
     cell.close()
     assert not cell._post.is_alive()
+    hub = hub_at(port)
+    answering = cell_at(f"b@127.0.0.1:{port}")
+    wait(lambda: shown(hub).get("b", {}).get("about"))
+    answering.close()
+    assert len(answering._answering) >= 3
+    assert not any(each.is_alive() for each in answering._answering)
 
 
 def test_the_exit_code_of_a_command_is_its_last_event(hub_at, port, tmp_path, wait, armsight):

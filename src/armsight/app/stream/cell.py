@@ -152,6 +152,7 @@ class CellSink(Sink):
         self._exited.set()
         self._session: Any = None
         self._declared: list[Any] = []
+        self._answering: list[threading.Thread] = []
         self._ending, self._end_at = threading.Event(), math.inf
         self._post = threading.Thread(target=self._posting, name="cell", daemon=True)
 
@@ -239,6 +240,8 @@ class CellSink(Sink):
         if self._session is not None:
             with suppress(Exception):
                 self._session.close()
+            for each in self._answering:
+                each.join(_END_S)
         with self._lock:
             self._outbox.close()
 
@@ -295,7 +298,7 @@ class CellSink(Sink):
     def _open(self) -> None:
         import zenoh
 
-        session = zenoh.open(self._config)
+        session, before = zenoh.open(self._config), threading.enumerate()
         topic = self._cell.topic
         self._declared = [
             session.declare_queryable(
@@ -305,6 +308,8 @@ class CellSink(Sink):
             session.declare_queryable(topic("hold"), lambda query: query.reply(topic("hold"), self._hold(query))),
             session.liveliness().declare_token(topic("alive", str(session.zid()))),
         ]
+        # Threads that answer; they are daemons as this one is, so that Python does not wait for them by itself.
+        self._answering = [each for each in threading.enumerate() if each not in before]
         self._session = session
 
     def _send_events(self) -> bool:
