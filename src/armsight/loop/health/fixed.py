@@ -320,11 +320,6 @@ class Unrest:
         axes = L @ vectors
         return np.asarray((axes * np.where(chances * len(values) < chance, values - 1.0, 0.0)) @ axes.T)
 
-    @property
-    def shows(self) -> bool:
-        """Whether there is anything certain or suspected."""
-        return bool(self.cov.any() or self.suspected.any())
-
     def copied(self) -> Unrest:
         """Return a copy that windows can be tried on; this one goes on without them."""
         other = copy(self)

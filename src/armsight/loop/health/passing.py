@@ -1,8 +1,9 @@
-"""What changes and does not stay: exposures that are not when they are said to be, focal lengths that oscillate.
+"""What changes and does not stay: exposures that are not when they are said to be, focal lengths that oscillate, nods.
 
 In: the residuals of the shots of one test, and by how much the times of their exposures move each. Out: the sums of the
 test with that eliminated, where it explains them better than anything that changed once and stays (a camera, the body), and
-the findings of time and lens. Model of a shot, its pose eliminated:
+the findings of time and lens. What stays may have changed at once or grow from test to test. Model of a shot, its pose
+eliminated:
 
     r = B d + C c + n,    d ~ N(0, s^2)
 
@@ -13,8 +14,8 @@ times alone, c their values that all shots of the test share. Late exposures, an
 shutters are all of this form. A focal length has one value in each test. Hypotheses are compared by their evidence (MacKay,
 1992), which takes off what chance explains: of numbers that each shot has anew it is much.
 
-A camera that nods, or a lens that breathes, has another rotation or focal length in each shot, and looks much the same:
-times explain a test only where their evidence is larger than that of these four of each shot (``nodding``).
+A camera that nods has another rotation in each shot, and a lens that breathes fast another focal length, which looks much
+the same; but it goes on where the body rests, and as much in each test (``nodding``).
 
 What images leave beyond their noise passes as well, and nothing is wrong then. Cameras that sharpen, compress and denoise
 displace all that is near each other in an image, for a while, by nearly the same (:class:`Leftover`):
@@ -80,8 +81,8 @@ _ODD = 0.02
 _USUAL = 30.0
 
 
-Passes = Literal["time", "lens"]
-_PASSES: tuple[Passes, ...] = ("time", "lens")
+Passes = Literal["time", "lens", "rig"]
+_PASSES: tuple[Passes, ...] = ("time", "lens", "rig")
 #: Returns the log-evidence of what stays, of sums and a variance of the noise, and whether with a skew; 0 of nothing.
 Staying = Callable[[ResidualSums, float, bool], float]
 
@@ -126,20 +127,23 @@ def apart(shots: Sequence[tuple[Array, Array, float]]) -> Apart:
     return max(found, key=lambda each: each.gained - each.occam)
 
 
-def nodding(shots: Sequence[tuple[Array, Array, float]]) -> float:
-    """Return twice the log-evidence of a camera that has another rotation or focal length in each shot, against none.
+def nodding(shots: Sequence[tuple[Array, Array, float]], known: Array | None) -> tuple[Array, float, float]:
+    """Return the covariance (4, 4) of what is anew in each shot, a camera's rotation or focal length, that explains most.
 
     Args:
         shots: residuals (n,), their derivatives by these (n, 4), and weights.
+        known: the one that tests before have shown: a camera that nods goes on; None without.
+
+    Returns:
+        It; what it explains of the sum of squares, and twice the logarithm of what chance explains with it.
     """
     W, b, weights = _normal(shots)
-
-    def evidence(sigma_rad: float) -> float:
-        K = np.eye(W.shape[1]) + sigma_rad**2 * W
-        gained = sigma_rad**2 * np.einsum("ni,ni->n", b, np.linalg.solve(K, b[..., None])[..., 0])
-        return float(weights @ (gained - np.linalg.slogdet(K)[1]))
-
-    return max(map(evidence, _NOD_RAD))
+    found = list[tuple[Array, float, float]]()
+    for cov in [sigma_rad**2 * np.eye(W.shape[1]) for sigma_rad in _NOD_RAD] if known is None else [known]:
+        K = np.eye(W.shape[1]) + W @ cov
+        gained = np.einsum("ni,ni->n", b @ cov, np.linalg.solve(K, b[..., None])[..., 0])
+        found.append((cov, float(weights @ gained), float(weights @ np.linalg.slogdet(K)[1])))
+    return max(found, key=lambda each: each[1] - each[2])
 
 
 def _apart(apart_s: float, W: Array, b: Array, weights: Array) -> Apart:
@@ -185,6 +189,11 @@ class _Rest(NamedTuple):
     gained: float
     occam: float
 
+    @property
+    def beyond(self) -> float:
+        """What it explains beyond chance."""
+        return self.gained - self.occam
+
     def shows(self, excess: float) -> bool:
         """Return whether it explains more than chance, of a noise whose variance is so many times larger."""
         return self.gained / excess > self.occam
@@ -217,7 +226,9 @@ class _Doubtful:
     counted: Passes | None = None
 
     @classmethod
-    def of(cls, every: ResidualSums, size: int, times: Times | None) -> _Doubtful:
+    def of(
+        cls, every: ResidualSums, size: int, times: Times | None, nods: tuple[ResidualSums, float] | None
+    ) -> _Doubtful:
         """Return a test; ``size``: how many parameters there are, which are eliminated."""
         M, row, cost = eliminated(every.M, slice(1, 1 + size)), 1 + _FOCAL_ROW, _left(every, size)
         focal = every.without(size + _FOCAL_ROW, _FOCAL_VARIANCE)
@@ -226,11 +237,16 @@ class _Doubtful:
         if times is not None:
             occam = times.found.occam - _occam(times.found.information)
             rests["time"] = _Rest(times.rest, cost - _left(times.rest, size), occam)
+        if nods is not None:
+            rests["rig"] = _Rest(nods[0], cost - _left(nods[0], size), nods[1])
         return cls(every, rests, times, _FOCAL * float(M[0, row] / (M[row, row] + 1.0)))
 
     def shows(self, cause: Passes | None, excess: float) -> bool:
-        """Return whether a cause explains more than chance, of a noise whose variance is so many times larger."""
-        return cause in self.rests and self.rests[cause].shows(excess)
+        """Return whether a cause explains more than chance, of a noise whose variance is so many times larger.
+
+        A camera that nods does so in each test.
+        """
+        return cause in self.rests and (cause == "rig" or self.rests[cause].shows(excess))
 
 
 def _occam(information: Array) -> float:
@@ -345,6 +361,7 @@ class Passing:
     Attributes:
         apart: of the tests in which the exposures were apart, when each began, s, and how.
         focal: of those in which one focal length against the other explained most, when each began, s, and its change.
+        nods: of those in which another rotation of a camera in each shot did, when each began, s.
         apart_s: standard deviation of the times in the newest test, those that its shots share included, s.
         focal_share: the focal length's change in it.
         unsure: causes that explained the newest doubtful test nearly as well as what was taken.
@@ -353,6 +370,7 @@ class Passing:
 
     apart: tuple[tuple[float, Apart], ...] = ()
     focal: tuple[tuple[float, float], ...] = ()
+    nods: tuple[float, ...] = ()
     apart_s: float = 0.0
     focal_share: float = 0.0
     unsure: tuple[str, ...] = ()
@@ -363,10 +381,20 @@ class Passing:
     @property
     def now(self) -> bool:
         """Whether the newest test showed something."""
-        return self.apart_s > 0.0 or self.focal_share != 0.0
+        return self._counted is not None
+
+    @property
+    def nodded(self) -> bool:
+        """Whether a camera was found to nod."""
+        return len(self.nods) >= _LEAST
 
     def decide(
-        self, every: ResidualSums, stays: Staying, size: int, times: Times | None
+        self,
+        every: ResidualSums,
+        stays: Staying,
+        size: int,
+        times: Times | None,
+        nods: tuple[ResidualSums, float] | None,
     ) -> tuple[Passes | None, tuple[float, ...]]:
         """Decide what explains the doubtful tests best, all together: what stays has one value in them, what passes many.
 
@@ -377,16 +405,26 @@ class Passing:
             stays: see :data:`Staying`.
             size: K, how many parameters there are.
             times: of exposure that explain it; None without.
+            nods: its sums with another rotation of a camera in each shot eliminated, and twice the logarithm of what chance
+                explains with that; None without.
 
         Returns:
             What explains the newest test, None where it is something that stays; and when those tests began, s, that were
             counted for something else, and are taken back.
         """
-        tests = [*self._doubtful[1 - TOGETHER :], _Doubtful.of(every, size, times)]
+        tests = [*self._doubtful[1 - TOGETHER :], _Doubtful.of(every, size, times, nods)]
         weighed = _Weighed.of(tests, stays, size)
-        cause = self._counted = weighed.best(self._counted, one=len(tests) == 1)
-        near = (each for each, log in weighed.explained.items() if log > max(_AHEAD, weighed.stays - _ALIKE))
-        self.unsure = tuple(near) if cause is None else ()
+        cause = weighed.best(self._counted, one=len(tests) == 1)
+        if cause is not None:  # a test in which something moved once is of both times, and looks like what passes
+            beyond = [each.rests[cause].beyond if cause in each.rests else 0.0 for each in tests]
+            for odd in {0, int(np.argmax(beyond))}:
+                others = [*tests[:odd], *tests[odd + 1 :]]
+                weighed = _Weighed.of(others, stays, size) if others and cause is not None else weighed
+                cause = cause if others and weighed.best(self._counted, one=len(others) == 1) == cause else None
+        self._counted = cause
+        near = max(_PASSES, key=weighed.explained.__getitem__)
+        alike = weighed.explained[near] > max(_AHEAD, weighed.stays - _ALIKE)
+        self.unsure = (near,) if cause is None and alike and len(tests) > 1 else ()
         self._doubtful = [replace(each, counted=cause if each.shows(cause, weighed.excess) else None) for each in tests]
         self._list(self._doubtful)
         changed = (
@@ -406,6 +444,8 @@ class Passing:
                 apart.append((each.every.begin_s, each.times.found))
             elif each.counted == "lens":
                 focal.append((each.every.begin_s, each.focal_share))
+        nods = (each for each in self.nods if each < first_s)
+        self.nods = (*nods, *(each.every.begin_s for each in tests if each.counted == "rig"))[-_LISTED:]
         # Of those of hours the first says since when.
         self.apart, self.focal = (*apart[:1], *apart[1:][-_LISTED:]), (*focal[:1], *focal[1:][-_LISTED:])
         newest = tests[-1]
@@ -433,7 +473,7 @@ class Passing:
     def among(self, stays: tuple[HealthFinding, ...], *, timed: bool) -> tuple[HealthFinding, ...]:
         """Return what was found, with findings of what stays: of one cause once; what explains it as well is named."""
         times, focals = len(self.apart), len(self.focal)
-        if max(times, focals) < _LEAST:
+        if max(times, focals) < max(_LEAST, len(self.nods)):
             return tuple(_besides(each, self.unsure) if each.cause in ("rig", "body") else each for each in stays)
         passes = self._time_finding(timed=timed) if times >= focals else self._lens_finding(timed=timed)
         return self._once(passes, stays)
@@ -458,7 +498,10 @@ class Passing:
         information = np.sum([each.information for each in tests], axis=0)
         mean_s = np.linalg.solve(information, np.sum([each.information @ each.shared_s for each in tests], axis=0))
         sigmas_s = np.sqrt(np.diag(np.linalg.inv(information)))
-        own_s = math.sqrt(float(np.mean([each.apart_s**2 for each in tests])))
+        shown = np.array(
+            [max(each.gained - each.occam, 1e-9) for each in tests]
+        )  # a body that rests shows nothing of it
+        own_s = math.sqrt(float(np.average([each.apart_s**2 for each in tests], weights=shown)))
         k = int(np.argmax(np.abs(mean_s[:3])))
         # What the velocity lacks is lacking in all shots alike.
         size, sigma = (
@@ -466,7 +509,7 @@ class Passing:
             1e3 * math.hypot(float(sigmas_s[k]), 0.5 * UNKNOWN_SHARE * float(mean_s[k])),
         )
         if own_s > _CONSTANT * abs(mean_s[k]):
-            size = 1e3 * math.sqrt(float(np.mean([each.rms_s**2 for each in tests])))
+            size = 1e3 * math.sqrt(float(np.average([each.rms_s**2 for each in tests], weights=shown)))
             sigma = size / math.sqrt(2.0 * len(tests))
             what = (
                 f"the two exposures of a shot are about {size:.1f} ms apart, and by another time in each shot: one camera "

@@ -20,7 +20,8 @@ at the same position in an image by the same: r = ... + L beta, with L polynomia
 its own. It is reported where beta explains more than any change of the seven numbers at any time does.
 
 A camera that nods or a lens that breathes averages out in the sums: what single shots say of its rotation and of a focal
-length is compared within each second, and what it varies beyond the noise is a covariance of its own (``fixed``). Images
+length is compared within each second, and what it varies beyond the noise is a covariance of its own (``fixed``); what one
+second does not show whole is one where it explains the tests better than anything else (``passing``). Images
 that were seen before, to the bit, say nothing new. What images leave in all that is near each other, for a second, is in
 the noise of each test, as large as the rig itself shows it (:class:`~armsight.loop.health.passing.Leftover`).
 
@@ -163,7 +164,7 @@ class _Newest(NamedTuple):
         evidence: log-evidence of what the lenses leave.
         fits: sums with the lenses' coefficients eliminated, of all shots, and without those that fit worst.
         every: the same of every point; where all points fit it is ``fits`` itself.
-        passes: whether times of exposure explain it.
+        passes: whether what each shot has of its own explains it.
     """
 
     whole: ResidualSums
@@ -257,6 +258,8 @@ class RigWatch:
         self._onset, self._since_s = Onset(0.0), 0.0
         self._found: RigChange | None = None
         self.noise, self._unrest, self._newest_added = np.zeros((6, 6)), Unrest(4), np.zeros((6, 6))
+        # Means and second moments of what moved to and fro in the newest tests that this explains; its covariance.
+        self._swings, self._swung = deque[tuple[Array, Array]](maxlen=TOGETHER), np.zeros((4, 4))
         self._images: dict[bytes, None] = {}  # detections of shots that were summed, the newest last
 
     def take(self, estimate: PoseEstimate, t_s: float | None) -> Array:
@@ -284,7 +287,8 @@ class RigWatch:
         self._effects.append((found.response, estimate.cov))
         if is_new:
             self._sum(found, estimate)
-        self.noise = self._nodding(found.response, estimate.T_left_body)
+        cov = self._to_and_fro_cov
+        self.noise = self._nodding(found.response, estimate.T_left_body, cov if cov.any() else self._unrest.suspected)
         added = self._added(found) + self.noise
         if added.any():  # of a body that is far off more than what is linear
             off = log_se3(inverse(estimate.T_left_body) @ self.reader.linear_about(estimate)[1])
@@ -308,14 +312,13 @@ class RigWatch:
             del self._images[next(iter(self._images))]
         return not known
 
-    def _nodding(self, response: Array, T: Array) -> Array:
+    def _nodding(self, response: Array, T: Array, cov: Array) -> Array:
         """Return the covariance (6, 6) that a camera which nods or a lens that breathes adds to a pose (4, 4).
 
         Either camera may be the one; by a rotation of the left one, in whose frame poses are, the body moves as well.
         """
-        if not self._unrest.shows:
+        if not cov.any():
             return np.zeros((6, 6))
-        cov = self._unrest.cov + self._unrest.suspected
         by_rotation = response[:, : self._size] @ self._to_and_fro[:, :3]
         by_focal = response[:, : self._size] @ self._alone
         by_right = np.column_stack([by_rotation, by_focal[:, 0]])
@@ -327,12 +330,13 @@ class RigWatch:
         """Return the derivatives (n, 4) of a shot's rows by what moves to and fro."""
         return np.asarray(rows[:, 1 : 1 + self._size] @ self._to_and_fro)
 
-    def _unrest_began(self, stays: Sequence[Sequence[ShotResiduals]]) -> bool:
-        """Compare what the shots of a test say of the right camera's rotation and a focal length.
+    @property
+    def _to_and_fro_cov(self) -> Array:
+        """Covariance (4, 4) of what moves to and fro, from test to test or within a second."""
+        return np.asarray(self._swung if self._swings else self._unrest.cov)
 
-        Returns:
-            Whether they are found to move to and fro since this test.
-        """
+    def _scattered(self, stays: Sequence[Sequence[ShotResiduals]]) -> tuple[Array, Array, Array, float]:
+        """Return of a test times (N,), s, what its shots say of what moves to and fro (N, 4), noise, and Birge's ratio."""
         shots = [shot for stay in stays for shot in stay]
         J, r = [self._moving(each.rows) for each in shots], [each.rows[:, 0] for each in shots]
         H, b = np.array([each.T @ each for each in J]), np.array([j.T @ e for j, e in zip(J, r, strict=True)])
@@ -340,16 +344,30 @@ class RigWatch:
         d = np.einsum("nij,nj->ni", cov, b)
         freedom = sum(map(len, r)) - 10.0 * len(shots)
         excess = (sum(float(e @ e) for e in r) - float(np.vdot(b, d))) / max(freedom, 1.0)
+        return np.array([each.t_s for each in shots]), d, cov, max(excess, 1.0)
+
+    def _unrest_began(self, stays: Sequence[Sequence[ShotResiduals]]) -> bool:
+        """Return whether the shots of a test show that a camera's rotation or a focal length moves to and fro since it."""
         rested = not self._unrest.cov.any()
-        self._unrest.take(np.array([each.t_s for each in shots]), d, cov, max(excess, 1.0))
+        self._unrest.take(*self._scattered(stays))
         return rested and bool(self._unrest.cov.any())
 
-    def _unrest_weighed(self, rows: Array, other: Array | None = None) -> Array:
+    def _swing(self, stays: Sequence[Sequence[ShotResiduals]]) -> None:
+        """Take all that the shots of a test say of what moves to and fro, too slowly for one second to show it."""
+        _, d, noise, excess = self._scattered(stays)
+        self._swings.append((d.mean(axis=0), d.T @ d / len(d) - excess * noise.mean(axis=0)))
+        means, squares = (np.mean(each, axis=0) for each in zip(*self._swings, strict=True))
+        values, vectors = np.linalg.eigh(
+            squares - np.outer(means, means)
+        )  # the mean is that of the calibration's error
+        self._swung = (vectors * np.maximum(values, 0.0)) @ vectors.T
+
+    def _unrest_weighed(self, rows: Array, other: Array | None = None, *, cov: Array | None = None) -> Array:
         """Return rows of a shot, or others (n, K) of it, with what moves to and fro in their noise."""
-        given = rows if other is None else other
-        if not self._unrest.cov.any():
+        given, cov = rows if other is None else other, self._unrest.cov if cov is None else cov
+        if not cov.any():
             return given
-        values, vectors = np.linalg.eigh(self._unrest.cov)
+        values, vectors = np.linalg.eigh(cov)
         return noisier(given, self._moving(rows) @ (vectors * np.sqrt(np.maximum(values, 0.0))))
 
     def _weighed_parts(
@@ -436,7 +454,12 @@ class RigWatch:
             self._decide()
 
     def _summed(
-        self, stays: Sequence[Sequence[ShotResiduals]], *, every: bool = False, own: Apart | None = None
+        self,
+        stays: Sequence[Sequence[ShotResiduals]],
+        *,
+        every: bool = False,
+        own: Apart | None = None,
+        cov: Array | None = None,
     ) -> ResidualSums:
         """Return the sums of stays, of each the mean of its shots.
 
@@ -444,11 +467,12 @@ class RigWatch:
             stays: they.
             every: with points that do not fit.
             own: times of exposure that are eliminated.
+            cov: (4, 4) of what moves to and fro; what one second shows of it if None.
         """
         sums = ResidualSums(self._full, stays[0][0].t_s if stays else 0.0)
         for alone in (True, False):  # those of one shot are summed at once
             shots = [
-                (self._unrest_weighed(each.every if every else each.rows), len(stay))
+                (self._unrest_weighed(each.every if every else each.rows, cov=cov), len(stay))
                 for stay in stays
                 for each in stay
                 if (len(stay) == 1) is alone
@@ -461,10 +485,15 @@ class RigWatch:
         return sums
 
     def _in_units(
-        self, stays: Sequence[Sequence[ShotResiduals]], *, every: bool = False, own: Apart | None = None
+        self,
+        stays: Sequence[Sequence[ShotResiduals]],
+        *,
+        every: bool = False,
+        own: Apart | None = None,
+        cov: Array | None = None,
     ) -> ResidualSums:
         """Return the same sums of all that may have changed, in units of its priors, and of the lenses' coefficients."""
-        return self._summed(stays, every=every, own=own).by(self._with_lens)
+        return self._summed(stays, every=every, own=own, cov=cov).by(self._with_lens)
 
     def _decide(self, *, ends: bool = False) -> None:
         """Test for a change with the newest shots."""
@@ -553,15 +582,15 @@ class RigWatch:
         self, stays: Sequence[Sequence[ShotResiduals]], passes: Passes | None, own: Apart | None
     ) -> tuple[_Newest, ResidualSums]:
         """Return the test of some stays, a cause that passes eliminated, and the sums of every point."""
-        own = own if passes == "time" else None
+        own, cov = own if passes == "time" else None, self._swung if passes == "rig" else None
         # Images that do not belong together are no moved camera; newer shots that agree with them are.
         alone = self._poses > 1 and self.suspected is None and any(len(stay) == 1 for stay in stays)
         odd = sorted(stays, key=_misfit)[len(stays) - max(len(stays) // _ODD, int(alone)) :]
         left_out = any(each.every is not each.rows for stay in stays for each in stay)
         sums = list[tuple[ResidualSums, ResidualSums]]()
         for every in (False, True)[: 1 + left_out]:
-            whole = self._in_units(stays, every=every, own=own)
-            usual = whole.less(self._in_units(odd, every=every, own=own)) if odd else whole
+            whole = self._in_units(stays, every=every, own=own, cov=cov)
+            usual = whole.less(self._in_units(odd, every=every, own=own, cov=cov)) if odd else whole
             sums.append((whole, usual))
         (whole, usual), of_every = sums[0], sums[-1]
         fitting = sums[0]
@@ -571,7 +600,7 @@ class RigWatch:
         noise, evidence = self._leftover.seen(fitting[0], LENS, 3 * len(self.reader.points), seven, share)
         fits = self._without_lens(fitting, noise)
         both = fits if fitting is of_every else self._without_lens(of_every, noise)
-        return _Newest(whole, noise, evidence, fits, both, own is not None), of_every[0]
+        return _Newest(whole, noise, evidence, fits, both, own is not None or passes == "rig"), of_every[0]
 
     def _without_lens(self, sums: tuple[ResidualSums, ResidualSums], noise: float) -> tuple[ResidualSums, ResidualSums]:
         """Return two sums with the lenses' coefficients eliminated, over the variance of the noise."""
@@ -580,24 +609,26 @@ class RigWatch:
 
     def _passes(
         self, stays: Sequence[Sequence[ShotResiduals]], every: ResidualSums
-    ) -> tuple[Literal["time", "lens"] | None, Apart | None]:
+    ) -> tuple[Passes | None, Apart | None]:
         """Return what passing cause explains a test of some sums best, and its times of exposure."""
-        found: Apart | None = None
+        found, times, nods = None, None, None
         if self._timed:
             parts = self._weighed_parts(stays, every=False)
             found = apart([(rows[:, 0], moved, weight) for rows, moved, weight in parts])
-            nods = nodding([(rows[:, 0], self._moving(rows), weight) for rows, _, weight in parts])
-            if found.apart_s > 0.0 and nods > found.gained - found.occam:
-                found = None
-        times = None
-        if found is not None:
+            moving = [(shot.rows[:, 0], self._moving(shot.rows), 1.0 / len(stay)) for stay in stays for shot in stay]
+            cov, _, occam = nodding(moving, self._swung if self._swings else None)
+            nods = self._summed(stays, cov=cov).by(self._with_lens), occam
             sums = self._summed(stays)
             shared = eliminate(found, parts, sums)
             shared = np.hstack([shared[:, :1], shared[:, 1:] @ self._with_lens])
             times = Times(found, shared, sums.by(self._with_lens))
-        cause, taken_back = self.passing.decide(every, self._staying, self._size, times)
+        cause, taken_back = self.passing.decide(every, self._staying, self._size, times, nods)
         if taken_back:
             self._take_back(taken_back)
+        if cause == "rig":
+            self._swing(stays)
+        else:
+            self._swings.clear()
         return cause, found
 
     def _staying(self, sums: ResidualSums, excess: float, skewed: bool) -> float:
@@ -743,9 +774,10 @@ class RigWatch:
     def _nods(self) -> tuple[HealthFinding, ...]:
         """Return the finding of a camera that nods or a lens that breathes, where that displaces poses by what matters."""
         cov, newest = self._unrest.cov, list(self._effects)[-1:]
+        cov = self._swung if self.passing.nodded and not cov.any() else cov
         if not cov.any() or not newest:
             return ()
-        covs = self._nodding(newest[0][0], self.reader.track[-1][1])
+        covs = self._nodding(newest[0][0], self.reader.track[-1][1], cov)
         cost_m = float(displacement_m(np.sqrt(np.diag(covs))))
         if cost_m < COSTS_M:
             return ()
@@ -782,7 +814,11 @@ class RigWatch:
             copied._fits if self._every is self._fits else (self._every[0].copied(), self._every[1].copied())
         )
         copied._stays, copied.passing = [stay.copy() for stay in self._stays], copy(self.passing)
-        copied._unrest, copied._wholes = self._unrest.copied(), self._wholes.copied()
+        copied._unrest, copied._wholes, copied._swings = (
+            self._unrest.copied(),
+            self._wholes.copied(),
+            self._swings.copy(),
+        )
         return copied
 
     def _ended(self) -> RigWatch:
@@ -910,7 +946,7 @@ def _nod_finding(cov: Array, cost_m: float) -> HealthFinding:
     size = float(np.degrees(np.sqrt(np.trace(cov))))
     return HealthFinding(
         "rig",
-        f"a camera nods: within a second the right one rotates by {size:.3f} deg (RMS) to and fro against the left one; "
+        f"a camera nods: the right one rotates by {size:.3f} deg (RMS) to and fro against the left one; "
         "which of the two moves cannot be distinguished",
         None,
         size,
