@@ -38,6 +38,15 @@ def test_pairs_go_by_number_and_are_called_after_the_left_file(tmp_path, store, 
     assert all(shot.t_s is None and shot.problem is None for shot in found)
 
 
+@pytest.mark.parametrize(("left", "right"), [("a,b", "c"), ("c", "a,b"), ("a,b", "a,c"), ("a,b,c", "d")])
+def test_a_folder_may_have_a_comma_in_its_name(tmp_path, store, left, right):
+    for side, folder in (("left", left), ("right", right)):
+        (tmp_path / folder).mkdir()
+        store(tmp_path / folder / f"{side}1.png", side, 1)
+    found = shots(open_source(f"pairs:{tmp_path}/{left}/left*.png,{tmp_path}/{right}/right*.png"))
+    assert [shot.problem for shot in found] == [None]
+
+
 @pytest.mark.opencv
 def test_a_damaged_image_is_a_shot_with_a_problem_and_the_run_goes_on(tmp_path, store):
     for k in range(3):

@@ -11,7 +11,7 @@ import glob
 import os
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import overload
@@ -145,16 +145,23 @@ class PairsSource(StoredSource):
 
 
 def two_globs(text: str) -> tuple[str, str]:
-    """Return the globs of LEFT,RIGHT; one may have commas of its own, as many on either side.
+    """Return the globs of LEFT,RIGHT.
 
     Raises:
         InputError: not two globs.
     """
-    parts = text.split(",")
-    left, right = (",".join(half) for half in (parts[: len(parts) // 2], parts[len(parts) // 2 :]))
-    if len(parts) % 2 or not left or not right:
+    if (found := split_names(text, lambda each: bool(glob.glob(os.path.expanduser(each))))) is None:
         raise InputError(f"pairs:{text}: two globs are needed: --source 'pairs:DIR/left*.png,DIR/right*.png'")
-    return left, right
+    return found
+
+
+def split_names(text: str, is_there: Callable[[str], bool]) -> tuple[str, str] | None:
+    """Return LEFT and RIGHT of LEFT,RIGHT; of several commas the one between two that are there, else the middle one."""
+    parts = text.split(",")
+    splits = [(",".join(parts[:k]), ",".join(parts[k:])) for k in range(1, len(parts))]
+    there = [split for split in splits if all(map(is_there, split))] if len(splits) > 1 else []
+    middle = splits[len(splits) // 2 : len(splits) // 2 + len(splits) % 2]
+    return next((split for split in (there if len(there) == 1 else middle) if all(split)), None)
 
 
 def natural_key(path: Path) -> tuple[tuple[int, str] | tuple[int, int], ...]:

@@ -26,6 +26,7 @@ from armsight.data import Array, Image, Shot
 from armsight.errors import InputError
 from armsight.files import check_readable
 from armsight.vision.source import Source
+from armsight.vision.sources.pairs import split_names
 
 if TYPE_CHECKING:
     from av.container import InputContainer
@@ -394,7 +395,7 @@ def _mixture(before: Array, frame: Array, after: Array) -> tuple[float, float]:
 
 def open_video(rest: str) -> VideoSource:
     """Open ``LEFT.mp4,RIGHT.mp4`` or ``SIDE_BY_SIDE.mp4``."""
-    names = [rest] if os.path.isfile(rest) else rest.split(",")
-    if len(names) > 2 or not all(names):
+    names = (rest,) if os.path.isfile(rest) or "," not in rest else split_names(rest, os.path.isfile)
+    if names is None or not all(names):
         raise InputError(f"video:{rest}: expected video:LEFT.mp4,RIGHT.mp4 or video:SIDE_BY_SIDE.mp4")
     return VideoSource.open(*names)
