@@ -202,7 +202,7 @@ def test_sums_of_what_grows_are_those_of_its_own_columns(begin, end):
 
 
 def test_what_is_no_longer_kept_says_of_the_parameters_what_it_did():
-    """History of before a change settle, with less weight the older they are, until it began; those after it do not."""
+    """Tests of before a change settle, with less weight the older they are, until it began; those after it do not."""
     rng, tests, kept = np.random.default_rng(9), History(3, 5), np.zeros((4, 4))
     for k in range(45):
         sums = ResidualSums(5, float(k))

@@ -57,7 +57,7 @@ _ALIKE = 6.0
 _CONSTANT = 0.4
 #: What passes and what stays began at one time where they are dated so near, s: each is known to about a test.
 _DATED_S = 2.0
-#: History that must show something before it is said: one in which a camera moved is of both times, and looks alike.
+#: Tests that must show something before it is said: one in which a camera moved is of both times, and looks alike.
 _LEAST = 2
 #: Of the columns of a shot those of times: of the right camera, of the rows of the right and of the left one; acceleration.
 _TIMES = [0, 7, 8, 9]

@@ -70,18 +70,10 @@ SHAPE_M, SCALE = 5e-5, 3e-4
 _LEAST_S, _LIKE_S = 0.025, 0.1
 #: One of so many shots, those that fit worst, is no usual one.
 _ODD = 4
-#: The test is made after so long, s, or so many shots, and the past is forgotten with this time constant, in tests.
+#: The test is made after so long, s, or so many shots.
 TEST_S, TEST_SHOTS = 1.0, 60
 #: In so many tests after an alarm the lenses are tested each time; a test counts for what images leave after so many more.
 _FRESH, _BEFORE = 6, 3
-#: Beginnings that are tried; half: an old change is dated to a half of its age, double: twice the time after a fault.
-_BEGINS = 16
-#: History that are kept, to find since when: then the older half is merged in pairs, and so on. half: an old beginning is
-#: known half as closely, double: 4 MB more. So many first ones say what the lenses lack.
-_MOST_KEPT, _LENS_KEPT = 64, 600
-#: Most of what all tests hold that merged ones may, as a change may begin in the midst of them, which are then left out;
-#: half: they are merged somewhat more often, double: a quarter of what the rig showed may be left out.
-_BLOCK_SHARE = 0.125
 #: A prior so wide that it decides nothing: m, rad, scale, s.
 _WIDE = np.array([0.1, 0.1, 1.0, 1.0, 1.0, 1.0, 0.1])
 #: A change matters that moves a pose by so many of its claimed sigmas, in any direction.
