@@ -11,7 +11,7 @@ docs/concepts/loop.md.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import replace
 from functools import partial
@@ -302,14 +302,19 @@ class KalmanEstimator:
         if after is None or contradicted:
             return outcome
         self._states[row:] = [after]
-        for state in later:
-            again, _ = (None, outcome) if state.measurement is None else self._used(self._states[-1], state.measurement)
-            if again is not None:
-                self._states.append(again)
+        self._use_again(later)
         self._backlash_set = False
         while len(self._states) > 2 and self._states[1].t_s < self._states[-1].t_s - HISTORY_S:
             del self._states[0]
         return outcome
+
+    def _use_again(self, later: Sequence[ErrorState]) -> None:
+        """Use the measurements of states that followed one that came late."""
+        for state in later:
+            if state.measurement is not None:
+                again, _ = self._used(self._states[-1], state.measurement)
+                if again is not None:
+                    self._states.append(again)
 
     def _contradicted(self, kind: type, outcome: Outcome) -> bool:
         """Count outcomes of a kind, images or windows; return whether so many are against the unit that it was dropped."""
