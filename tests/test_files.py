@@ -14,6 +14,7 @@ import pytest
 from armsight import files
 from armsight.errors import InputError
 from armsight.files import (
+    RowFile,
     alone_in,
     check_readable,
     check_writable,
@@ -251,6 +252,24 @@ def test_what_was_written_is_on_the_disk_before_it_has_its_name(tmp_path, monkey
     monkeypatch.setattr(files.os, "replace", lambda old, new: done.append(str(new)))
     write_text(tmp_path / "file", SMALL)
     assert [Path(each).name.split(".")[1:2] or Path(each).name for each in done] == [["file"], "file", tmp_path.name]
+
+
+def test_rows_are_in_their_file_whole_or_not_at_all(tmp_path):
+    path, link = tmp_path / "poses.csv", tmp_path / "link.csv"
+    path.write_text("old\n")
+    link.symlink_to(path)
+    with pytest.raises(InputError, match=r"poses\.csv: cannot be written: File exists"):
+        RowFile(path, ("a", "b"))
+    with room(2), pytest.raises(InputError, match=r"link\.csv: cannot be written"):
+        RowFile(link, ("a", "b"), replaces=True)
+    assert (link.is_symlink(), path.exists()) == (True, True)
+    rows = RowFile(link, ("a", "b"), replaces=True)
+    rows.add(["x,y", 1.5])
+    with room(18), pytest.raises(InputError, match=r"link\.csv: cannot be written"):
+        rows.add(["another", 2.5])
+    rows.add(["z", None])
+    rows.close()
+    assert (path.read_text(), rows.rows) == ('a,b\n"x,y",1.5\nz,\n', 2)
 
 
 def test_tables_are_read_as_cells(tmp_path):

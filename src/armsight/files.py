@@ -108,11 +108,11 @@ def read_text(path: str | Path, most_mb: float = DOCUMENT_MB) -> str:
     try:
         return io.TextIOWrapper(io.BytesIO(data), _encoding(path, data)).read()
     except UnicodeDecodeError as error:
-        raise InputError(_no_text(path, data, error)) from None
+        raise InputError(_no_text(path, error)) from None
 
 
-def _no_text(path: str | Path, data: bytes, error: UnicodeDecodeError) -> str:
-    how = "save text as UTF-8, a table as CSV" if data[:5] != b"<?xml" else "its declaration says otherwise"
+def _no_text(path: str | Path, error: UnicodeDecodeError) -> str:
+    how = "save text as UTF-8, a table as CSV" if error.object[:5] != b"<?xml" else "its declaration says otherwise"
     return f"{path}: not a text file in {error.encoding}; {how}"
 
 
@@ -262,7 +262,7 @@ def _bounded(path: str | Path, file: io.TextIOWrapper) -> Iterator[str]:
                 raise InputError(f"{path}: a line of more than {_LONGEST_LINE} characters: not a table")
             yield line
     except UnicodeDecodeError as error:
-        raise InputError(_no_text(path, b"", error)) from None
+        raise InputError(_no_text(path, error)) from None
 
 
 def _with_points(path: str | Path, rows: list[list[str]]) -> list[list[str]]:
@@ -412,14 +412,18 @@ class RowFile:
 
     def __init__(self, path: Path, columns: Sequence[str], *, replaces: bool = False) -> None:
         self.path, self.rows, self._whole = path, 0, 0
-        flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | (os.O_TRUNC if replaces else os.O_EXCL)
+        target, is_new = _target(path), not os.path.exists(path)
+        flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | (0 if replaces else os.O_EXCL) | getattr(os, "O_BINARY", 0)
         with self._named():
-            self._file = os.open(path, flags, 0o644)
+            self._file = os.open(target, flags, 0o644)
         try:
+            with self._named():
+                os.ftruncate(self._file, 0)
             self._append(columns)
         except InputError:
             os.close(self._file)
-            path.unlink()
+            if is_new:
+                target.unlink()
             raise
 
     @contextlib.contextmanager
@@ -495,6 +499,8 @@ def check_writable(path: str | Path, *, apart_from: Iterable[str | Path | None] 
     folder = target.parent
     if not os.access(folder, os.W_OK):
         raise InputError(f"{path}: cannot be written: no permission to write in {folder}")
+    if os.path.exists(target) and not os.access(target, os.W_OK):
+        raise InputError(f"{path}: cannot be written: it is read-only")
     try:
         with contextlib.suppress(FileNotFoundError):
             os.lstat(_beside(target))  # a name that is too long

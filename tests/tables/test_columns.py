@@ -71,3 +71,16 @@ def test_a_long_table_stays_in_its_file_and_is_read_as_a_short_one(tmp_path, mon
     monkeypatch.setattr("armsight.tables.columns._MOST_NUMBERS", 5)
     with pytest.raises(InputError, match="3 rows of 2 numbers are too many"):
         tables[1].numbers(["t_s", "x_m"], gaps=True)
+
+
+def test_a_long_table_that_changes_while_it_is_read(tmp_path, monkeypatch):
+    monkeypatch.setattr("armsight.files.DOCUMENT_MB", 1e-6)
+    path = tmp_path / "imu.csv"
+    path.write_text("t_s,x_m\n0,1\n1,2\n")
+    table = Columns.of_csv(path)
+    with path.open("a") as file:
+        file.write("2,3\n")
+    np.testing.assert_array_equal(table.numbers(["x_m"]), [[1], [2]])
+    path.write_text("t_s,x_m\n0,1\n")
+    with pytest.raises(InputError, match=r"imu\.csv: became shorter while it was read"):
+        table.numbers(["x_m"])

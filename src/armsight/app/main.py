@@ -143,8 +143,12 @@ def run(arguments: list[str]) -> int:
         if wrong:
             print_error(wrong)
     finally:
-        for call in at_exit:
-            call(code, wrong)
+        try:
+            for call in at_exit:
+                call(code, wrong)
+        except KeyboardInterrupt:  # while a hub is awaited that does not answer
+            click.echo("armsight: interrupted", err=True)
+            code = 130
     return code
 
 

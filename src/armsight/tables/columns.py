@@ -167,10 +167,13 @@ def _padded(row: list[str], head: list[str]) -> list[str]:
 
 
 class _StoredRows(Sequence[tuple[int, list[str]]]):
-    """Lines and rows of a long table, which stay in its file: each look at them all reads it again."""
+    """Lines and rows of a long table, which stay in its file: each look at them all reads it again.
+
+    Rows that a program appends meanwhile are not read.
+    """
 
     def __init__(self, path: Path) -> None:
-        self._path = path
+        self._path, self._count = path, sys.maxsize
         with contextlib.closing(long_rows(path)) as rows:
             self.head = [cell.strip() for cell in next(rows, [])]
         self._count = sum(1 for _ in self)
@@ -179,9 +182,13 @@ class _StoredRows(Sequence[tuple[int, list[str]]]):
         return self._count
 
     def __iter__(self) -> Generator[tuple[int, list[str]]]:
-        for line, row in enumerate(long_rows(self._path), 1):
-            if line > 1 and any(row):
-                yield line, _padded([cell.strip() for cell in row], self.head)
+        lines = ((line, row) for line, row in enumerate(long_rows(self._path), 1) if line > 1 and any(row))
+        count = 0
+        for line, row in itertools.islice(lines, self._count):
+            count += 1
+            yield line, _padded([cell.strip() for cell in row], self.head)
+        if count < self._count < sys.maxsize:
+            raise InputError(f"{self._path}: became shorter while it was read")
 
     def __getitem__(self, row: Any) -> Any:  # noqa: ANN401 - the line and the row; a slice of none is asked for
         with contextlib.closing(iter(self)) as rows:

@@ -160,7 +160,7 @@ def test_a_wrong_file_is_one_line(armsight, setting, tmp_path, header, rows, sai
 def test_motion_is_not_for_logged_poses(armsight, setting, tmp_path):
     assert_rejected(
         run(armsight, tmp_path, "--open-loop"),
-        "commands no motion: leave out --motion, --open-loop, --fixed, --follow-rig and --sync-led",
+        "commands no motion: leave out --motion, --open-loop, --fixed, --follow-rig, --references and --sync-led",
     )
     assert_rejected(run(armsight, tmp_path), "angles.csv: no such file")
 

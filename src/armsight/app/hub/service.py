@@ -72,7 +72,7 @@ class Hub:
         self._say, self._cells = say, dict[tuple[str, str], CellView]()
         self._heard: queue.Queue[Heard] = queue.Queue()
         self._dropped, self._problem = 0, ""
-        self._keys = keys
+        self._site = None if keys is None else site_of(keys)[0]
         self._rejected, self._rejected_s = 0, -math.inf
         self._lock = threading.Lock()  # of the cells
         self._cached: tuple[float, bytes] = (0.0, b"")
@@ -103,13 +103,13 @@ class Hub:
     def rejected(self, why: str) -> None:
         """Say and keep that a connection was rejected, and how many were since the last time."""
         self._rejected += 1
-        if self._keys is None or time.monotonic() - self._rejected_s < _REJECTED_S:
+        if self._site is None or time.monotonic() - self._rejected_s < _REJECTED_S:
             return
         text = f"{self._rejected} connections rejected: no valid key of this site (the last: {why})"
         self._rejected, self._rejected_s, now = 0, time.monotonic(), time.time()
         self._say(text)
         event = {"n": 1, "kind": "rejected", "level": "warning", "text": text, "t": now}
-        self._store.add_events(site_of(self._keys)[0], HUB, {"outbox": str(now), "events": [event]}, now)
+        self._store.add_events(self._site, HUB, {"outbox": str(now), "events": [event]}, now)
 
     def _hear(self, heard: Heard) -> None:
         if heard[2] == "state" and self._heard.qsize() > _WAITING:  # another follows in a second; of tokens none does

@@ -42,7 +42,8 @@ _SYNC_S = 1e-3
 _WIDE_PX, _AGAIN = 2.0, 60
 #: What to do about repeated shots of a recording.
 _RECORDED = "they are no new measurements: leave them out, and record at the rate that the cameras really give"
-#: Newest shots that are kept for the lines at the end, which count all; half, double: so much memory, 7 kB a shot.
+#: Newest shots, of which the notes at the end are made (a board that was rotated, a row that was never seen); counts are of
+#: all. Half: less is noted, double: twice the memory, 7 kB a shot.
 _KEPT = 1_000
 #: s, between two looks at the health of live cameras; half: nothing, double: a warning comes later.
 _HEALTH_S = 1.0

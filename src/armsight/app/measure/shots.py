@@ -34,6 +34,7 @@ from armsight.vision.pose.shot_pose import ShotPose
 from armsight.vision.pose.shutter import LOOSE_PX
 from armsight.vision.rig import Shutters, StereoRig
 from armsight.vision.sources import Source, notes_of, open_source
+from armsight.vision.sources.folder import INDEX
 from armsight.vision.sources.pairs import StoredSource
 
 #: So many shots that fit badly are named.
@@ -118,7 +119,8 @@ class ImageShots:
             self._said = notes_of(source)
             say(self._said)
             if options.output is not None and isinstance(source, StoredSource):
-                check_writable(options.output, apart_from=source.files)
+                indices = {file.parent / INDEX for file in source.files}
+                check_writable(options.output, apart_from=(*source.files, *indices))
             self._timed = source.timed
             self.recorded = self._timed or isinstance(source, StoredSource)
             if requested is not None and not self._timed:
