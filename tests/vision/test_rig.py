@@ -86,6 +86,9 @@ def test_perturbed_moves_along_the_parameter_vector():
 def test_points_are_triangulated_where_both_cameras_see_them():
     rig, p = ordinary_rig(), np.array([[0.02, -0.03, 0.8], [-0.05, 0.04, 1.1]])
     np.testing.assert_allclose(rig.triangulate(*rig.project(p)), p, atol=1e-9)
+    for wrong in (([521, 281], [459, 291]), (np.zeros((2, 2)), np.zeros((3, 2)))):
+        with pytest.raises(InputError, match=r"\(N, 2\) pixels each are needed"):
+            rig.triangulate(*wrong)
 
 
 def test_a_newer_version_asks_for_an_update(tmp_path):

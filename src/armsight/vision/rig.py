@@ -238,9 +238,17 @@ class StereoRig(Record):
         """Return the points (N, 3), m, left camera's frame, that both cameras see at raw pixels (N, 2) each.
 
         NaN where two rays do not meet before both cameras.
+
+        Raises:
+            InputError: not as many pixels of both cameras, or not two numbers each.
         """
         from armsight.vision.triangulate import optimal_points
 
+        shapes = [np.shape(each) for each in (uv_left, uv_right)]
+        if shapes[0] != shapes[1] or shapes[0][1:] != (2,):
+            raise InputError(
+                f"uv_left and uv_right have shapes {shapes[0]} and {shapes[1]}: (N, 2) pixels each are needed"
+            )
         uv = np.stack([uv_left, uv_right], axis=1).astype(float)
         return optimal_points(self, uv, np.tile(np.eye(2), (len(uv), 2, 1, 1)))[0]
 

@@ -13,7 +13,7 @@ import pytest
 from armsight.app.demo import demo
 from armsight.app.run import folder as run_folder
 from armsight.app.run.experiment import RunResult
-from armsight.app.run.folder import finish, make_room, write_shots
+from armsight.app.run.folder import finish, make_room, open_folder, write_shots
 from armsight.app.run.report import report_of
 from armsight.data import Body, JointStates, Missed, Shot
 from armsight.errors import ArmsightError, DeviceError, InputError
@@ -162,6 +162,14 @@ def test_an_earlier_runs_files_make_room_and_a_strangers_stay(tmp_path):
     (tmp_path / "shots" / "shots.csv").write_text("x")
     make_room(tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == {"mine.txt", "rig.json"}
+
+
+def test_a_run_of_a_real_arm_is_never_written_over_and_a_simulated_one_is(tmp_path):
+    (tmp_path / "summary.json").write_text("{}")
+    with pytest.raises(InputError, match="holds an earlier run of an arm; name another folder with -o"):
+        open_folder(tmp_path)
+    (tmp_path / "truth.csv").write_text("t_s")
+    open_folder(tmp_path)
 
 
 def test_what_cannot_make_room_is_named(tmp_path):

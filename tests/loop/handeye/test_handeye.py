@@ -78,3 +78,15 @@ def test_an_unknown_mounting_and_a_transform_of_the_other_one_are_rejected():
         calibrate_handeye(A, B, cov, eye="on_foot")
     with pytest.raises(InputError, match="belongs to 'in_hand'"):
         _ = calibrate_handeye(A, B, cov).T_flange_rig
+
+
+def test_millimetres_and_what_is_no_rigid_motion_are_named():
+    flange, body = (np.tile(np.eye(4), (5, 1, 1)) for _ in range(2))
+    flange[:, :3, 3], body[:, 2, 3] = 400.0, 0.8
+    with pytest.raises(
+        InputError, match=r"Ts_base_flange: positions of up to 400 m: are they millimetres\? give metres"
+    ):
+        calibrate_handeye(flange, body)
+    flange[:, :3, 3], body[2, 3, 3] = 0.4, 1000.0
+    with pytest.raises(InputError, match="Ts_rig_body: pose 2 is no rigid motion: its last row is not 0 0 0 1"):
+        calibrate_handeye(flange, body)

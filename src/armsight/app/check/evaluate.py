@@ -54,7 +54,7 @@ def read_check(path: Path, *, closed: bool = False, columns: str | None = None) 
         if columns is not None:
             raise InputError(f"{path}: --columns goes with a table of attained poses; this is a run's folder")
         return attained_in(path, closed=closed)
-    if closed:
+    if closed and path.exists():
         raise InputError(f"{path}: --closed goes with a run's folder; this is a table of attained poses")
     rows = read_rows(path / "check.csv" if path.is_dir() else path, columns)
     unknown = not any(row.cov.any() for row in rows)

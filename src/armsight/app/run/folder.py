@@ -286,9 +286,11 @@ def open_folder(folder: Path) -> None:
     """Check that a run can be written to a folder, before the long work begins; it is not made yet.
 
     Raises:
-        InputError: it cannot be made or written to, or holds shots that are not of a run and would be overwritten.
+        InputError: it cannot be made or written to, or holds an earlier run of a real arm, or shots that are not of a run.
     """
     check_folder(folder, problem="no run can be written here")
+    if (folder / "summary.json").exists() and not (folder / "truth.csv").exists():
+        raise InputError(f"{folder}: holds an earlier run of an arm; name another folder with -o")
     if (folder / _SHOTS).exists() and not (folder / "summary.json").exists():
         raise InputError(f"{folder}: holds shots that are not of an earlier run; choose another folder")
 

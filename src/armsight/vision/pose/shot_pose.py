@@ -281,8 +281,15 @@ class ShotPoses:
         return pyarrow.table(self.columns()).__arrow_c_stream__(requested_schema)
 
     def to_pandas(self) -> Any:  # noqa: ANN401 - pandas is no dependency
-        """Return pandas' DataFrame of the columns."""
-        return importlib.import_module("pandas").DataFrame(self.columns())
+        """Return pandas' DataFrame of the columns.
+
+        Raises:
+            InputError: pandas is not installed.
+        """
+        try:
+            return importlib.import_module("pandas").DataFrame(self.columns())
+        except ImportError:
+            raise InputError("pandas is not installed: pip install pandas; columns() is the same table") from None
 
     def plot(self) -> Any:  # noqa: ANN401 - matplotlib is no dependency
         """Draw position, mm, and angles, degrees, over time or shots, with two sigmas; return matplotlib's figure.
