@@ -104,7 +104,7 @@ def selection_rows(run: Identification) -> list[tuple[str, float, bool]]:
 
 
 def _short(sources: str) -> str:
-    """Return the names of sources that were selected together, as one line of a figure."""
+    """Return the names of sources that were selected together, as one line."""
     first, *others = sources.split(", ")
     return f"{first} and {len(others)} more" if len(sources) > _MOST_LETTERS else sources
 
@@ -209,7 +209,8 @@ def identify_report(run: Identification, *, everything: bool = False) -> Report:
         f"{len(run.measured)} poses, {fitted} parameters fitted, {noise}; held-out residual over its predicted sigma "
         f"{run.held_out.residual_over_predicted:.2f} (1: the sigmas are right)"
     )
-    parts, backlashes = contributions(found, run.measured).items(), joint_backlashes(found, run.measured)
+    parts = [(_short(source), size) for source, size in contributions(found, run.measured).items()]
+    backlashes = joint_backlashes(found, run.measured)
     wide = max((len(source) for source, _ in parts), default=0)
     moved = "displacement of the tool by each error source as selected, RMS, beyond what those before explain:"
     pairs = [f"{a} and {b}: {c:+.3f}" for a, b, c in found.correlated()]
