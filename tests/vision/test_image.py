@@ -105,6 +105,16 @@ def test_a_tiffs_rotation_is_ignored_and_its_mirrored_rows_are_put_right(
         np.testing.assert_array_equal(read_image(path), shown(image))
 
 
+@pytest.mark.parametrize("at", [1 << 62, 1 << 63, (1 << 64) - 1])
+def test_a_big_tiff_whose_directory_is_nowhere_is_rejected(tmp_path, at, monkeypatch):
+    path = tmp_path / "a.tiff"
+    path.write_bytes(struct.pack("<2s3HQ", b"II", 43, 8, 0, at))
+    for most_mb in (128, 1e-6):  # whole, and as a large file is read
+        monkeypatch.setattr("armsight.vision.image.IMAGE_MB", most_mb)
+        with pytest.raises(InputError, match=r"a\.tiff: not an image that can be read"):
+            read_image(path)
+
+
 def test_a_thumbnail_end_is_not_the_end(tmp_path):
     path = stored(tmp_path, "a.jpg", COLOUR)
     data = with_exif(path.read_bytes(), 1, thumbnail=path.read_bytes())

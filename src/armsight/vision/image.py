@@ -94,7 +94,7 @@ def _right_angles(file: IO[bytes]) -> int:
     OpenCV (5.0.0) applies a TIFF's orientation under every flag, IMREAD_UNCHANGED included, and a JPEG's, PNG's, WebP's not
     under that one. Where a TIFF's is a mirroring, its rows are stored mirrored, and OpenCV's image is the one to take.
     """
-    with contextlib.suppress(struct.error):
+    with contextlib.suppress(struct.error, OSError, OverflowError, ValueError):  # a damaged file's offset may be any
         start = file.read(16)
         order = {b"II": "<", b"MM": ">"}.get(start[:2])
         layout = _TIFF.get(struct.unpack_from(f"{order}H", start, 2)[0]) if order else None
@@ -110,7 +110,7 @@ def _right_angles(file: IO[bytes]) -> int:
 
 
 def read_image(path: str | Path) -> Image:
-    """Read an image file as it is stored; an orientation is ignored, for pixels must stay where the camera has them.
+    """Read an image file as stored, for pixels must stay where the camera has them; only a TIFF's mirroring is applied.
 
     Returns:
         (H, W) grey or (H, W, 3) BGR, uint8 or uint16.
