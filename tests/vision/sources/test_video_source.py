@@ -105,14 +105,18 @@ def test_a_file_that_is_cut_short_says_so(film, picture):
     assert found[-1].problem == f"{path} is damaged or cut short: it ends at {(len(found) - 1) / 30:.3f} s of 0.667 s"
 
 
-def recorded(path, codec, kept, late=0):
-    """Write frames of 30 a second, each of which has its number as its grey level, without those that are not kept."""
+def recorded(path, codec, kept, late=0, ticks=1):
+    """Write frames of 30 a second, each of which has its number as its grey level, without those that are not kept.
+
+    With ticks a frame the numbers need not be whole.
+    """
     with av.open(str(path), "w") as file:
         stream = file.add_stream(codec, rate=30)
         stream.height, stream.width, stream.pix_fmt = 48, 128, "yuvj420p" if codec == "mjpeg" else "yuv420p"
+        stream.codec_context.time_base = Fraction(1, 30 * ticks)
         for k in kept:
-            frame = av.VideoFrame.from_ndarray(np.full((48, 128, 3), 5 * k, np.uint8), format="bgr24")
-            frame.pts, frame.time_base = k + late, Fraction(1, 30)
+            frame = av.VideoFrame.from_ndarray(np.full((48, 128, 3), 5 * round(k) % 255, np.uint8), format="bgr24")
+            frame.pts, frame.time_base = round(k * ticks) + late, stream.codec_context.time_base
             file.mux(stream.encode(frame))
         file.mux(stream.encode())
 
@@ -139,6 +143,17 @@ def test_frames_are_not_paired_across_those_that_were_dropped(tmp_path, suffix, 
     both = [shot for shot in found if shot.problem is None]
     assert [shot.t_s for shot in both] == pytest.approx([k / 30 for k in sorted(set(kept[0]) & set(kept[1]))], abs=1e-3)
     assert all(abs(float(shot.left.mean()) - float(shot.right.mean())) < 2.5 for shot in both)
+
+
+def test_stamps_that_jitter_are_paired_up_to_half_a_frame_apart(tmp_path):
+    number = np.arange(300)
+    stamps = number + np.random.default_rng(11).normal(0, 0.12, (2, 300)) * (number > 0)
+    left, right = (tmp_path / f"{side}.mkv" for side in ("left", "right"))
+    for path, kept in zip((left, right), stamps, strict=True):
+        recorded(path, "libx264", kept, ticks=100)
+    both = [shot for shot in shots(f"video:{left},{right}") if shot.problem is None]
+    assert all(abs(float(shot.left.mean()) - float(shot.right.mean())) < 2.5 for shot in both)
+    assert len(both) == pytest.approx(np.sum(np.abs(np.diff(stamps, axis=0)) < 0.5), abs=2)
 
 
 @pytest.mark.parametrize("codec", ["libsvtav1", "libx264", "mpeg4", "libvpx-vp9", "mjpeg"])

@@ -10,6 +10,7 @@ is applied, as ffmpeg does; PyAV's frame.rotation (18.1.0) and OpenCV (5.0.0) ta
 
 from __future__ import annotations
 
+import bisect
 import contextlib
 import itertools
 import os
@@ -79,6 +80,7 @@ class VideoSource(Source):
                 f"{width // 2}x{height} side by side; two files are video:LEFT,RIGHT",
             )
         self._shots = 0
+        self._steps_s: list[float] = []  # between frames of either file, s, sorted
         self._ended = False
 
     @property
@@ -120,13 +122,17 @@ class VideoSource(Source):
             return None
         name = f"{self._shots:06d}"
         self._shots += 1
+        before_s = [file.t_s for file in self._files]
         grabbed = [file.grab() for file in self._files]
         if not all(grabbed):
             self._ended = True
             problem = self._unexpected_end(grabbed)
             return Shot(name, None, None, None, problem) if problem else None
+        for file, t_s in zip(self._files, before_s, strict=True):
+            if file.t_s > t_s:  # one that was held has not moved on
+                bisect.insort(self._steps_s, file.t_s - t_s)
         first, last = self._files[0], self._files[-1]
-        if abs(first.t_s - last.t_s) > min(first.period_s, first.step_s, last.step_s) / 2:
+        if abs(first.t_s - last.t_s) > self._period_s() / 2:
             early, late = sorted((first, last), key=lambda file: file.t_s)
             late.held = True
             problem = (
@@ -142,6 +148,12 @@ class VideoSource(Source):
         self._ended = True
         for file in self._files:
             file.close()
+
+    def _period_s(self) -> float:
+        """Return the median step so far, s: a file's own period is a mean, and long where frames were dropped."""
+        number = len(self._steps_s)
+        middle = self._steps_s[(number - 1) // 2 : number // 2 + 1]
+        return float(np.mean(middle)) if middle else self._files[0].period_s
 
     def _unexpected_end(self, grabbed: list[bool]) -> str | None:
         """Return what is wrong with the end of the files; None where nothing is."""
@@ -174,7 +186,6 @@ class Film:
         frames: how many were decoded.
         undecoded: how many could not be.
         t_s, end_s: when the current frame is shown, from the beginning, and until when, s.
-        step_s: since the frame before it, s; infinite for the first.
     """
 
     def __init__(self, path: str) -> None:
@@ -207,7 +218,6 @@ class Film:
             self.promised_s = (self._container.duration or 0) / 1e6 - float(self._start * self._time_base)
         self.frames = self.undecoded = 0
         self.t_s = self.end_s = 0.0
-        self.step_s = np.inf
         self._frame: VideoFrame | None = None
         self._frames: Iterator[VideoFrame] = self._decoded()
         first = list(itertools.islice(self._frames, 1))  # the rotation stands in the frames alone
@@ -239,12 +249,10 @@ class Film:
         self._frame = next(self._frames, None)
         if self._frame is None:
             return False
-        before_s = self.t_s if self.frames else -np.inf
         if self._frame.pts is None:
             self.t_s = self.frames * self.period_s if self.frames else 0.0
         else:
             self.t_s = float((self._frame.pts - self._start) * self._time_base)
-        self.step_s = self.t_s - before_s
         self.end_s = self.t_s + max(self.period_s, float((self._frame.duration or 0) * self._time_base))
         self.frames += 1
         return True
