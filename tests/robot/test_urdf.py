@@ -206,6 +206,13 @@ PRISMATIC = (
         (changed(RPY, 'rpy="a b c"'), "must be 3 numbers"),
         (changed(RPY, 'rpy="0 0 nan"'), "must be 3 numbers"),
         (changed(RPY, 'quat_xyzw="0 0 0 1"'), "joint 'joint2': <origin> has quat_xyzw, which needs <robot version"),
+        *(
+            (
+                changed("<robot", f'<robot version="{old}"').replace(RPY, 'quat_xyzw="0 0 0 1"'),
+                "which needs <robot version",
+            )
+            for old in ("0.9", "1.0", "1", "1.00", " 1.0 ", "", "abc", "1.1.0", "-1.1")
+        ),
         (changed("<robot", '<robot version="1.1"').replace(RPY, f'{RPY} quat_xyzw="0 0 0 1"'), "and no rpy beside it"),
         (changed("<robot", '<robot version="1.1"').replace(RPY, 'quat_xyzw="0 0 1"'), "must be 4 numbers"),
         (changed("<robot", '<robot version="1.1"').replace(RPY, 'quat_xyzw="0 0 0 0"'), "quat_xyzw of length zero"),

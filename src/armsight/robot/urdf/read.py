@@ -15,6 +15,7 @@ axes) is chosen so that gamma and e vanish where they can, which gives a table b
 
 from __future__ import annotations
 
+import re
 import xml.etree.ElementTree as ET
 from itertools import dropwhile
 from pathlib import Path
@@ -71,7 +72,8 @@ def parse_urdf(text: str, path: str | Path, *, tool_link: str | None = None) -> 
         raise InputError(f"{path}: the outermost element is <{robot.tag}>, must be <robot>")
     if any("xacro" in element.tag for element in robot.iter() if isinstance(element.tag, str)):
         raise InputError(f"{path}: holds xacro macros; expand them first: xacro {Path(path).name} > arm.urdf")
-    quaternions = robot.get("version", "1.0") != "1.0"
+    version = re.fullmatch(r"([0-9]{1,9})\.([0-9]{1,9})", robot.get("version", "1.0"))
+    quaternions = version is not None and tuple(map(int, version.groups())) >= (1, 1)
     joints = [_joint(path, element, quaternions) for element in robot.findall("joint")]
     chain = Tree(path, [element.get("name") for element in robot.findall("link")], joints).chain(tool_link)
     _check_units(path, list(dropwhile(lambda joint: not joint.rotary, chain)))
