@@ -24,7 +24,7 @@ BODY = Body("plate", ("A", "B", "C"), np.eye(3))
 
 
 ARM = open_arm("six_r")
-SETUP = SimpleNamespace(arm=ARM, target=SimpleNamespace(body=BODY))
+SETUP = SimpleNamespace(arm=ARM, target=SimpleNamespace(body=BODY), beside=None)
 PROPERTIES = {"arm": "six_r", "sigma_m": float("nan"), "values": [1.0, float("inf")], "count": 3, "said": True}
 
 
@@ -178,3 +178,12 @@ def test_what_cannot_make_room_is_named(tmp_path):
     with pytest.raises(InputError, match=r"run\.log: an earlier run's file cannot be removed"):
         make_room(tmp_path)
     assert (tmp_path / "summary.json").exists()
+
+
+def test_what_was_lost_of_a_reference_is_said():
+    beside = SimpleNamespace(
+        entry=SimpleNamespace(reference=SimpleNamespace(name="imu")), losses=("it was lost: gone",)
+    )
+    result = broken_off()
+    result.setup = SimpleNamespace(**vars(SETUP) | {"beside": beside})
+    assert [note.text for note in report_of(result, None, ()).notes] == ["imu: it was lost: gone"]

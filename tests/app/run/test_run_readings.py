@@ -10,11 +10,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from armsight.app.run.devices import LiveReadings
+from armsight.app.run.devices import JUMP_S, LiveReadings
 from armsight.errors import ArmsightError
 from armsight.loop.references.file import INERTIAL_COLUMNS, Entry
 from armsight.loop.references.inertial import Inertial
-from armsight.loop.running.setup import HostClock
+from armsight.loop.running.setup import Fused, HostClock
 
 ENTRY = Entry(Inertial.of("imu"), "inertial", "mpu-6050", None, None, None, False)
 
@@ -80,6 +80,76 @@ def test_lines_of_a_serial_port_may_be_cut(board, monkeypatch):
     assert len(t_s) == 2
     os.close(controller)
     os.close(port)
+
+
+@pytest.fixture
+def fed(board, monkeypatch):
+    """Return what gives a sensor lines (arrival, s, line), after which its port is lost: times (N,), s, and the losses."""
+
+    def feed(lines):
+        now, left = [lines[0][0]], iter(lines)
+
+        def read():
+            now[0], data = next(left, (now[0], None))
+            if data is None:
+                raise OSError("unplugged")
+            return data + b"\n"
+
+        monkeypatch.setattr(LiveReadings, "_opened", lambda self, spec: read)
+        readings = LiveReadings(replace(ENTRY, live="udp:1"), board, lambda: now[0])
+        readings._thread.join()
+        t_s = readings(np.inf)[0] + 5.0  # of the board's clock
+        assert readings.losses.pop("it was lost: unplugged") == 1
+        unit = Fused(ENTRY, readings, readings.losses)
+        readings.close()
+        return t_s, unit.losses
+
+    return feed
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        line(1.0).replace(b'"t_s": 1.0', b'"t_s": 1' + 400 * b"0"),
+        line(1.0).replace(b'"t_s": 1.0', b'"t_s": 1e999'),
+        line(1e300),
+        line(-1e300),
+        line(np.nan),
+        line(1.0, np.inf),
+        60_000 * b"[",
+        b"\xff\x00",
+        b'{"t_s": []}',
+    ],
+    ids=lambda wrong: str(wrong[:12]),
+)
+def test_a_line_that_is_no_reading_costs_itself_alone(fed, wrong):
+    t_s, losses = fed([(105.0, b"0}"), (105.0, line(7.0)), (105.01, wrong), (105.02, wrong), (105.1, line(7.1))])
+    np.testing.assert_allclose(t_s, [105.0, 105.1], atol=1e-4)
+    assert losses == ("a line was no reading (2 times)",)  # the first line of a port may be cut
+
+
+def test_one_wild_stamp_costs_itself_alone(fed):
+    t_s, losses = fed([(105.0, line(7.0)), (105.1, line(100_000.2)), (105.2, line(7.2)), (105.3, line(7.3))])
+    np.testing.assert_allclose(t_s, [105.0, 105.2, 105.3], atol=1e-4)
+    assert losses == ("a stamp was more than 1 s off",)
+
+
+@pytest.mark.parametrize("jump_s", [-7.0, -1.5, 1.5, 1e6])
+def test_a_clock_that_jumps_is_converted_anew(fed, jump_s):
+    """The arrivals are the oracle: nothing is late, so the time of a line is that of its arrival."""
+    arrivals = 105.0 + 0.06 * np.arange(80)
+    stamps = arrivals - 98.0 + np.where(arrivals > 107.0, jump_s, 0.0)
+    t_s, losses = fed([(t, line(stamp)) for t, stamp in zip(arrivals, stamps, strict=True)])
+    lost = (arrivals > 107.0) & (arrivals < 107.0 + JUMP_S + 0.06)
+    np.testing.assert_allclose(t_s, arrivals[~lost], atol=1e-3)
+    assert losses == (f"a stamp was more than 1 s off ({lost.sum()} times)", "its clock jumped")
+
+
+def test_lines_that_are_late_do_not_move_the_clock(fed):
+    late = [(109.0 + 1e-3 * n, line(9.005 + 0.1 * n)) for n in range(20)]  # after a stall of 2 s
+    t_s, losses = fed([(105.0, line(7.0)), (106.9, line(8.9)), *late, (109.1, line(11.1))])
+    np.testing.assert_allclose(t_s, [105.0, 106.9, *np.arange(108.105, 108.95, 0.1), 109.1], atol=2e-3)
+    assert losses == ("a stamp was more than 1 s off (11 times)",)
 
 
 @pytest.mark.parametrize(

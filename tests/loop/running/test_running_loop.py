@@ -6,6 +6,7 @@ import signal
 import sys
 import threading
 import time
+from collections import Counter
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -20,12 +21,15 @@ from armsight.data import JointStates, Missed, Shot
 from armsight.errors import ArmsightError, CalibrationError, DeviceError, InputError
 from armsight.geometry.pose import pose
 from armsight.loop.estimators import Delay, KalmanEstimator
+from armsight.loop.references.file import Entry
+from armsight.loop.references.inertial import Inertial
 from armsight.loop.running import log
 from armsight.loop.running.calibrate import find_delay
 from armsight.loop.running.controllers import PERIOD_S, Planned
+from armsight.loop.running.data import NoteDatum
 from armsight.loop.running.log import Log, RunSegment
 from armsight.loop.running.loop import SIMULATED_SEARCH_S, Loop, beside, steady
-from armsight.loop.running.setup import Setup
+from armsight.loop.running.setup import Fused, Setup
 from armsight.robot.arm_file import open_arm
 from armsight.robot.boards.codes import BoardState
 from armsight.robot.boards.contract import Abilities
@@ -368,3 +372,17 @@ def test_interrupts_are_held_back_and_reported():
     assert held == [signal.SIGINT]
     with pytest.raises(KeyboardInterrupt):
         assert os.kill(os.getpid(), signal.SIGINT) or time.sleep(10.0)
+
+
+def test_what_is_lost_of_a_reference_is_published_once():
+    loop, losses, said = looped(Standing()), Counter(), []
+    entry = Entry(Inertial.of("imu"), "inertial", "mpu-6050", None, None, None, False)
+    loop.setup = replace(loop.setup, beside=Fused(entry, losses=losses))
+    loop.publisher = SimpleNamespace(put=said.append)
+    for kind in ("a line was no reading", "a line was no reading", "it was lost: gone"):
+        losses[kind] += 1
+        loop.pass_time(0.005)
+    assert [each.text for each in said if isinstance(each, NoteDatum)] == [
+        "imu: a line was no reading",
+        "imu: it was lost: gone",
+    ]

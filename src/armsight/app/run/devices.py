@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import re
 import socket
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -43,15 +45,24 @@ BAUD = 921_600
 FIRST_S = 3.0
 _WAIT_S = 0.1  # for a line: so soon a thread sees that it is to end
 _LINES_BYTES = 65_536
+#: s: stamps so far off their arrival, for so long, are of a clock that jumped; half: a stall of the network passes for a
+#: jump, double: a smaller jump leaves readings late, and a jump costs more of them.
+JUMP_S = 1.0
 
 
 class LiveReadings:
     """Reads a sensor in a thread. Its clock is converted as the board's is: by what came fastest.
 
+    A line that is no reading, or whose stamp is off by ``JUMP_S``, is left out. Where all are off for ``JUMP_S``, the clock
+    jumped, as with a sensor that began anew: it is converted anew.
+
     Args:
         entry: its table, which says where it is: ``udp:[HOST:]PORT`` or ``serial:PORT[,BAUD]``.
         clock: that converts the board's times to the computer's.
         now: the computer's clock, s.
+
+    Attributes:
+        losses: what was lost since the first reading, and how often.
 
     Raises:
         InputError: the table does not say, or what comes is not its readings.
@@ -64,6 +75,8 @@ class LiveReadings:
         self._lock, self._ended, self._problem = threading.Lock(), threading.Event(), ""
         self._rows: list[tuple[float, list[float]]] = []  # time, s, on the computer's clock; values
         self._newest_s = self._stamp_s = -np.inf  # the newest time, board's clock, and stamp
+        self._heard_s, self._off_s = now(), np.inf  # when the newest reading came, and the first after it that is off
+        self.losses = Counter[str]()
         self._closing = contextlib.ExitStack()
         self._read = self._opened(entry.live or "")
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -103,13 +116,18 @@ class LiveReadings:
 
     def _run(self) -> None:
         rest = b""
+        silent_s = self._now()
         while not self._ended.is_set():
+            if self._now() - max(self._heard_s, silent_s) > FIRST_S:
+                silent_s = self._now()
+                self.losses[f"no reading came for {FIRST_S:g} s"] += 1
             try:
                 rest += self._read()
             except TimeoutError:
                 continue
             except OSError as error:  # it was disconnected: a run goes on without it
-                self._problem = f"ended: {error}"
+                self._problem = f"it was lost: {error}"
+                self.losses[self._problem] += 1
                 return
             *lines, rest = rest.split(b"\n")
             for line in filter(bytes.strip, lines):
@@ -117,15 +135,31 @@ class LiveReadings:
             rest = rest[-_LINES_BYTES:]
 
     def _take(self, line: bytes) -> None:
+        now = self._now()
         try:
             record = json.loads(line)
             t_s, *values = (float(record[name]) for name in ("t_s", *INERTIAL_COLUMNS))
-        except (ValueError, TypeError, KeyError) as error:  # the first line of a port may be cut
+        except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
             kind = f"{error.args[0]} is missing" if isinstance(error, KeyError) else "is no JSON object of numbers"
             self._problem = f"expected lines of JSON with t_s, {', '.join(INERTIAL_COLUMNS)}; {line[:40]!r} {kind}"
+            self.losses["a line was no reading"] += 1
             return
-        if np.isfinite(values).all() and t_s > self._stamp_s:  # repeated ones, and NaN, are left out
-            with self._lock:
+        # No time is known of a stamp whose last digit is longer than JUMP_S; NaN and infinity are among them.
+        if not (np.isfinite(values).all() and math.ulp(t_s) < JUMP_S):
+            self.losses["a line was no reading"] += 1
+            return
+        with self._lock:
+            if self._stamp_s == -np.inf:
+                self.losses.clear()  # the first line of a port may be cut
+            elif abs(t_s + self._own.offset_s - now) > JUMP_S:
+                self._off_s = min(self._off_s, now)
+                if now - self._off_s < JUMP_S:
+                    self.losses[f"a stamp was more than {JUMP_S:g} s off"] += 1
+                    return
+                self._own, self._stamp_s = HostClock(self._now), -np.inf
+                self.losses["its clock jumped"] += 1
+            self._heard_s, self._off_s = now, np.inf
+            if t_s > self._stamp_s:  # repeated ones are left out
                 self._stamp_s = t_s
                 self._own.heard(t_s)
                 self._rows.append((t_s + self._own.offset_s, values))
@@ -255,7 +289,7 @@ def open_devices(devices: Devices) -> Iterator[Setup]:
         if devices.reference is not None:
             readings = LiveReadings(devices.reference, clock)
             stack.callback(readings.close)
-            beside = Fused(devices.reference, readings)
+            beside = Fused(devices.reference, readings, readings.losses)
         yield Setup(
             devices.arm,
             opened,

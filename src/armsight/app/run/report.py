@@ -202,7 +202,17 @@ def _said(result: RunResult) -> list[Note]:
     """Return what is said of a run on stderr."""
     level: Level = "error" if any(each.forbids for each in result.health) else "warn"
     remarks = [*unseen_lines(result.fixed_unseen), *correction_lines(result.log.corrections, result.not_corrected)]
-    return [*(Note(level, line) for line in health_lines(result.health)), *(Note("hint", line) for line in remarks)]
+    return [
+        *(Note(level, line) for line in health_lines(result.health)),
+        *(Note("warn", line) for line in _lost(result)),
+        *(Note("hint", line) for line in remarks),
+    ]
+
+
+def _lost(result: RunResult) -> list[str]:
+    """Return what was lost of the reference beside vision."""
+    beside = result.setup.beside
+    return [] if beside is None else [f"{beside.entry.reference.name}: {loss}" for loss in beside.losses]
 
 
 def show(report: Report, folder: Path, *, as_json: bool) -> None:
@@ -360,6 +370,7 @@ def notes_of(result: RunResult) -> list[str]:
     modes = Counter({_BASED.get(mode, f"on {mode}"): count for mode, count in log.modes.items()})
     return [
         *health_lines(result.health),
+        *_lost(result),
         *unseen_lines(result.fixed_unseen),
         *correction_lines(log.corrections, result.not_corrected),
         f"hand-eye: {len(handeye.q)} poses used, {len(handeye.missed)} missed; left out, a pose is "

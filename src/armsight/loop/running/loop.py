@@ -178,7 +178,7 @@ class Loop:
         self._datum: ShotDatum | None = None
         self._known: Mounting | None = None  # the mounting that was published
         self._shot_s = -np.inf
-        self._impacts = 0  # that were published
+        self._impacts = self._losses = 0  # that were published
         self._stamp_s: float | None = None  # of the shot that is measured, as it was stamped
         self.health = HealthMonitor(follower.rig, setup.target.body, setup.sync_s, printed=is_print(setup.target))
         self._frames = self.health.stamps = FrameClock()
@@ -275,6 +275,10 @@ class Loop:
                 f"{beside.entry.reference.name}: an impact that joints do not explain: a knock, or links in their gaps"
             )
             self.publisher.put(NoteDatum(beside.impacts[-1], said, "warning"))
+        if beside is not None and len(losses := beside.losses) > self._losses:
+            for loss in losses[self._losses :]:
+                self.publisher.put(NoteDatum(self.t_s, f"{beside.entry.reference.name}: {loss}", "warning"))
+            self._losses = len(losses)
         estimate = self.estimator.estimate()
         self.log.estimated(estimate)
         self.publisher.put(JointsDatum(states, estimate.T_base_tool, estimate.cov, estimate.vision_age_s, felt))

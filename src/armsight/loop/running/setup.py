@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -140,6 +140,7 @@ class FusedRow:
     sigma_rms_m: float  #: of the position with it, root of the trace, m
     sigma_without_rms_m: float | None  #: and of those before, m
     impacts_s: tuple[float, ...]  #: when the joints did not explain what was felt, s, as after a knock
+    losses: tuple[str, ...]  #: what was lost of it, and why it was used no more; empty where nothing was
 
     @property
     def line(self) -> str:
@@ -151,8 +152,7 @@ class FusedRow:
             without = f", without {1e3 * self.sigma_without_rms_m:.3f}"
         if self.impacts_s:
             dropped = f"; felt impacts at {', '.join(f'{t:.2f}' for t in self.impacts_s[:_SAID])} s"
-        if self.rejected_s is not None:
-            dropped = f"; it was dropped at {self.rejected_s:.1f} s: images contradict it"
+        dropped += "".join(f"; {each}" for each in self.losses)
         return (
             f"with {self.name} from {self.begin_s:.1f} s on: {moved}sigma {1e3 * self.sigma_rms_m:.3f} mm{without}; it "
             f"{found} with joints and vision: residuals {self.residual_over_sigma:.2f} of their sigma, {self.outliers} of "
@@ -166,6 +166,7 @@ class Fused:
     Args:
         entry: its table.
         source: where its readings come from.
+        losses: what is lost of them, and how often; a thread of the source may add to it.
 
     Attributes:
         entry: as given.
@@ -177,8 +178,14 @@ class Fused:
         rejected_s: when images contradicted it so that it was used no more, s; None where they did not.
     """
 
-    def __init__(self, entry: Entry, source: ReadingsSource = lambda end_s: (np.empty(0), np.empty((0, 6)))) -> None:
+    def __init__(
+        self,
+        entry: Entry,
+        source: ReadingsSource = lambda end_s: (np.empty(0), np.empty((0, 6))),
+        losses: Counter[str] | None = None,
+    ) -> None:
         self.entry, self._sensor, self._source = entry, entry.reference, source
+        self._losses = Counter[str]() if losses is None else losses
         kind = INERTIAL_CLASSES[entry.sensor_class]
         self._density = np.repeat([kind.gyro_noise, kind.noise], 3)
         self._squares, self.windows, self.outliers = 0.0, 0, 0
@@ -204,7 +211,14 @@ class Fused:
             outcome = estimator.take(self._sensor, samples)
             if outcome is Outcome.OUTLIER and self.rejected_s is None:
                 self.rejected_s = float(t_s[-1])
+                self._losses[f"it was dropped at {self.rejected_s:.1f} s: images contradict it"] += 1
         return samples
+
+    @property
+    def losses(self) -> tuple[str, ...]:
+        """What was lost of it, each kind once."""
+        found = self._losses.copy()  # at once, as a thread may add to it
+        return tuple(what if count == 1 else f"{what} ({count} times)" for what, count in found.items())
 
     def _heard(self, name: str, innovation: Innovation) -> None:
         """Take a window's residual."""
@@ -227,13 +241,13 @@ class Fused:
             InputError: it was never used; the message says why.
         """
         if not self.windows or not len(covs):
-            raise InputError(f"[{self._sensor.name}]: {self._unused()}")
+            raise InputError("; ".join((f"[{self._sensor.name}]: {self._unused()}", *self.losses)))
         ratio = float(np.sqrt(self._squares / max(self.windows - self.outliers, 1)))
         agrees = self.outliers < OUTLIERS * self.windows and self.rejected_s is None and ratio < HONEST
         sigma = float(np.sqrt(np.einsum("nii->ni", covs)[:, :3].sum(axis=1).mean()))
         moved, without = (None, None) if before is None else before
         said = self.windows, self.outliers, self.begin_s, ratio, agrees, self.rejected_s
-        return FusedRow(self._sensor.name, *said, moved, sigma, without, tuple(self.impacts))
+        return FusedRow(self._sensor.name, *said, moved, sigma, without, tuple(self.impacts), self.losses)
 
     def _unused(self) -> str:
         """Return why no window was used."""
