@@ -213,12 +213,20 @@ def test_a_connection_without_a_key_is_rejected_and_that_is_an_event(port, tmp_p
 
 def test_a_cell_holds_for_the_key_of_its_site_alone(hub_at, cell_at, port, tmp_path, wait, monkeypatch):
     keys = tmp_path / "keys"
-    make_keys(keys, "lab", ["arm", "shy"], "127.0.0.1", port)
+    make_keys(keys, "lab", ["arm", "shy", "done"], "127.0.0.1", port)
     hub, held = hub_at(port, keys), []
+
+    def ended(why):
+        raise InputError("nothing moves any more")
+
     cell_at(with_line(keys / "cells/arm/cell.toml", "holds = false", "holds = true"), "run", hold=held.append)
     cell_at(keys / "cells/shy/cell.toml", "run", hold=held.append)
-    wait(lambda: set(shown(hub)) == {"arm", "shy"} and all(cell["about"] for cell in shown(hub).values()))
+    cell_at(with_line(keys / "cells/done/cell.toml", "holds = false", "holds = true"), "run", hold=ended)
+    wait(lambda: set(shown(hub)) == {"arm", "shy", "done"} and all(cell["about"] for cell in shown(hub).values()))
     assert hold(keys, "shy", "why", f"127.0.0.1:{port}").startswith("rejected: this cell does not allow it")
+    assert hold(keys, "done", "smoke", f"127.0.0.1:{port}") == "rejected: nothing moves any more"
+    wait(lambda: any("rejected: nothing moves" in each["text"] for each in hub._store.events()))
+    assert [each["kind"] for each in hub._store.events() if each["cell"] == "done"] == ["hold", "began"]
     assert held == []
     assert hold(keys, "arm", "smoke", f"127.0.0.1:{port}") == "held"
     assert held == ["the hub asked to hold: smoke"]

@@ -13,12 +13,14 @@ import pytest
 from armsight.app.demo import demo
 from armsight.app.run import folder as run_folder
 from armsight.app.run.experiment import RunResult
-from armsight.app.run.folder import finish, make_room, open_folder, write_shots
+from armsight.app.run.folder import finish, make_room, open_folder, run_in, write_shots
 from armsight.app.run.report import report_of
+from armsight.app.stream.streams import Streams
 from armsight.data import Body, JointStates, Missed, Shot
 from armsight.errors import ArmsightError, DeviceError, InputError
 from armsight.loop.health import HealthFinding
 from armsight.robot.arm_file import open_arm
+from armsight.sim.example_rig import example_rig
 
 BODY = Body("plate", ("A", "B", "C"), np.eye(3))
 
@@ -178,6 +180,23 @@ def test_what_cannot_make_room_is_named(tmp_path):
     with pytest.raises(InputError, match=r"run\.log: an earlier run's file cannot be removed"):
         make_room(tmp_path)
     assert (tmp_path / "summary.json").exists()
+
+
+def test_a_hold_after_the_motions_does_not_keep_the_report_from_being_written(tmp_path, monkeypatch):
+    opened, sent = [], []
+    monkeypatch.setattr(run_folder.os, "kill", lambda *what: sent.append(what))
+    monkeypatch.setattr(
+        run_folder, "open_streams", lambda specs, about, say: (opened.append(about), Streams({}, say))[1]
+    )
+    monkeypatch.setattr(run_folder, "run_experiment", lambda *_, **__: (opened[0].hold("smoke"), broken_off())[1])
+    board = SimpleNamespace(welcome=SimpleNamespace(board="f4"))
+    setup = SimpleNamespace(**vars(SETUP) | {"board": board})
+    files = {"body.toml": 'name = "plate"'}
+    run_in(tmp_path / "run", setup, example_rig(), None, None, files, command="run", say=pytest.fail)
+    assert sent == [(os.getpid(), signal.SIGINT)]
+    with pytest.raises(InputError, match="nothing moves any more"):
+        opened[0].hold("smoke")
+    assert len(sent) == 1
 
 
 def test_what_was_lost_of_a_reference_is_said():

@@ -15,6 +15,7 @@ import os
 import shutil
 import signal
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -85,19 +86,25 @@ def run_in(
     more = {REFERENCES: files[REFERENCES]} if REFERENCES in files else {}
     texts = properties(rig, files["body.toml"], setup.arm, command=command, **more)
     published = Published(rig, setup.target.body, setup.arm, texts)  # for another process; functions stay in this one
-    hold = _interrupt if command == "run" else None
-    here = replace(published, hold=hold, temperatures_c=lambda: setup.board.joints.temperature_c)
+    ended = threading.Event()
+
+    def hold(_: str) -> None:
+        """Stop the arm and keep what was measured, as Ctrl-C does."""
+        if ended.is_set():  # it would keep the report from being written
+            raise InputError("nothing moves any more")
+        os.kill(os.getpid(), signal.SIGINT)
+
+    may_hold = hold if command == "run" else None
+    here = replace(published, hold=may_hold, temperatures_c=lambda: setup.board.joints.temperature_c)
     with contextlib.ExitStack() as stack:
         file = stack.enter_context(contextlib.closing(LazyMcap(folder, published, say)))
         beside = stack.enter_context(contextlib.closing(open_streams(streams, here, say)))
-        result = run_experiment(setup, rig, plan, targets, publisher=Fanout((file, beside)), **how)
+        try:
+            result = run_experiment(setup, rig, plan, targets, publisher=Fanout((file, beside)), **how)
+        finally:
+            ended.set()
     result.properties = {"arm": setup.arm.name, "board": setup.board.welcome.board}
     return result
-
-
-def _interrupt(_: str) -> None:
-    """Stop the arm and keep what was measured, as Ctrl-C does."""
-    os.kill(os.getpid(), signal.SIGINT)
 
 
 def finish(

@@ -347,9 +347,9 @@ class CellSink(Sink):
         """Answer a request to hold: done, or why not; both are events."""
         try:
             text = self._checked_hold(query.payload.to_bytes() if query.payload is not None else b"")
-            self._event("hold", "warning", f"the hub asked to hold: {text}")
             assert self._published.hold is not None
             self._published.hold(f"the hub asked to hold: {text}")
+            self._event("hold", "warning", f"the hub asked to hold: {text}")
         except InputError as error:
             self._event("hold", "warning", f"a request to hold was rejected: {error}")
             return f"rejected: {error}".encode()

@@ -31,7 +31,7 @@ class Published(Record):
         body: what is measured; without points where nothing is.
         arm: the nominal arm; None where there is none.
         properties: texts that are stored with a recording: files, versions, options.
-        hold: brings the arm to rest, with the reason; None where nothing moves.
+        hold: brings the arm to rest, with the reason; an InputError says why it cannot; None where nothing moves.
         temperatures_c: returns those of the motors (n,), degrees Celsius, or None; None where there are no motors.
     """
 
