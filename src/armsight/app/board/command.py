@@ -49,6 +49,13 @@ def _path(*names: str, metavar: str = "FILE", default: str | None = None, **give
     return click.option(*names, metavar=metavar, type=kind, default=start, show_default=shown, **given)
 
 
+def _new_offsets_file() -> Path:
+    """Return where old offsets are kept: a file that is not there yet."""
+    from armsight.files import unused
+
+    return unused(Path("old_offsets.json"))
+
+
 _board = click.option(
     "--board",
     "name",
@@ -409,7 +416,13 @@ def release(name: str, as_json: bool) -> None:
     "--further", metavar="DEG,...", help="Correct by these: true angle less reported one of each joint, degrees."
 )
 @_path("--restore", help="Write back what --keep has kept.")
-@_path("--keep", help="New file for the offsets as they were; otherwise old_offsets.json, or with -2, -3 ...")
+@click.option(
+    "--keep",
+    metavar="FILE",
+    type=PATH,
+    default=_new_offsets_file,
+    help="New file for the offsets as they were; otherwise old_offsets.json, or with -2, -3 ...",
+)
 @_yes
 @_JSON
 def offsets(
@@ -418,7 +431,7 @@ def offsets(
     nominal: str | None,
     further: str | None,
     restore: Path | None,
-    keep: Path | None,
+    keep: Path,
     yes: bool,
     as_json: bool,
 ) -> None:
@@ -431,12 +444,10 @@ def offsets(
     with --yes.
     """
     from armsight.app.board import offsets as kept
-    from armsight.files import unused
     from armsight.robot.arm_file import open_arm
     from armsight.robot.board_registry import calibration_of
     from armsight.robot.boards.feetech.board import FeetechBoard
 
-    keep = unused(Path("old_offsets.json")) if keep is None else keep
     given = [each for each in (identified, further, restore) if each is not None]
     if len(given) > 1 or (identified is None) != (nominal is None):
         raise InputError("give one of --identified ARM with --arm ARM, --further DEG,... and --restore FILE")
