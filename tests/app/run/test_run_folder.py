@@ -168,7 +168,9 @@ def test_an_earlier_runs_files_make_room_and_a_strangers_stay(tmp_path):
 
 def test_a_run_of_a_real_arm_is_never_written_over_and_a_simulated_one_is(tmp_path):
     (tmp_path / "summary.json").write_text("{}")
-    with pytest.raises(InputError, match="holds an earlier run of an arm; name another folder with -o"):
+    with pytest.raises(
+        InputError, match="holds an earlier run of an arm; move it away, or name another folder with -o"
+    ):
         open_folder(tmp_path)
     (tmp_path / "truth.csv").write_text("t_s")
     open_folder(tmp_path)

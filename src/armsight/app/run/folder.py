@@ -297,7 +297,7 @@ def open_folder(folder: Path) -> None:
     """
     check_folder(folder, problem="no run can be written here")
     if (folder / "summary.json").exists() and not (folder / "truth.csv").exists():
-        raise InputError(f"{folder}: holds an earlier run of an arm; name another folder with -o")
+        raise InputError(f"{folder}: holds an earlier run of an arm; move it away, or name another folder with -o")
     if (folder / _SHOTS).exists() and not (folder / "summary.json").exists():
         raise InputError(f"{folder}: holds shots that are not of an earlier run; choose another folder")
 
