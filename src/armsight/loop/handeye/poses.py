@@ -23,11 +23,9 @@ from armsight.errors import InputError
 from armsight.geometry.check import checked
 from armsight.geometry.pose import adjoint, exp_se3, inverse, log_se3, pose, small_adjoint
 from armsight.geometry.rotation import nearest_rotation
-from armsight.tables.lengths import REACH
+from armsight.tables.poses import FAR_M
 
 CHANCE = 1e-5  # a pose whose residual has a smaller chance than this is taken for a mistake and left out
-
-FAR_M = REACH[2]  # m; no robot or camera sees so far: such numbers are millimetres
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,7 +208,7 @@ def checked_poses(A: ArrayLike, B: ArrayLike, covs: ArrayLike | None, eye: Eye, 
         bad = (off > 1e-4) | (np.linalg.det(R) < 0) if len(Ts) else np.zeros(0, bool)
         if bad.any():
             raise InputError(f"{name}: pose {int(np.argmax(bad))} is no rigid motion: its 3x3 part is no rotation")
-        if (bad := (Ts[:, 3] != (0.0, 0.0, 0.0, 1.0)).any(axis=1)).any():
+        if (bad := (np.abs(Ts[:, 3] - (0.0, 0.0, 0.0, 1.0)) > 1e-4).any(axis=1)).any():
             raise InputError(f"{name}: pose {int(np.argmax(bad))} is no rigid motion: its last row is not 0 0 0 1")
         if (far := np.abs(Ts[:, :3, 3]).max(initial=0.0)) > FAR_M:
             raise InputError(f"{name}: positions of up to {far:.0f} m: are they millimetres? give metres")
