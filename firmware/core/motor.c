@@ -450,13 +450,15 @@ void motor_measure(motor_state *motor, const motor_config *config, float supply_
     }
     motor->gap_rad += moved_rad - speed_rad_s * TICK_S;
     const float size_rad_s = number_size(speed_rad_s);
-    float sure_rad_s = size_rad_s < motor->heard_rad_s ? size_rad_s - motor->doubt_rad_s : -UNKNOWN_RAD_S;
-    if (sure_rad_s > 0.0f) { /* the doubt is the last sample's: the current may be larger by now */
-        const float faster = motor->trust == 1.0f ? 1.0f : 1.0f + CONSTANT_OFF;
-        const float least_rad_s = faster * size_rad_s - motor->unsure_per_a * number_size(current_a);
-        sure_rad_s = least_rad_s < sure_rad_s ? least_rad_s : sure_rad_s;
-    }
-    motor->sure_rad_s = sure_rad_s;
+    motor->sure_rad_s = size_rad_s < motor->heard_rad_s ? size_rad_s - motor->doubt_rad_s : -UNKNOWN_RAD_S;
+}
+
+float motor_sure(const motor_state *motor)
+{
+    const float faster = motor->trust == 1.0f ? 1.0f : 1.0f + CONSTANT_OFF;
+    const float by_current_rad_s =
+        faster * number_size(motor->speed_rad_s) - motor->unsure_per_a * number_size(motor->last_a);
+    return by_current_rad_s < motor->sure_rad_s ? by_current_rad_s : motor->sure_rad_s;
 }
 
 /* Return whether a current is seen, without which its sensor may be broken. */

@@ -43,11 +43,14 @@ void motor_sleep(zero_state *zero, float current_a);
 /* Return whether a current is shown that was not, once the bridge has slept for 32 ms: the sensor's error. */
 bool motor_flows_asleep(const zero_state *zero, const motor_config *config, float supply_v);
 
+/* Return how fast the motor surely is: sure_rad_s doubts it as at the last sample, and the current may be larger by now. */
+float motor_sure(const motor_state *motor);
+
 /* Return the joint's speed: the reading's, or the motor's where that is faster beyond all its uncertainty. */
 static inline float motor_witness(const motor_state *motor, float reading_rad_s)
 {
-    const float faster_rad_s = motor->sure_rad_s - MOTOR_WITNESS * motor->fastest_rad_s;
-    return faster_rad_s > number_size(reading_rad_s) ? motor->speed_rad_s : reading_rad_s;
+    const float least_rad_s = number_size(reading_rad_s) + MOTOR_WITNESS * motor->fastest_rad_s;
+    return motor->sure_rad_s > least_rad_s && motor_sure(motor) > least_rad_s ? motor->speed_rad_s : reading_rad_s;
 }
 
 /* Let the motor's speed be damped in place of the reading's as far as damping_share says: an elastic joint that is read

@@ -122,7 +122,8 @@ void pid_control(joint_state *joint, const joint_config *config, float per_nomin
     const float own_s_per_rad = config->motor.constant_v_s * per_nominal_v;
     const float fastest_rad_s = joint->motor.fastest_rad_s;
     const float free_duty = fastest_rad_s * own_s_per_rad;
-    const float faster_rad_s = joint->motor.sure_rad_s - fastest_rad_s;
+    const bool fast = joint->motor.sure_rad_s > fastest_rad_s;
+    const float faster_rad_s = fast ? motor_sure(&joint->motor) - fastest_rad_s : 0.0f;
     if (faster_rad_s > 0.0f) { /* it is driven on as a free motor at its limit, less what brings it back there in BRAKE_S */
         const float left_duty = free_duty - config->gains.ka_s2_per_rad * (1.0f / BRAKE_S) * faster_rad_s;
         if (joint->motor.speed_rad_s > 0.0f) {
