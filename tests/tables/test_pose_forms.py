@@ -178,7 +178,7 @@ FORMS = {
     "FANUC TP .LS (HandlingTool 9.40)": ("p.LS", "/PROG  P\n/MN\n/POS\n" + rows(LS, MM, FIXED) + "/END\n", {}),
     "Universal Robots URScript 5.11": (
         "p.script",
-        "def p():\n  set_tcp(p[0,0,0,0,0,0])\n".replace("  set_tcp(p[0,0,0,0,0,0])\n", "  set_payload(1.2)\n")
+        "def p():\n  set_tcp(p[0,0,0.12,0,0,0])\n  set_payload(1.2)\n"
         + rows("  movel(p[{},{},{},{},{},{}], a=1.2, v=0.25)\n  sleep(0.5)", P, VECTOR)
         + "end\n",
         {},
@@ -210,6 +210,15 @@ FORMS = {
     "xArm Python SDK set_position (1.13)": (
         "p.py",
         rows("arm.set_position(x={}, y={}, z={}, roll={}, pitch={}, yaw={}, speed=100, wait=True)", MM, FIXED),
+        {},
+    ),
+    "xArm Python SDK set_position, radians (1.18.4)": (
+        "p.py",
+        rows(
+            "arm.set_position(\n    x={}, y={}, z={}, roll={}, pitch={}, yaw={}, is_radian=True\n)",
+            MM,
+            np.radians(FIXED),
+        ),
         {},
     ),
     "xArm JSON of positions": (
@@ -460,6 +469,11 @@ JOINTS = {
     "Mecademic MoveJoints": ("j.mxprog", rows("MoveJoints({},{},{},{},{},{})", DEG), {}),
     "Doosan posj": ("j.drl", rows("j{k} = posj({}, {}, {}, {}, {}, {})", DEG), {}),
     "xArm set_servo_angle": ("j.py", rows("arm.set_servo_angle(angle=[{}, {}, {}, {}, {}, {}], speed=20)", DEG), {}),
+    "xArm set_servo_angle of an arm in radians": (
+        "j.py",
+        "arm = XArmAPI('10.0.0.2', is_radian=True)\n" + rows("arm.set_servo_angle(angle=[{}, {}, {}, {}, {}, {}])", Q),
+        {},
+    ),
     "Staubli jointRx, zeros left out": (
         "j.dtx",
         '<Data name="j" type="jointRx" size="6">\n'
@@ -513,6 +527,26 @@ def test_each_program_gives_the_same_joints(tmp_path, form):
             "p.dtx",
             DTX + '<Value key="0" x="1" fatherId="a[0]" />\n<Value key="1" x="2" fatherId="b[0]" />\n</Data>',
             "points are of several frames",
+        ),
+        *(
+            (name, f"{text}\n", f"line 2: .*{word}.* is a motion or pose relative to another one")
+            for name, text, word in (
+                ("p.mxprog", "MovePose(200,0,300,0,90,0)\nMoveLinRelWrf(0,0,50,0,0,0)", "MoveLinRelWrf"),
+                ("p.src", "PTP {X 1,Y 2,Z 3,A 4,B 5,C 6}\nLIN_REL {X 0,Y 0,Z 9,A 0,B 0,C 0}", "LIN_REL"),
+                ("p.drl", "movel(posx(1,2,3,4,5,6))\nmovel(posx(0,0,9,0,0,0), mod=DR_MV_MOD_REL)", "DR_MV_MOD_REL"),
+                ("p.py", "a.set_position(1,2,3,4,5,6)\na.set_position(0,0,9,0,0,0, relative=True)", "relative=True"),
+                ("p.script", "movel(p[1,2,3,0,0,0])\nmovel(pose_trans(p1, p[0,0,0.1,0,0,0]))", "pose_trans"),
+                (
+                    "p.LS",
+                    "/MN\n 1:L P[1] 100mm/sec FINE INC ;\n/POS\n" + rows(LS, MM, FIXED),
+                    "P.1. 100mm/sec FINE INC",
+                ),
+            )
+        ),
+        (
+            "p.py",
+            "a.set_position(1,2,3,4,5,6)\na.set_position(1,2,3,0.1,0.2,0.3, is_radian=True)\n",
+            "is_radian=True stands at some of its 2 points",
         ),
         ("a.yaml", "a: [1, 2\n", "not YAML"),
         ("a.json", '{"a": [1, 2}', "line 1: not JSON"),

@@ -50,7 +50,6 @@ class Program(NamedTuple):
     pose: str  #: a pattern with its numbers as groups, in the order of ``names``
     joints: str | None = None  #: a pattern of joints, degrees, one group with commas, or named groups
     names: tuple[str, ...] = (*_MM, *_ANGLES)  #: of the numbers of a pose
-    beside: str | None = None  #: a pattern of lines that hold such numbers, but no pose to read: tools, frames
 
 
 PROGRAMS = (
@@ -61,7 +60,6 @@ PROGRAMS = (
         r"\[\s*\[\s*<n><,><n><,><n>\s*\]<,>\[\s*<n><,><n><,><n><,><n>\s*\]<,>\[",
         r"\[\s*\[<joints>\s*\]<,>\[",
         (*_MM, *_QUATERNION),
-        r"\b(?:tooldata|wobjdata|loaddata|speeddata|zonedata)\b",
     ),
     Program(  # .LS: P[1]{.. X = 1 mm, .. R = 6 deg}
         "FANUC",
@@ -82,9 +80,8 @@ PROGRAMS = (
         "Mecademic",
         _ROTATED,
         r"\b(?:Move|Set)\w+\s*\(",
-        r"\b(?:MovePose|MoveLin|MoveLinRelWrf|MoveJump)\s*\(<6>\s*\)",
+        r"\b(?:MovePose|MoveLin)\s*\(<6>\s*\)",
         r"\bMoveJoints\s*\(<joints>\s*\)",
-        beside=r"\bSet[TW]rf\b",
     ),
     Program(  # P(x, .., rz, fig)
         "DENSO",
@@ -126,7 +123,7 @@ PROGRAMS = (
         "xArm",
         _FIXED,
         r"\bset_(?:position|servo_angle)\s*\(",
-        r"\bset_position\s*\((?:\s*\*?\[\s*)?"
+        r"\bset_position\s*\(\s*(?:\*?\[\s*)?"
         + "<,>".join(rf"(?:{name}\s*=)?\s*<n>" for name in ("x", "y", "z", "roll", "pitch", "yaw")),
         r"\bset_servo_angle\s*\([^\[]*\[<joints>\s*\]",
     ),
@@ -140,8 +137,18 @@ _KRL = re.compile(r"\{\s*(?:\w+\s*:\s*)?([A-Z]\w*\s+[-+.\deE]+(?:\s*,\s*[A-Z]\w*
 _KRL_KEYS = (("X", "Y", "Z", "A", "B", "C"), ("A1", "A2", "A3", "A4", "A5", "A6"))
 #: What only points have; motions between them have other names ({VEL 100.0,ACC 100.0}).
 _OF_A_POINT = {"X", "Y", "Z", *_KRL_KEYS[1]}
-#: Frames and tools in KUKA's language have the form of points.
-_KRL_BESIDE = re.compile(r"^\s*(?:DECL\s+)?(?:GLOBAL\s+)?(?:FRAME\b.*)?\$|\b(?:BASE|TOOL)_DATA\b", re.IGNORECASE)
+#: Lines of tools, frames, loads and speeds, whose numbers have the form of points.
+_BESIDE = re.compile(
+    r"^.*\b(?:(?:tool|wobj|load|speed|zone)data|Set[TW]rf|set_tcp|(?:BASE|TOOL)_DATA)\b.*$|"
+    r"^[ \t]*(?:DECL\s+)?(?:GLOBAL\s+)?(?:FRAME\b.*)?\$.*$",
+    re.MULTILINE | re.IGNORECASE,
+)
+#: What moves by numbers from where the arm is, or gives a pose in that of another one.
+_RELATIVE = re.compile(
+    r"\bMoveLinRel[TW]rf\s*\(|\b\w+_REL\s*\{|\bDR_MV_MOD_REL\b|\brelative\s*=\s*True\b|"
+    r"\bpose_(?:trans|add|sub)\s*\(.*\bp\[|\bP\[\d+.*\bINC\b",
+    re.IGNORECASE,
+)
 
 
 class ProgramPoints(NamedTuple):
@@ -159,6 +166,22 @@ def program_rows(path: Path, text: str) -> ProgramPoints | None:
     Raises:
         InputError: a point that lacks a number, poses and joints in one file, or pulses.
     """
+    kept = _BESIDE.sub("", text)
+    found = _program_points(path, kept)
+    if found is None:
+        return None
+    for line, row in enumerate(kept.splitlines(), 1):
+        if relative := _RELATIVE.search(row):
+            raise InputError(
+                f"{path}: line {line}: {relative[0]!r} is a motion or pose relative to another one, not to the base: write "
+                "the pose it ends at, or delete the line if no image was taken there"
+            )
+    passed = (f"{path}: tools, frames and loads are passed over",)
+    return found if kept == text else found._replace(notes=(*passed, *found.notes))
+
+
+def _program_points(path: Path, text: str) -> ProgramPoints | None:
+    """Return the points of a program without its tools and frames."""
     written = [(line, row.strip()) for line, row in enumerate(text.splitlines(), 1)]
     written = [(line, row) for line, row in written if row and not row.startswith("#")]
     if any(_UR.search(row) for _, row in written):
@@ -175,13 +198,11 @@ def _points(path: Path, text: str, program: Program) -> ProgramPoints | None:
     """Return the points of one maker's program; None where it has none."""
     if program.maker == "Staubli":
         return _points_of_staubli(path, text)
-    kept = text if program.beside is None else re.sub(rf"(?m)^.*{program.beside}.*$", "", text)
-    notes: tuple[str, ...] = () if kept == text else (f"{path}: frames and tools are passed over",)
+    notes: tuple[str, ...] = ()
     if program.maker == "Yaskawa":
-        kept, left_out = _rectangular(path, kept)
-        notes += left_out
+        text, notes = _rectangular(path, text)
     poses, joints = (
-        [] if each is None else list(re.finditer(_pattern(each), kept, re.MULTILINE))
+        [] if each is None else list(re.finditer(_pattern(each), text, re.MULTILINE))
         for each in (program.pose, program.joints)
     )
     joints = [one for one in joints if not any(one.start() == pose.start() for pose in poses)]
@@ -190,35 +211,51 @@ def _points(path: Path, text: str, program: Program) -> ProgramPoints | None:
             f"{path}: {program.maker}'s program holds {len(poses)} poses (line {_line(text, poses[0])}) and {len(joints)} "
             f"joints (line {_line(text, joints[0])}): keep one kind in a file"
         )
-    frames = dict.fromkeys(re.findall(r"\bUF\s*:\s*(\w+)\s*,\s*UT\s*:\s*(\w+)", kept))
+    frames = dict.fromkeys(re.findall(r"\bUF\s*:\s*(\w+)\s*,\s*UT\s*:\s*(\w+)", text))
     if len(frames) > 1:  # FANUC's; their poses do not belong together
         named = ", ".join(f"UF {uf}, UT {ut}" for uf, ut in frames)
         raise InputError(f"{path}: its points are of several frames or tools ({named}): keep those of one in a file")
+    if not poses and not joints:
+        return None
+    unit = _unit(path, text, len(joints) or len(poses))
     if joints:
-        return _joint_points(text, joints, notes)
-    return _pose_points(path, text, program, poses, notes) if poses else None
+        return _joint_points(text, joints, unit, notes)
+    return _pose_points(path, text, program, poses, unit, notes)
 
 
-def _joint_points(text: str, joints: list[re.Match[str]], notes: tuple[str, ...]) -> ProgramPoints:
-    """Return joints, degrees: of each one group with commas, or one a joint."""
+def _unit(path: Path, text: str, count: int) -> str:
+    """Return "deg", or "rad" where all of so many motions of an xArm, or the arm itself, say is_radian=True."""
+    said = re.findall(r"\bis_radian\s*=\s*(True|False)", text)
+    if "True" not in said:
+        return "deg"
+    whole = re.search(r"\bXArmAPI\s*\([^)]*\bis_radian\s*=\s*True", text) is not None
+    if "False" in said or not (whole or len(said) == count):
+        raise InputError(f"{path}: is_radian=True stands at some of its {count} points: write it at all or none")
+    return "rad"
+
+
+def _joint_points(text: str, joints: list[re.Match[str]], unit: str, notes: tuple[str, ...]) -> ProgramPoints:
+    """Return joints: of each one group with commas, or one a joint."""
     cells = [re.split(r"[\s,]+", one[1].strip()) if one.re.groups == 1 else list(one.groups()) for one in joints]
     rows = [(_line(text, one), [cell.strip() for cell in row]) for one, row in zip(joints, cells, strict=True)]
-    return ProgramPoints([f"q{k}_deg" for k in range(1, len(cells[0]) + 1)], rows, None, notes)
+    return ProgramPoints([f"q{k}_{unit}" for k in range(1, len(cells[0]) + 1)], rows, None, notes)
 
 
 def _pose_points(
-    path: Path, text: str, program: Program, poses: list[re.Match[str]], notes: tuple[str, ...]
+    path: Path, text: str, program: Program, poses: list[re.Match[str]], unit: str, notes: tuple[str, ...]
 ) -> ProgramPoints:
-    """Return poses, mm and degrees or quaternions."""
+    """Return poses, mm and angles or quaternions."""
     rows = [(_line(text, one), list(one.groups())) for one in poses]
-    how = f"degrees, {program.rotation}" if program.rotation else "quaternions"
+    angles_in = "degrees" if unit == "deg" else "radians"
+    how = f"{angles_in}, {program.rotation}" if program.rotation else "quaternions"
     said = f"{path}: {len(rows)} points read as {program.maker}'s: mm, {how}"
     if program.rotation == "ZYZ":  # not among the conventions of three axes
         angles = np.array([row[3:] for _, row in rows], float)
         quaternions = Rotation.from_euler("ZYZ", angles, degrees=True).as_quat()[:, [3, 0, 1, 2]].tolist()
         rows = [(line, [*row[:3], *map(repr, q)]) for (line, row), q in zip(rows, quaternions, strict=True)]
         return ProgramPoints([*_MM, *_QUATERNION], rows, None, (*notes, said))
-    return ProgramPoints(list(program.names), rows, program.rotation or None, (*notes, said))
+    names = [name.replace("_deg", f"_{unit}") for name in program.names]
+    return ProgramPoints(names, rows, program.rotation or None, (*notes, said))
 
 
 def _line(text: str, found: re.Match[str]) -> int:
@@ -290,9 +327,7 @@ def _poses_of_ur(path: Path, written: list[tuple[int, str]]) -> list[tuple[int, 
 
 
 def _points_in(row: str) -> list[dict[str, str]]:
-    """Return the numbers of the points of a line in KUKA's language by their names, without other structures (speeds)."""
-    if _KRL_BESIDE.search(row):
-        return []
+    """Return the numbers of the points of a line in KUKA's language by their names; other structures (speeds) have none."""
     found = (dict(part.split() for part in re.split(r"\s*,\s*", one)) for one in _KRL.findall(row))
     return [point for point in found if _OF_A_POINT & set(point)]
 
