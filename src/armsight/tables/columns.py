@@ -133,7 +133,7 @@ def degree_columns(path: str | Path, rows: list[list[str]]) -> list[list[str]]:
     """Return a table with ``q1_deg ..`` for LeRobot's names of an SO-100's or SO-101's joints, ``shoulder_pan.pos`` ...
 
     LeRobot records degrees or, with ``use_degrees`` off, percent of each joint's range, -100 to 100; its data do not say
-    which. Beyond 100 they are degrees.
+    which. Beyond 100 they are degrees, of which it counts 360 for 4095 of a servo's 4096 counts (0.4.4, motors_bus.py).
 
     Args:
         path: the table's file, for errors.
@@ -159,7 +159,14 @@ def degree_columns(path: str | Path, rows: list[list[str]]) -> list[list[str]]:
             f"{path}: {known[0]} .. {known[-1]}: degrees, or percent of each joint's range? LeRobot's data do not say, and "
             "no value is beyond 100; where use_degrees was on, name the columns q1_deg .. q5_deg, else record with it on"
         )
-    return [[f"q{at[k]}_deg" if k in at else name for k, name in enumerate(head)], *rows[1:]]
+    body = [[_degrees(cell) if k in at else cell for k, cell in enumerate(row)] for row in rows[1:]]
+    return [[f"q{at[k]}_deg" if k in at else name for k, name in enumerate(head)], *body]
+
+
+def _degrees(cell: str) -> str:
+    """Return a cell in LeRobot's degrees in degrees."""
+    value = number(cell)
+    return cell if value is None else repr(value * 4095 / 4096)
 
 
 def _padded(row: list[str], head: list[str]) -> list[str]:

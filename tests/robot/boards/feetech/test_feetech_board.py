@@ -288,7 +288,11 @@ def test_columns_of_lerobot_are_degrees_where_no_percent_can_be():
     rows = [head, ["0.0", "90.5", "1", "2", "3", "-101.5", "30"]]
     read = degree_columns("log.csv", rows)
     assert read[0] == ["t_s", "q3_deg", "q1_deg", "q2_deg", "q4_deg", "q5_deg", "gripper.pos"]
-    assert read[1] == rows[1]
+    counts = np.array([2047.0, -1024, 0, 3, -1155])  # off the middles; LeRobot 0.4.4 writes 360/4095 degrees for each
+    log = [head, ["0.0", *(repr(count * 360 / 4095) for count in counts.tolist()), ""]]
+    read = degree_columns("log.csv", log)
+    assert (read[1][0], read[1][-1]) == ("0.0", "")
+    np.testing.assert_allclose(np.array(read[1][1:-1], float), counts * 360 / 4096, rtol=1e-12)
     with pytest.raises(InputError, match="degrees, or percent of each joint's range"):
         degree_columns("log.csv", [head, ["0.0", "90.5", "1", "2", "3", "-99.5", "300"]])
     with pytest.raises(InputError, match="read are those of one SO-100 or SO-101"):
