@@ -193,6 +193,14 @@ def test_one_camera_of_any_program(tmp_path, name, text):
         ("left: {K: [[1]]}\nright: {K: [[1]]}\n", "camera|K"),
         ("target_type: aprilgrid\n", "Kalibr's target file"),
         ("K: [500, 0, 320, 0, 501, 240, 0, 0, 1]\nD: []\n", "c.yaml: holds no image size"),
+        # mrcal's lenses whose numbers are as many as OpenCV's: STEREOGRAPHIC four, CAHVOR nine
+        *(
+            (
+                f"{{'lensmodel': '{lens}', 'intrinsics': {[600, 600, 320, 240, *more]}, 'imagersize': [640, 480]}}",
+                f"c.yaml: lens {lens} is",
+            )
+            for lens, more in (("LENSMODEL_STEREOGRAPHIC", []), ("LENSMODEL_CAHVOR", [0.01, 0.02, 0.001, -0.1, 0.01]))
+        ),
     ],
 )
 def test_what_is_no_camera_is_named_with_its_file(tmp_path, text, said):

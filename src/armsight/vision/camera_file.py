@@ -317,6 +317,7 @@ def read_cameras(path: str | Path) -> tuple[Camera, Camera]:
         InputError: missing, or not two cameras; the message names the file and the entry.
     """
     from armsight.tables.document import read_document  # not above: YAML takes as long to import as a pair of images
+    from armsight.vision.rigfiles.rigfile import naming
 
     document = read_document(path)
     if not all(isinstance(document.get(side), dict) for side in SIDES):
@@ -325,8 +326,11 @@ def read_cameras(path: str | Path) -> tuple[Camera, Camera]:
             f"{described(document)}"
         )
     own = {"image_size_px": document.get("image_size_px")}
-    left, right = (_named(f"{path}: camera {side}", {**own, **document[side]}) for side in SIDES)
-    return left, right
+    cameras = []
+    for side in SIDES:
+        with naming(f"{path}: camera {side}"):
+            cameras.append(camera_of({**own, **document[side]})[0])
+    return cameras[0], cameras[1]
 
 
 def read_camera(path: str | Path) -> Camera:
@@ -336,29 +340,25 @@ def read_camera(path: str | Path) -> Camera:
         InputError: missing, of two cameras, or none.
     """
     from armsight.tables.document import read_document  # not above: YAML takes as long to import as a pair of images
+    from armsight.vision.rigfiles.rigfile import naming
 
     document = read_document(path)
     inner = [value for value in document.values() if is_camera(value)]
     if not is_camera(document) and len(inner) == 1:
         document = dict(inner[0])
-    if "lensmodel" in document:  # mrcal's intrinsics go on with the distortion
-        numbers = checked(document.get("intrinsics", []), (None,), f"{path}: intrinsics")
-        document |= {"intrinsics": numbers[:4], "distortion": numbers[4:]}
+    if "lensmodel" in document:
+        from armsight.vision.rigfiles.programs import mrcal_entry
+
+        with naming(path):
+            document = dict(mrcal_entry(document))
     if not is_camera(document):
         kind = f"{len(inner)} cameras" if inner else stranger(document) or "no camera"
         raise InputError(
             f"{path}: holds {kind}, expected one: camera_matrix (or K), distortion and image size; there are "
             f"{described(document)}"
         )
-    return _named(f"{path}", document)
-
-
-def _named(where: str, entry: Mapping[str, Any]) -> Camera:
-    """Return the camera of an entry; errors name where it is."""
-    try:
-        return camera_of(entry)[0]
-    except InputError as error:
-        raise InputError(f"{where}: {error}") from None
+    with naming(path):
+        return camera_of(document)[0]
 
 
 #: What is seen in the plain names of a document -> what to say.

@@ -97,7 +97,7 @@ def _mrcal_read(documents: Sequence[Document], paths: Sequence[Path], options: I
     for path, document in zip(paths, documents, strict=True):
         with naming(path):
             name = path.name if path.name not in models else str(path)
-            models[name], entries[name] = document, _mrcal_entry(document)
+            models[name], entries[name] = document, mrcal_entry(document)
 
     def posed(name: str) -> tuple[Array, list[str]]:
         value = models[name].get("rt_cam_ref", models[name].get("extrinsics"))
@@ -107,7 +107,7 @@ def _mrcal_read(documents: Sequence[Document], paths: Sequence[Path], options: I
     return posed_rig(entries, posed, options, paths)
 
 
-def _mrcal_entry(document: Document) -> Mapping[str, Foreign]:
+def mrcal_entry(document: Document) -> Mapping[str, Foreign]:
     """Return a camera's entry under the names of :mod:`~armsight.vision.camera_file`."""
     lens = str(need(document, "lensmodel"))
     if lens not in _LENSES:
