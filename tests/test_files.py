@@ -345,5 +345,9 @@ def test_a_folder_is_for_one_process_of_a_command(tmp_path):
     with alone_in(tmp_path / "live", "live"):
         with pytest.raises(InputError, match="another live uses it: give this one another folder, -o FOLDER"):
             alone_in(tmp_path / "live", "live").__enter__()
-        alone_in(tmp_path / "live", "hub").__enter__()
-    alone_in(tmp_path / "live", "live").__enter__()
+        with pytest.raises(InputError, match="another live uses it"):
+            alone_in(tmp_path / "live", "run").__enter__()
+    assert not (tmp_path / "live").exists()  # nothing came to be in it
+    with alone_in(tmp_path / "live", "hub"):
+        (tmp_path / "live" / "events").touch()
+    assert [each.name for each in (tmp_path / "live").iterdir()] == ["events"]

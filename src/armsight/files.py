@@ -552,7 +552,7 @@ def check_outputs(outputs: Iterable[str | Path | None], inputs: Iterable[str | P
 
 @contextlib.contextmanager
 def alone_in(folder: Path, command: str) -> Iterator[None]:
-    """Keep a folder, which is made, to one process of a command.
+    """Keep a folder, which is made, to one process of any command; a folder that stays empty is removed again.
 
     Raises:
         InputError: another one uses it.
@@ -560,16 +560,29 @@ def alone_in(folder: Path, command: str) -> Iterator[None]:
     import fcntl  # POSIX
 
     folder.mkdir(parents=True, exist_ok=True)
-    with (folder / f"{command}.lock").open("w", encoding="utf-8") as lock:
+    path = folder / "in_use.lock"
+    with path.open("a+", encoding="utf-8") as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if not os.fstat(lock.fileno()).st_nlink:  # the one who ends has just removed it
+                raise BlockingIOError
         except BlockingIOError:
-            raise InputError(f"{folder}: another {command} uses it: give this one another folder, -o FOLDER") from None
+            lock.seek(0)
+            other = lock.read() or command
+            raise InputError(f"{folder}: another {other} uses it: give this one another folder, -o FOLDER") from None
         except OSError as error:  # a file system without locks
             raise InputError(
                 f"{folder}: cannot be kept to one {command}: {error.strerror}: give another folder"
             ) from None
-        yield
+        lock.truncate(0)
+        lock.write(command)
+        lock.flush()
+        try:
+            yield
+        finally:
+            with contextlib.suppress(OSError):
+                path.unlink()
+                folder.rmdir()  # where nothing came to be in it
 
 
 def check_folder(

@@ -21,6 +21,7 @@ from armsight.errors import ArmsightError, DeviceError, InputError
 from armsight.loop.health import HealthFinding
 from armsight.robot.arm_file import open_arm
 from armsight.sim.example_rig import example_rig
+from cli_runs import assert_rejected
 
 BODY = Body("plate", ("A", "B", "C"), np.eye(3))
 
@@ -168,12 +169,22 @@ def test_an_earlier_runs_files_make_room_and_a_strangers_stay(tmp_path):
 
 def test_a_run_of_a_real_arm_is_never_written_over_and_a_simulated_one_is(tmp_path):
     (tmp_path / "summary.json").write_text("{}")
+    with open_folder(tmp_path):  # angles were logged beside a recording: nothing moved
+        (tmp_path / "motion.toml").write_text("")
     with pytest.raises(
         InputError, match="holds an earlier run of an arm; move it away, or name another folder with -o"
     ):
-        open_folder(tmp_path)
+        open_folder(tmp_path).__enter__()
     (tmp_path / "truth.csv").write_text("t_s")
-    open_folder(tmp_path)
+    with open_folder(tmp_path):
+        pass
+
+
+def test_two_runs_into_one_folder_at_the_same_time_are_rejected(tmp_path, armsight):
+    with open_folder(tmp_path / "here"):
+        said = armsight("demo", "--quick", "-o", tmp_path / "here")
+    assert_rejected(said, f"{tmp_path / 'here'}: another run uses it: give this one another folder, -o FOLDER")
+    assert not (tmp_path / "here").exists()
 
 
 def test_what_cannot_make_room_is_named(tmp_path):

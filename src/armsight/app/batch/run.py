@@ -23,7 +23,7 @@ from armsight import __version__
 from armsight.app.batch.work import BatchOptions, Done, work
 from armsight.app.progress import bar
 from armsight.errors import InputError
-from armsight.files import check_folder, parsed_json, read_bytes, read_text, replacing, write_text
+from armsight.files import alone_in, check_folder, parsed_json, read_bytes, read_text, replacing, write_text
 from armsight.robot.arm_file import open_arm
 from armsight.vision.markers.targets import open_body, open_target
 from armsight.vision.sources import open_rig
@@ -149,6 +149,12 @@ def run_batch(batch: Batch, say: Callable[[str], None]) -> BatchDone:
         if name is not None:
             open_one(name)
     check_folder(batch.output, problem="no batch can be written here")
+    with alone_in(batch.output, "batch"):
+        return _run_batch(batch, paths, say)
+
+
+def _run_batch(batch: Batch, paths: dict[str, str], say: Callable[[str], None]) -> BatchDone:
+    """Run a batch whose folder is checked."""
     parts = batch.output / PARTS
     try:
         parts.mkdir(parents=True, exist_ok=True)

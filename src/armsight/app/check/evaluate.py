@@ -78,10 +78,7 @@ def evaluate(attained: Attained) -> CheckResult:
     often, said = _often(rows)
     counts = Counter(row.pose for row in rows)
     if rows and not often and len(counts) < _WIDE:
-        seldom = (
-            f"{len(counts)} poses, none attained {few} times and more (the most: {max(counts.values())}), so there is no "
-            f"repeatability: 30 times are the standard's, or {_WIDE} poses and more once (armsight check plan)"
-        )
+        seldom = f"of {len(counts)} poses none was attained {few} times, the most {max(counts.values())}"
     elif rows and not often:
         p, p_ref, cov, common = _stacked(rows)
         workspace = WorkspaceResult(len(rows), *iso9283.anywhere(p - p_ref, cov, common))
@@ -90,7 +87,12 @@ def evaluate(attained: Attained) -> CheckResult:
     poses, notes = {name: _pose(group) for name, group in often.items()}, [*attained.notes, *said]
     circle = _circle(by_test["circle"], attained.reversals) if by_test["circle"] else None
     if not (poses or workspace or followed or circle):
-        raise InputError("; ".join(["nothing can be evaluated", *([seldom] if seldom else []), *notes]))
+        reasons = [*([seldom] if seldom else []), *notes]
+        more = f"; {len(reasons) - 2} more left out" if len(reasons) > 2 else ""
+        reason = "; ".join(reasons[:2]) + more
+        raise InputError(
+            f"nothing can be evaluated: {reason}; run motions that repeat: armsight check plan writes them"
+        )
     notes += [f"left out: all poses, as none was attained {few} times"] if seldom else []
     ways = _several_ways(often)
     return CheckResult(poses, ways, workspace, _distance(often), _drift(often), followed, circle, notes)

@@ -86,10 +86,9 @@ def run_demo(demo: Demo, *, progress: Progress = lambda line: None) -> Report:
     pairs, handeyes, study_shots = _AMOUNTS[demo.quick]
     unit = None if demo.references is None else the_one(read_references(demo.references), demo.references)
     folder = demo.folder
-    open_folder(folder)
     progress("building the workcell")
     cameras = demo.cameras or (_SLOW_CAMERAS if demo.model in CONTROLLED else _CAMERAS)
-    with _workcell(demo, cameras) as workcell:
+    with open_folder(folder), _workcell(demo, cameras) as workcell:
         own = demo.model != DEFAULT_ARM
         motion = _MOTIONS[demo.quick].read_text(encoding="utf-8")
         if own:

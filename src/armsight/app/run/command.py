@@ -151,11 +151,10 @@ def command(
     unit = None if references is None else the_one(read_references(references), references)
     if references is not None:
         files["references.toml"] = read_text(references)
-    open_folder(output)
     devices = Devices(source_spec, board_spec, arm, target, 1e-3 * sync_ms, sync_led, unit)
     begun = False
     try:
-        with steps() as progress:
+        with open_folder(output), steps() as progress:
             progress("opening the devices")
             with open_devices(devices) as setup:
                 setup = replace(setup, fixed=fixed_targets)
@@ -192,9 +191,9 @@ def _run_logged(
 
     from armsight.app.progress import steps
     from armsight.app.run.angles import read_angles
+    from armsight.app.run.folder import open_folder
     from armsight.app.run.logged import run_logged, summary_lines, write_logged
     from armsight.app.show.messages import colour, weak
-    from armsight.app.show.page import writable_folder
     from armsight.app.show.plotting import require_matplotlib
     from armsight.files import columns_unused
     from armsight.robot.arm_file import open_arm
@@ -207,12 +206,11 @@ def _run_logged(
     angles = read_angles(path, arm)
     if angles.unused:
         click.echo(f"note: {path}: {columns_unused(angles.unused)}", err=True)
-    folder = writable_folder(output, "no run")
-    with contextlib.closing(open_source(source_spec)) as source, steps() as progress:
+    with open_folder(output), contextlib.closing(open_source(source_spec)) as source, steps() as progress:
         result = run_logged(source, rig, target, arm, angles, progress)
         progress("writing and plotting")
-        summary = write_logged(folder, result, {"arm": arm_spec, "board": f"{LOGGED}{path}"})
-    click.echo(json.dumps(summary) if as_json else "\n".join(summary_lines(summary, folder)))
+        summary = write_logged(output, result, {"arm": arm_spec, "board": f"{LOGGED}{path}"})
+    click.echo(json.dumps(summary) if as_json else "\n".join(summary_lines(summary, output)))
     for line in result.weak:
         click.echo(weak(line), err=True, color=colour())
     if result.weak:

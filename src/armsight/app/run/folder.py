@@ -41,7 +41,7 @@ from armsight.app.stream.mcap_file import REFERENCES, RUN_MCAP, LazyMcap, proper
 from armsight.app.stream.streams import open_streams
 from armsight.data import Array, Image, PoseEstimate, Shot
 from armsight.errors import ArmsightError, InputError
-from armsight.files import check_folder, replacing, write_text
+from armsight.files import alone_in, check_folder, replacing, write_text
 from armsight.geometry.pose import left_axes
 from armsight.geometry.rotation import quaternion_wxyz
 from armsight.loop.estimators import Mounting
@@ -289,17 +289,22 @@ def write_shots(folder: Path, shots: Sequence[Shot]) -> None:
         raise InputError(f"{folder}: cannot be written: {error.strerror}") from None
 
 
-def open_folder(folder: Path) -> None:
-    """Check that a run can be written to a folder, before the long work begins; it is not made yet.
+@contextlib.contextmanager
+def open_folder(folder: Path) -> Iterator[None]:
+    """Keep a folder to one run, and check that it can be written there, before the long work begins.
 
     Raises:
-        InputError: it cannot be made or written to, or holds an earlier run of a real arm, or shots that are not of a run.
+        InputError: it cannot be made or written to, holds an earlier run of a real arm, or shots that are not of a run, or
+            another command uses it.
     """
     check_folder(folder, problem="no run can be written here")
-    if (folder / "summary.json").exists() and not (folder / "truth.csv").exists():
+    moved = (folder / "summary.json").exists() and (folder / "motion.toml").exists()
+    if moved and not (folder / "truth.csv").exists():
         raise InputError(f"{folder}: holds an earlier run of an arm; move it away, or name another folder with -o")
     if (folder / _SHOTS).exists() and not (folder / "summary.json").exists():
         raise InputError(f"{folder}: holds shots that are not of an earlier run; choose another folder")
+    with alone_in(folder, "run"):
+        yield
 
 
 def make_room(folder: Path) -> None:
