@@ -27,6 +27,7 @@ reader passes over them: the board and :func:`~armsight.loop.identify.corrected.
 from __future__ import annotations
 
 import difflib
+import logging
 import os
 import xml.etree.ElementTree as ET
 from dataclasses import replace
@@ -47,10 +48,13 @@ from armsight.robot.models import MODELS
 from armsight.robot.urdf.read import parse_urdf, read_urdf
 from armsight.robot.urdf.write import urdf_text
 
+_LOG = logging.getLogger(__name__)
 #: Column of an identified table -> its unit; beta is Hayati's angle.
 _COLUMNS = {"offset": "rad", "d": "m", "a": "m", "alpha": "rad", "beta": "rad"}
 #: Attribute of an arm that identification leaves as it was -> its unit; corrected.toml has them, so that it is a whole arm.
 LIMITS = {"q_min": "rad", "q_max": "rad", "qd_max": "rad_s", "qdd_max": "rad_s2", "qddd_max": "rad_s3", "home": "rad"}
+#: How far corrected.toml puts the tool from the nominal arm's all over the joint limits, RMS, and its sigma; m.
+MOVED = ("tool_moved_m", "sigma_tool_moved_m")
 #: Version of corrected.toml. Version 1, which said no version, had [[cause]] tables and other names of the kinds of
 #: gravity; version 2 had no ranges of the readings and no nominal table.
 VERSION = 3
@@ -227,7 +231,27 @@ def identified_table(path: str | Path, given: dict[str, Any]) -> tuple[Arm, Arra
         source=f"identified: {path}",
         **limits,
     )
+    weak = undetermined(*(float(given.get(key, np.nan)) for key in MOVED))
+    if weak:
+        _LOG.warning("%s: %s", path, weak)
     return arm, at["beta"]
+
+
+def undetermined(moved_m: float, sigma_m: float) -> str:
+    """Return that poses do not determine an arm all over its joint limits, or "" where they do, or where it is not known.
+
+    The nominal arm is off by moved^2 - sigma^2 on the mean, the corrected one by sigma^2: from here on it is no better.
+
+    Args:
+        moved_m: how far the identified arm puts its tool from the nominal one's, RMS over the joint limits, m.
+        sigma_m: sigma of that, m.
+    """
+    if not 2 * sigma_m**2 > moved_m**2:
+        return ""
+    return (
+        f"not determined well enough away from its poses: it moves the tool by {1e3 * moved_m:.1f} mm there, sigma "
+        f"{1e3 * sigma_m:.1f} mm; armsight identify plan chooses more poses"
+    )
 
 
 def joint_numbers(path: str | Path, rows: list[dict[str, Any]], key: str) -> Array:

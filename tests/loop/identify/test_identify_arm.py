@@ -52,6 +52,25 @@ def test_a_worn_arm_is_found_out(scene):
         assert found.value(f"backlash{i + 1}")[0] == pytest.approx(w.backlash[i], abs=np.deg2rad(0.02))
 
 
+def test_what_few_poses_leave_open_elsewhere_is_in_the_sigma_and_is_said(scene, tmp_path, caplog):
+    assert "not determined" not in repr(scene[2])
+    squares = []
+    for seed in (21, 22, 23):
+        w, rng = worn(seed), np.random.default_rng(seed)
+        q, sides = w.nominal.home + rng.uniform(-0.2, 0.2, (14, 6)), rng.choice([-1.0, 1.0], (14, 6))
+        found = identify(w.nominal, w.seen(q, sides, rng))
+        model, q = found.model, rng.uniform(-np.pi, np.pi, (200, 6)).clip(w.nominal.q_min, w.nominal.q_max)
+        T = model.T_rig_base(found.solution.x) @ model.tool_in_base(found.solution.x, q, None)
+        off = np.linalg.norm((T - w.T_rig_body(q, np.zeros((200, 6))))[:, :3, 3], axis=1)
+        squares.append(np.mean(off**2) / found.moved_all_over()[1] ** 2)
+    assert 0.25 < np.mean(squares) < 4.0
+    weak = replace(found, cov=found.cov * (found.moved_all_over()[0] / found.moved_all_over()[1]) ** 2)
+    assert "not determined well enough away from its poses" in repr(weak)
+    Corrected.of(weak).save(tmp_path / "corrected.toml")
+    open_arm(tmp_path / "corrected.toml")
+    assert "corrected.toml: not determined well enough" in caplog.text
+
+
 def test_what_is_observable_alone_is_within_its_sigma(scene):
     w, _, found, _ = scene
     seen = {name: true for name, true in truth_of(w).items() if name not in found.reasons and found.value(name)[1] > 0}

@@ -79,6 +79,7 @@ def test_what_is_written_is_read_with_the_same_corrections(arm, tmp_path):
     arm.save(path)
     back = armsight.open_corrected(path)
     assert back.notes == ()
+    assert back.moved_m == arm.moved_m
     newer = tmp_path / "newer.toml"
     newer.write_text(path.read_text().replace("version = 3", "version = 4"))
     with pytest.raises(InputError, match="corrected arm version 4, this armsight reads up to 3: update armsight"):

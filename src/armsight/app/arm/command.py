@@ -182,7 +182,8 @@ def calibrated(arm_name: str, file: str, output: Path | None, yes: bool, as_json
     a corrected.toml of `armsight identify`, or another arm's file.
     """
     from armsight.app.arm import description
-    from armsight.robot.arm_file import open_arm
+    from armsight.files import read_toml
+    from armsight.robot.arm_file import MOVED, open_arm
     from armsight.robot.calibration_file import difference, read_calibration, with_tool_of, write_calibration
     from armsight.robot.urdf.write import write_urdf
 
@@ -192,7 +193,9 @@ def calibrated(arm_name: str, file: str, output: Path | None, yes: bool, as_json
         _check_written(output, arm_name, file)
     nominal = open_arm(arm_name)
     arm = read_calibration(file, nominal) if file.lower().endswith((".yaml", ".yml", ".conf")) else open_arm(file)
+    sigma_m = None
     if arm.source.startswith("identified:"):
+        sigma_m = read_toml(file).get(MOVED[1])
         arm = replace(with_tool_of(arm, file, nominal), name=f"the corrected {arm.name}")
     if output is not None and output.exists():
         _keep(output, yes)
@@ -203,7 +206,7 @@ def calibrated(arm_name: str, file: str, output: Path | None, yes: bool, as_json
             _note(f"{output} cannot hold the flange's {off}: give them to the tool")
     elif output is not None:
         write_urdf(arm, output)
-    _print(description.difference(nominal, arm, difference(nominal, arm)), as_json)
+    _print(description.difference(nominal, arm, difference(nominal, arm), sigma_m), as_json)
 
 
 @command.command()

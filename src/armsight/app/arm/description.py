@@ -146,8 +146,8 @@ def inverse(arm: Arm, T_base_tool: Array, found: Solutions) -> Shown:
     return {**of, "reachable": reachable, "reason": found.reason, "solutions": solutions, "nearest": nearest}, lines
 
 
-def difference(nominal: Arm, arm: Arm, found: Difference) -> Shown:
-    """Return how far an arm puts its tool from where the nominal one does, and the changes of its table."""
+def difference(nominal: Arm, arm: Arm, found: Difference, sigma_m: float | None) -> Shown:
+    """Return how far an arm puts its tool from where the nominal one does, sigma of that, and the changes of its table."""
     changes = {name: getattr(found, name) for name in ("a_m", "d_m", "alpha_rad", "offset_rad")}
     scaled = np.stack([(1e3 if name.endswith("_m") else np.degrees(1.0)) * each for name, each in changes.items()], 1)
     rows = [
@@ -158,12 +158,17 @@ def difference(nominal: Arm, arm: Arm, found: Difference) -> Shown:
         f"{arm.name} puts its tool {1e3 * found.mean_m:.3f} mm from {nominal.name} on the mean, "
         f"{1e3 * found.most_m:.3f} mm at most, rotated by {np.degrees(found.mean_rad):.3f} deg on the mean, "
         f"{np.degrees(found.most_rad):.3f} deg at most",
-        "(the same joint angles and base; poses all over the joint limits)",
+        "(the same joint angles and base; poses all over the joint limits"
+        + (f"; sigma by the poses identified from: {1e3 * sigma_m:.3f} mm)" if sigma_m is not None else ")"),
         *aligned((("changes", "a mm", "d mm", "alpha deg", "offset deg"), *rows)),
     ]
     if np.isnan(found.a_m).any():
         lines.append("-: axes that were parallel no longer are, or another convention: these rows cannot be compared")
-    values = {"tool_apart_mean_m": found.mean_m, "tool_apart_max_m": found.most_m}
+    values: dict[str, float | None] = {
+        "tool_apart_mean_m": found.mean_m,
+        "tool_apart_max_m": found.most_m,
+        "sigma_tool_apart_m": sigma_m,
+    }
     values |= {"tool_rotated_mean_rad": found.mean_rad, "tool_rotated_max_rad": found.most_rad}
     return {"nominal": nominal.name, "arm": arm.name, **values, "changes": json_of(changes)}, lines
 

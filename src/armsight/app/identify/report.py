@@ -24,6 +24,7 @@ from armsight.loop.identify.backlash import JointBacklash, joint_backlashes
 from armsight.loop.identify.corrected import Corrected, zeros_text
 from armsight.loop.identify.identify import contributions, value_text
 from armsight.loop.identify.selection import PLACEMENT
+from armsight.robot.arm_file import MOVED, undetermined
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -252,6 +253,8 @@ def assess(run: Identification) -> tuple[Grade, str]:
             f"Do not use this identification: the nominal arm of {run.arm.name} predicts as well; take more poses.",
         )
     said = f"the corrected {run.arm.name} is off by {after:.2f} mm where the nominal one is by {before:.2f}"
+    if elsewhere := undetermined(*run.found.moved_all_over()):
+        return "fair", f"Usable near these poses only: there {said}; {elsewhere}."
     weak = [note for note in run.notes if "times as large as predicted" in note or "another state" in note]
     if weak or 2 * after > before:
         why = "read the notes below first" if weak else "a part of the error is of a kind that was not found"
@@ -299,6 +302,7 @@ def _values(run: Identification) -> dict[str, Any]:
         "nominal": run.held_out.nominal.summary(),
         "identified": run.held_out.identified.summary(),
         "residual_over_predicted": run.held_out.residual_over_predicted,
+        **dict(zip(MOVED, found.moved_all_over(), strict=True)),
         "noise_m": noise[0],
         "noise_rad": noise[1] if found.model.full else None,
         "parameters": parameter_rows(run),

@@ -38,11 +38,17 @@ def print_error(text: str) -> None:
 
 
 class _Notes(logging.Handler):
-    """Prints what the library logs as notes on stderr."""
+    """Prints what the library logs as notes on stderr, each once."""
+
+    def __init__(self, level: int) -> None:
+        super().__init__(level)
+        self._said = set[str]()
 
     def emit(self, record: logging.LogRecord) -> None:
         """Print one."""
-        click.echo(f"note: {record.getMessage()}", err=True)
+        if (line := record.getMessage()) not in self._said:
+            self._said.add(line)
+            click.echo(f"note: {line}", err=True)
 
 
 def print_notes() -> None:

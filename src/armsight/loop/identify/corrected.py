@@ -23,7 +23,7 @@ from armsight.geometry.rotation import nearest_rotation, quaternion_wxyz
 from armsight.loop.identify import model as chain
 from armsight.loop.identify.identify import Identified
 from armsight.loop.identify.model import FAST, RIPPLES, SENSOR, Feature, Model, all_features
-from armsight.robot.arm_file import LIMITS, VERSION, file_transform, identified_table, joint_numbers, tilted_urdf
+from armsight.robot.arm_file import LIMITS, MOVED, VERSION, file_transform, identified_table, joint_numbers, tilted_urdf
 from armsight.robot.kinematics.arm import Arm
 
 #: Newton steps to a reading, what counts as there, m and rad, and the step of differences, rad.
@@ -41,12 +41,13 @@ class Corrected(Record):
     model: Model  #: the nominal arm with every parameter
     x: Array  #: (P,) the vector
     sigma: Array  #: (P,) of every parameter, zero where it was not fitted
+    moved_m: tuple[float, float] = (np.nan, np.nan)  #: as :meth:`Identified.moved_all_over`; NaN where it is not known
     notes: tuple[str, ...] = ()  #: what was missing in the file that it was read from, as text
 
     @staticmethod
     def of(found: Identified) -> Corrected:
         """Return what was identified, ready for use."""
-        return Corrected(found.model, found.solution.x, np.sqrt(np.diag(found.cov)))
+        return Corrected(found.model, found.solution.x, np.sqrt(np.diag(found.cov)), found.moved_all_over())
 
     def zeros_rad(self) -> Array:
         """Return by how much each joint is further than it reads at zero (n,), rad, beside the nominal table."""
@@ -123,6 +124,8 @@ def table_text(arm: Corrected) -> str:
         *_toml({"T_rig_base": _pose(model.T_rig_base(x)), "T_base_0": _pose(model.arm.T_base_0)}),
         *_toml({"T_flange_body": _pose(model.T_6_body(x)), "up_base": model.up_base.tolist()}),
     ]
+    if np.isfinite(arm.moved_m).all():
+        lines += _toml(dict(zip(MOVED, arm.moved_m, strict=True)))
     if (model.arm.coupling != np.eye(model.arm.joints)).any():
         lines += _toml({"coupling": model.arm.coupling.tolist()})
     if seen:
@@ -223,7 +226,8 @@ def open_corrected(path: str | Path) -> Corrected:
     numbers = [joint_numbers(path, rows, f"sigma_{key}_{unit}") for key, unit in _UNITS.items()]
     sigma[model.table_at : model.sources_at] = np.stack(numbers, axis=1).ravel()
     x[model.sources_at :], sigma[model.sources_at :] = coefficients
-    return Corrected(model, x, sigma, tuple(notes))
+    moved, sigma_moved = (_finite(path, key, given[key]) if key in given else np.nan for key in MOVED)
+    return Corrected(model, x, sigma, (moved, sigma_moved), tuple(notes))
 
 
 def _error_sources(path: str | Path, given: dict[str, Any]) -> tuple[tuple[Feature, ...], Array]:
