@@ -1,5 +1,7 @@
 """Video files: real AVI files, written by OpenCV with a frame number in the grey of each frame."""
 
+import math
+import struct
 from fractions import Fraction
 
 import av
@@ -119,6 +121,42 @@ def recorded(path, codec, kept, late=0, ticks=1):
             frame.pts, frame.time_base = round(k * ticks) + late, stream.codec_context.time_base
             file.mux(stream.encode(frame))
         file.mux(stream.encode())
+
+
+@pytest.mark.parametrize("suffix", ["mkv", "ts"])
+def test_two_files_of_one_clock_need_not_begin_at_the_same_moment(tmp_path, suffix):
+    left, right, past = (tmp_path / f"{name}.{suffix}" for name in ("left", "right", "past"))
+    for path, first in ((left, 3), (right, 10), (past, 900)):
+        recorded(path, "libx264", range(first, first + 20))  # frame k was recorded at k / 30 s, whatever the file
+    for one, other in ((left, right), (right, left)):
+        source = open_source(f"video:{one},{other}")
+        (note,) = notes_of(source)
+        assert note.startswith(f"{right} begins 0.233 s after {left} by their stamps")
+        found = list(iter(source.read, None))
+        both = [shot for shot in found if shot.problem is None]
+        greys = [[math.ceil(image.mean() / 5) for image in (shot.left, shot.right)] for shot in both]
+        assert greys == [[k, k] for k in range(10, 23)]
+        np.testing.assert_allclose([shot.t_s for shot in both], np.arange(7, 20) / 30, atol=1.1e-3)
+        assert f"{right} has no frame for {left}'s at 0.000 s" in found[0].problem
+    source = open_source(f"video:{left},{past}")
+    assert ", past its end: " in notes_of(source)[0]
+    assert sum(shot.problem is None for shot in iter(source.read, None)) == 20
+
+
+def test_frames_that_an_edit_list_hides_are_no_damage(tmp_path):
+    whole, cut = tmp_path / "whole.mp4", tmp_path / "cut.mp4"
+    recorded(whole, "libx264", range(20))
+    data = whole.read_bytes()
+    at = data.index(b"elst") + 12  # one edit: its duration, ms, and where it begins in the track
+    head, scale = data.index(b"mvhd") + 20, struct.unpack_from(">I", data, data.index(b"mdhd") + 16)[0]
+    duration, begin = struct.unpack_from(">Ii", data, at)
+    assert abs(struct.unpack_from(">I", data, head)[0] - duration) < 2
+    left = struct.pack(">I", duration - round(1e3 * 8 / 30))
+    data = data[:at] + left + struct.pack(">i", begin + 8 * scale // 30) + data[at + 8 :]
+    cut.write_bytes(data[:head] + left + data[head + 4 :])
+    found = shots(f"video:{cut}")
+    assert [shot.problem for shot in found] == [None] * 12
+    assert [math.ceil(shot.left.mean() / 5) for shot in found] == list(range(8, 20))
 
 
 @pytest.mark.parametrize(

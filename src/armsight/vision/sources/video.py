@@ -1,7 +1,9 @@
 """Video files: one for each camera, or one with both images side by side.
 
 In: file names. Out: one shot a frame, with the file's own time stamps. Frames are paired by time stamp, so that a frame
-one recorder dropped costs one shot and does not shift the rest.
+one recorder dropped costs one shot and does not shift the rest. Matroska, MPEG-TS and MP4 with an empty edit hold when a
+file begins, too: two of one clock (of one GStreamer pipeline: matroskamux 1.22) need not begin at the same moment. (OpenCV
+5.0.0 and ffmpeg take both beginnings for 0.)
 
 :class:`Film` decodes by PyAV, which brings FFmpeg with the decoders that cameras and LeRobot use (AV1 among them, which
 opencv-python's wheels open, count and do not decode). A rotation by right angles or a mirroring that was noted for players
@@ -79,6 +81,7 @@ class VideoSource(Source):
                 f"{first.path}: frames of {width}x{height} px have the shape of one picture, and are taken as two of "
                 f"{width // 2}x{height} side by side; two files are video:LEFT,RIGHT",
             )
+        self._odd += _one_clock(first, last)
         self._shots = 0
         self._steps_s: list[float] = []  # between frames of either file, s, sorted
         self._ended = False
@@ -159,9 +162,10 @@ class VideoSource(Source):
         """Return what is wrong with the end of the files; None where nothing is."""
         for file, ok in zip(self._files, grabbed, strict=True):
             if (
-                not ok and file.end_s < file.promised_s - file.period_s
+                not ok and file.end_s - file.late_s < file.promised_s - file.period_s
             ):  # some containers estimate: one frame less is fine
-                return f"{file.path} is damaged or cut short: it ends at {file.end_s:.3f} s of {file.promised_s:.3f} s"
+                ends = f"it ends at {file.end_s - file.late_s:.3f} s of {file.promised_s:.3f} s"
+                return f"{file.path} is damaged or cut short: {ends}"
         if any(grabbed):
             short, long = sorted(self._files, key=lambda file: file.frames)
             return f"{short.path} ends after {short.frames} frames, {long.path} goes on: stopped there"
@@ -182,7 +186,9 @@ class Film:
         size_px: width and height of its images.
         period_s: between two frames, s; infinite where the file does not say.
         promised_s: how long the file says it is, s; an estimate in some containers. (The number of frames that an AVI says
-            is not that of those in it: it counts those that the recorder dropped.)
+            is not that of those in it: it counts those that the recorder dropped; an MP4's those that an edit list hides.)
+        begin_s: when it begins by its own clock, s.
+        late_s: how much later than the times' zero it begins, s.
         frames: how many were decoded.
         undecoded: how many could not be.
         t_s, end_s: when the current frame is shown, from the beginning, and until when, s.
@@ -212,10 +218,11 @@ class Film:
         self.period_s = float(1 / rate) if rate else np.inf
         self._time_base: Fraction = self._stream.time_base or Fraction(1)
         self._start = self._stream.start_time or 0
-        if self._stream.frames and average:
+        self.begin_s, self.late_s = float(self._start * self._time_base), 0.0
+        if self._stream.frames and average and "mp4" not in self._container.format.name:
             self.promised_s = float(self._stream.frames / average)
-        else:  # Matroska's duration counts from zero
-            self.promised_s = (self._container.duration or 0) / 1e6 - float(self._start * self._time_base)
+        else:  # the duration counts from zero
+            self.promised_s = (self._container.duration or 0) / 1e6 - self.begin_s
         self.frames = self.undecoded = 0
         self.t_s = self.end_s = 0.0
         self._frame: VideoFrame | None = None
@@ -250,9 +257,9 @@ class Film:
         if self._frame is None:
             return False
         if self._frame.pts is None:
-            self.t_s = self.frames * self.period_s if self.frames else 0.0
+            self.t_s = self.late_s + (self.frames * self.period_s if self.frames else 0.0)
         else:
-            self.t_s = float((self._frame.pts - self._start) * self._time_base)
+            self.t_s = self.late_s + float((self._frame.pts - self._start) * self._time_base)
         self.end_s = self.t_s + max(self.period_s, float((self._frame.duration or 0) * self._time_base))
         self.frames += 1
         return True
@@ -374,6 +381,21 @@ class _File(Film):
             "show markers twice, or where they never were; record at the camera's own rate, or leave them out: "
             f"{_listed(numbers)}"
         )
+
+
+def _one_clock(first: Film, last: Film) -> tuple[str, ...]:
+    """Make the later of two files begin later, where their own clocks say so and they overlap; return what to say of it."""
+    early, later = sorted((first, last), key=lambda file: file.begin_s)
+    late_s = later.begin_s - early.begin_s
+    if late_s <= early.period_s / 2:
+        return ()
+    if late_s >= early.promised_s:
+        return (f"{later.path} begins {late_s:.3f} s after {early.path}, past its end: their beginnings are paired",)
+    later.late_s = later.t_s = late_s
+    return (
+        f"{later.path} begins {late_s:.3f} s after {early.path} by their stamps, and is paired so; of two clocks: "
+        "ffmpeg -i IN -c copy OUT makes a file begin at 0",
+    )
 
 
 def _listed(numbers: Sequence[int]) -> str:
