@@ -76,3 +76,12 @@ def test_the_topics_are_those_of_the_page(tmp_path):
     for message in bag.messages([name for name, topic in bag.topics.items() if topic.kind in TO_ROS]):
         kind, _ = TO_ROS[message.kind](store.types, message.decode())
         assert kind.replace("/msg/", "/") in PAGE
+
+
+def test_a_fisheye_has_ros_name_in_ros_messages():
+    from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
+    from rosbags.typesys import Stores, get_typestore
+
+    sent = CameraCalibration(distortion_model="kannala_brandt", D=[0.1] * 4, K=[0.0] * 9, R=[0.0] * 9, P=[0.0] * 12)
+    _, info = TO_ROS["foxglove.CameraCalibration"](get_typestore(Stores.ROS2_HUMBLE).types, sent)
+    assert info.distortion_model == "equidistant"  # sensor_msgs/distortion_models.hpp; image_geometry knows no other

@@ -138,6 +138,20 @@ def test_bayer_patterns_of_16_bits_are_those_of_8(tmp_path, pattern):
     np.testing.assert_allclose(sixteen[0].left / 257, eight[0].left, atol=1)
 
 
+@pytest.mark.parametrize(("pattern", "bits"), [("rggb", 8), ("gbrg", 16)])
+def test_a_compressed_mosaic_is_the_image_of_the_raw_one(tmp_path, pattern, bits):
+    """compressed_image_transport gives imencode a mosaic, and "bayer_rggb8; png compressed " as the format."""
+    dtype = np.dtype(f"u{bits // 8}")
+    raw = np.random.default_rng(2).integers(0, np.iinfo(dtype).max, (12, 16), dtype)
+    plain, _ = shots(f"bag:{write_bag(tmp_path / 'raw', 'mcap', sent_as(f'bayer_{pattern}{bits}', raw))}")
+    packed = Pixels(raw, f"bayer_{pattern}{bits}; png compressed ", cv2.imencode(".png", raw)[1].tobytes())
+    sent = [Sent(t, EPOCH_NS + k, packed) for k in (0, STEP_NS) for t in (LEFT, RIGHT)]
+    found, _ = shots(f"bag:{write_bag(tmp_path / 'packed', 'mcap', sent)}")
+    np.testing.assert_array_equal(found[0].left, plain[0].left)
+    assert found[0].left.shape == (12, 16, 3)
+    assert found[0].encoded is None  # the file would be taken for a grey image
+
+
 def test_distances_are_said_to_be_no_picture(tmp_path):
     found, _ = shots(f"bag:{write_bag(tmp_path / 'a', 'sqlite3', sent_as('32FC1', np.zeros((8, 8), np.float32)))}")
     assert found[0].problem.startswith("left image: its 32FC1 holds distances of a depth camera")
@@ -431,7 +445,10 @@ def test_joints_and_transforms_are_streams(tmp_path):
     names = ["b", "a"]
     static = pose(exp_so3(np.array([0.1, 0.2, 0.3])), np.array([0.0, 0.0, 0.5]))
     moving = [pose(exp_so3(np.array([0.0, 0.0, 0.1 * k])), np.array([0.1 * k, 0.0, 0.0])) for k in range(5)]
-    sent = [Sent("/tf_static", EPOCH_NS, Transforms([("tool0", "flange", static)]))]
+    before = pose(np.eye(3), np.array([0.0, 0.0, 0.1]))  # the last static one holds for all times
+    sent = [
+        Sent("/tf_static", EPOCH_NS + k, Transforms([("tool0", "flange", T)])) for k, T in ((0, before), (9, static))
+    ]
     for k, T in enumerate(moving):
         t = EPOCH_NS + k * STEP_NS
         sent += [

@@ -18,6 +18,8 @@ from armsight.vision.sources.bag.reader import Decoded
 
 _Types: TypeAlias = Any
 _Made: TypeAlias = tuple[str, Any]
+#: Foxglove's names of lens models -> ROS's (sensor_msgs/distortion_models.hpp), where they differ.
+_MODELS = {"kannala_brandt": "equidistant"}
 
 
 def ros_name(topic: str) -> str:
@@ -59,8 +61,8 @@ def _info(types: _Types, m: Decoded) -> _Made:
     kind = "sensor_msgs/msg/CameraInfo"
     region = types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
     D, K, R, P = (np.array(values, float) for values in (m.D, m.K, m.R, m.P))
-    header = _header(types, m, m.frame_id)
-    return kind, types[kind](header, m.height, m.width, m.distortion_model, D, K, R, P, 0, 0, region)
+    header, model = _header(types, m, m.frame_id), _MODELS.get(m.distortion_model, m.distortion_model)
+    return kind, types[kind](header, m.height, m.width, model, D, K, R, P, 0, 0, region)
 
 
 def _odometry(types: _Types, m: Decoded) -> _Made:

@@ -4,7 +4,8 @@ In: a :class:`~.reader.Bag`. Out: :class:`BagSource`. The topics are found by ty
 names say which are left and right, or the user does: ``bag:FILE,left=/a/image_raw,right=/b/image_raw``.
 
 Images of sensor_msgs/Image are taken as they are (8 or 16 bits, grey, BGR, RGB with or without alpha, Bayer, YUV 4:2:2 and
-4:2:0), compressed ones are decoded by OpenCV. Distances of depth cameras are no images.
+4:2:0), compressed ones are decoded by OpenCV; ROS's compressed_image_transport compresses Bayer mosaics as they are, and
+says so in the format. Distances of depth cameras are no images.
 """
 
 from __future__ import annotations
@@ -177,7 +178,11 @@ def decoded_image(kind: str, message: Decoded) -> tuple[Image, bytes | None]:
         if "compresseddepth" in str(message.format).lower():
             raise InputError(f"its {message.format} {_NO_PICTURE}")
         data = bytes(message.data)
-        return decoded(data, f"its {message.format or 'compressed'} data"), data
+        image = decoded(data, f"its {message.format or 'compressed'} data")
+        encoding, _, _ = str(message.format).partition(";")  # "bayer_rggb8; jpeg compressed ": it is a mosaic still
+        if encoding.startswith("bayer_") and encoding in _ENCODINGS and image.ndim == 2:
+            return cv2.cvtColor(image, _ENCODINGS[encoding][2] or 0), None
+        return image, data
     if _FLOATING.fullmatch(message.encoding):
         raise InputError(f"its {message.encoding} {_NO_PICTURE}")
     if message.encoding not in _ENCODINGS:

@@ -125,11 +125,17 @@ def _called(name: str, among: Mapping[str, float]) -> str:
 
 
 def read_transforms(bag: Bag) -> dict[str, tuple[str, PoseTrack]]:
-    """Read the transforms of a recording: child frame -> its parent, and its poses in it over time."""
+    """Read the transforms of a recording: child frame -> its parent, and its poses in it over time.
+
+    Of a transform that is sent as static the last one holds at all times, as in tf2.
+    """
     rows: dict[tuple[str, str], list[tuple[float, Array]]] = {}
     for message in bag.messages([topic.name for topic in bag.of_kind(*TRANSFORMS)]):
         for stamp_ns, parent, child, T in _transforms(message.decode()):
-            rows.setdefault((parent, child), []).append(((stamp_ns or message.arrival_ns) / S_NS, T))
+            sent = rows.setdefault((parent, child), [])
+            if message.topic.endswith("tf_static"):
+                sent.clear()
+            sent.append(((stamp_ns or message.arrival_ns) / S_NS, T))
     tree: dict[str, tuple[str, PoseTrack]] = {}
     for (parent, child), poses in rows.items():
         t_s, first = np.unique([t for t, _ in poses], return_index=True)
