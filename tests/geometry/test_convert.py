@@ -70,6 +70,23 @@ def test_ros_has_the_quaternion_as_x_y_z_w():
     np.testing.assert_allclose([q["x"], q["y"], q["z"], q["w"]], pinocchio.Quaternion(T[:3, :3]).coeffs(), atol=1e-15)
 
 
+class ByColumns:
+    """A pose as robodk 6.0.2's Mat: [i, j] is row i, column j, and iterating gives columns; here one without a position."""
+
+    def __init__(self, T):
+        self.rows = T.tolist()
+
+    def __len__(self):
+        return 4
+
+    def __iter__(self):
+        return iter(list(map(list, zip(*self.rows, strict=True))))
+
+    def __getitem__(self, index):
+        row, column = index if isinstance(index, tuple) else (slice(None), index)
+        return np.array(self.rows)[row, column].tolist()
+
+
 @pytest.mark.parametrize(
     ("given", "words"),
     [
@@ -77,6 +94,7 @@ def test_ros_has_the_quaternion_as_x_y_z_w():
         (np.tile(np.eye(4), (3, 1, 1)), "holds 3 transforms; expected one"),
         ((Rotation.identity(), np.zeros(2)), r"expected \(3,\), m"),
         ("pose", "expected a 4x4 matrix"),
+        (ByColumns(np.kron([[1, 0], [0, 0]], [[0.0, -1], [1, 0]]) + np.diag([0, 0, 1.0, 1])), "the list of its rows"),
         (np.diag([1.0, 1.0, -1.0, 1.0]), "no rigid transform"),
         (T.T, "no rigid transform"),
         ((Rotation.identity(), ["a", "b", "c"]), r"needs a translation of numbers: expected \(3,\), m"),

@@ -2,10 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from armsight.errors import InputError
+
+
+def numbers(value: object) -> NDArray[np.float64]:
+    """Return a value as an array of numbers.
+
+    Raises:
+        TypeError: no numbers, or an object that is no sequence and does not say its array: numpy would iterate over it, and
+            robodk's Mat (6.0.2) and USD's Gf.Matrix4d (26.11) come out transposed then.
+    """
+    if not hasattr(value, "__array__") and hasattr(value, "__len__") and not isinstance(value, Sequence):
+        raise TypeError(f"a {type(value).__name__} may be read transposed; give its rows as a list")
+    return np.asarray(value, dtype=np.float64)
 
 
 def checked(value: ArrayLike, shape: tuple[int | None, ...], name: str) -> NDArray[np.float64]:
@@ -20,7 +34,7 @@ def checked(value: ArrayLike, shape: tuple[int | None, ...], name: str) -> NDArr
         InputError: not numeric, another shape, or not finite.
     """
     try:
-        array = np.asarray(value, dtype=np.float64)
+        array = numbers(value)
     except (TypeError, ValueError) as error:
         raise InputError(f"{name} must be numbers: {error}") from None
     if array.ndim != len(shape) or any(s is not None and s != n for s, n in zip(shape, array.shape, strict=True)):

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from armsight.errors import InputError
+from armsight.geometry.check import numbers
 from armsight.geometry.pose import pose
 from armsight.geometry.rotation import Array, from_quaternion_wxyz, quaternion_wxyz
 
@@ -74,7 +75,7 @@ def _is_pair(given: Any) -> bool:  # noqa: ANN401
 def _numbers(given: object) -> Array:
     """Return an array of numbers, an empty one where there are none."""
     try:
-        return np.array(given, dtype=float)
+        return numbers(given).copy()
     except (TypeError, ValueError):
         return np.zeros(0)
 
@@ -105,7 +106,8 @@ def _matrix(given: Any) -> Array:  # noqa: ANN401 - any library's object
     T = _numbers(given)
     if T.shape[-2:] != (4, 4) or T.ndim > 3:
         raise InputError(
-            f"{type(given).__name__}: expected a 4x4 matrix, or a transform of pinocchio, SciPy, spatialmath or ROS"
+            f"{type(given).__name__}: expected a 4x4 matrix, m, as an array or the list of its rows, or a transform of "
+            "pinocchio, SciPy, spatialmath or ROS"
         )
     return T
 
