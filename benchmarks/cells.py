@@ -238,7 +238,7 @@ def counted(folder):
 
 def alarms(days, seed):
     """Print false alarms of 20 healthy cells: white means, and slow motion beside, in some cells three times as much."""
-    from armsight.app.hub.drift import CHANCE, Slopes, drifts
+    from armsight.app.hub.cells import CHANCE, Slopes, drifts
 
     kinds = (("white", 0.0, 1.0), ("moving, 40 s", 2.0, 40.0), ("moving, 5 min", 2.0, 300.0), ("1 h", 2.0, 3600.0))
     for kind, breath, tau_s in kinds:

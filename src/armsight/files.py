@@ -39,6 +39,11 @@ _MB = 1_000_000
 _KINDS = ((stat.S_ISDIR, "a folder"), (stat.S_ISFIFO, "a pipe"), (stat.S_ISSOCK, "a socket"))
 
 
+def natural_key(name: object) -> tuple[tuple[int, str] | tuple[int, int], ...]:
+    """Return a sorting key under which numbers in a path or name count as numbers: left2 before left10."""
+    return tuple((0, int(part)) if part.isdecimal() else (1, part) for part in re.split(r"(\d+)", str(name)) if part)
+
+
 def opened(path: str | Path, most_mb: float | None = None) -> IO[bytes]:
     """Open what must be an ordinary file, for reading; whatever a name leads to, this returns at once.
 

@@ -125,7 +125,11 @@ def test_a_motion_that_shows_no_time_is_rejected():
     first, second = two_tables(rng, 5.0, lambda t: np.zeros((len(t), 3)))
     with pytest.raises(CalibrationError, match="repeats itself"):
         time_between(*periodic)
-    with pytest.raises((CalibrationError, InputError)):
+    with pytest.raises(CalibrationError, match=r"moved by 0\.\d+ mm RMS, .* was at rest"):
         time_between(first, second)
+    f = rng.uniform(0.15, 0.7, (2, 3))
+    moving = [two_tables(rng, 5.0, lambda t, f=f: 0.05 * np.sin(2 * np.pi * f * t[:, None])) for f in f]
+    with pytest.raises(CalibrationError, match="they saw different motions"):
+        time_between(moving[0][0], moving[1][1])
     with pytest.raises(InputError, match="a column t_s is needed"):
         time_between(first, replace(second, t_s=None))

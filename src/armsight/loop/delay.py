@@ -157,7 +157,7 @@ def time_between(first: PoseTable, second: PoseTable) -> Delay:
 
     Raises:
         InputError: tables without times, or too few poses.
-        CalibrationError: the motion does not determine the delay, or repeats itself.
+        CalibrationError: the motion does not determine the delay, or repeats itself; the body was at rest.
     """
     (t_a, p_a), (t_b, p_b) = (_positions(each) for each in (first, second))
     path, fits = CubicSpline(t_a, p_a), list[tuple[float, float, float]]()
@@ -175,6 +175,11 @@ def time_between(first: PoseTable, second: PoseTable) -> Delay:
     if not fits:
         raise InputError(f"the two rigs have fewer than {MIN_MEASUREMENTS} poses of one motion in common")
     (rms, delay, sigma), *rest = sorted(fits)
+    if (moved := float(np.sqrt(np.square(p_b - p_b.mean(axis=0)).sum(axis=1).mean()))) < _ALIKE * rms:
+        raise CalibrationError(
+            f"the body moved by {1e3 * moved:.3g} mm RMS, and at no lag do the rigs agree to half of that: it was at rest, "
+            "or they saw different motions: move it by centimetres before both"
+        )
     if any(other < _ALIKE * rms and abs(late - delay) > _AHEAD_S for other, late, _ in rest):
         raise CalibrationError("the motion repeats itself: move to and fro at different speeds and over different ways")
     if not sigma < MAX_SIGMA_S:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from armsight.errors import InputError
-from armsight.files import DECIMAL_COMMA, TABLE_MB, read_table, read_text
+from armsight.files import DECIMAL_COMMA, TABLE_MB, natural_key, read_table, read_text
 from armsight.tables.lengths import NUMBER, number
 from armsight.tables.nested import BY_COUNT, PACKED, document_rows, is_document, is_packed
 from armsight.tables.programs import program_rows
@@ -144,11 +144,7 @@ def read_cells(path: Path, columns: Mapping[str, str] | Sequence[str] = (), side
 
 def _of_files(path: Path, side: str, whose: str | None) -> Cells:
     """Return the poses of files of one pose each, in the order of the numbers in their names, which name them."""
-
-    def natural(file: Path) -> list[tuple[int, str]]:
-        return [(int(part), "") if part.isdecimal() else (0, part) for part in re.split(r"(\d+)", file.name)]
-
-    files = sorted(path.parent.glob(path.name), key=natural)
+    files = sorted(path.parent.glob(path.name), key=natural_key)
     if not files:
         raise InputError(f"{path}: no such file; quote a glob such as 'poses/pose_*.yaml'")
     each = [_of_file(file, side, whose) for file in files]

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import socket
 import subprocess
 import sys
@@ -182,8 +183,14 @@ def test_a_cell_writes_below_its_own_name_alone(hub_at, cell_at, port, tmp_path,
     cell_at(tmp_path / "other/cells/c/cell.toml")
     cell_at(tmp_path / "keys/cells/a/cell.toml")
     wait(lambda: shown(hub).get("a", {}).get("state"))
+    wait(lambda: len(hub._router.links()) == 2)
+    hub._look_for_names()
+    assert {each["cell"] for each in hub._store.events()} == {"a"}  # a cell that is about to begin is none
+    hub._look_for_names()
     assert set(shown(hub)) == {"a"}
-    assert {each["cell"] for each in hub._store.events()} == {"a"}
+    (found,) = [each for each in hub._store.events() if each["cell"] == "hub"]
+    assert found["kind"] == "rejected"
+    assert re.fullmatch(r"tls/127.0.0.1:\d+ has the key of b and sends under another name: .*", found["text"])
 
 
 def test_a_connection_without_a_key_is_rejected_and_that_is_an_event(port, tmp_path, wait):

@@ -8,8 +8,7 @@ from datetime import UTC, datetime, timedelta
 import numpy as np
 import pytest
 
-from armsight.app.hub.cells import FINDING, LOOK, LOST, WELL, CellView, look_for_drifts, ranked
-from armsight.app.hub.drift import CHANCE, Slopes, drifts
+from armsight.app.hub.cells import CHANCE, FINDING, LOOK, LOST, WELL, CellView, Slopes, drifts, look_for_drifts, ranked
 from armsight.app.hub.keys import make_keys, site_of
 from armsight.app.hub.push import push
 from armsight.app.hub.store import Store
@@ -225,6 +224,11 @@ def test_the_store_keeps_each_event_once_and_finds_it(tmp_path):
     assert [(str(c), str(d), e) for c, d, e in duckdb.sql(query).fetchall()] == [("lab.a", "1970-01-01", 0.05)]
 
 
+def test_numbers_in_names_count_as_numbers():
+    cells = [CellView("lab", f"table-{n}", lost_s=0.0) for n in (10, 2, 1)]
+    assert [each["name"] for each in ranked(cells, 1.0)] == ["table-1", "table-2", "table-10"]
+
+
 def runs(folder):
     for name in ("one", "two"):
         (folder / name).mkdir(parents=True)
@@ -255,6 +259,42 @@ def test_a_push_goes_on_where_it_was(tmp_path):
     again = push(cell, folder, str(store), 100.0, lambda sent: None)
     assert (again.runs, again.files, again.complete_before) == (1, 1, 1)
     assert (there / "run.mcap").read_bytes() == b"one" * 1000
+
+
+def test_a_push_makes_no_bucket(tmp_path, armsight):
+    """As s3fs: makedirs below a bucket that is not there makes it."""
+    import fsspec
+    from fsspec.implementations.memory import MemoryFileSystem
+
+    class Buckets(MemoryFileSystem):
+        protocol, store, pseudo_dirs, root_marker = "buckets", {}, [""], ""
+
+        @classmethod
+        def _strip_protocol(cls, path):
+            return path.removeprefix("buckets://").strip("/")
+
+    fsspec.register_implementation("buckets", Buckets, clobber=True)
+    folder = runs(tmp_path / "runs")
+    said = armsight("hub", "push", folder, "buckets://archvie/x", "--cell", "a")
+    assert_rejected(said, "no 'archvie' is there, or it cannot be reached")
+    assert not Buckets.store
+    Buckets.pseudo_dirs.append("archive")
+    assert armsight("hub", "push", folder, "buckets://archive/x", "--cell", "a", "--json").code == 0
+    assert sum(name.endswith("manifest.json") for name in Buckets.store) == 2
+
+
+def test_clocks_of_two_tables(tmp_path, armsight):
+    t = np.arange(0.0, 12.0, 0.04)
+    p = 0.05 * np.sin(np.outer(t, [2.0, 2.9, 4.1]) + np.arange(3.0))
+    for name, late_s in (("one", 0.0), ("two", 100.25)):
+        rows = [f"{a + late_s:.6f},{x:.9f},{y:.9f},{z:.9f},1,0,0,0" for a, (x, y, z) in zip(t, p, strict=True)]
+        (tmp_path / f"{name}.csv").write_text("\n".join(["t_s,x_m,y_m,z_m,qw,qx,qy,qz", *rows]) + "\n")
+    found = json.loads(armsight("hub", "clocks", tmp_path / "one.csv", tmp_path / "two.csv", "--json").out)
+    assert found["delay_s"] == pytest.approx(100.25, abs=1e-5)
+    said = armsight("hub", "clocks", tmp_path / "one.csv", tmp_path / "two.csv").out
+    assert "two.csv less those of " in said
+    assert "one.csv: +100250.0" in said
+    assert_rejected(armsight("hub", "clocks", tmp_path / "one.csv", tmp_path / "none.csv"), "none.csv", "no such file")
 
 
 def test_a_push_waits_for_its_cell_and_says_what_is_wrong(tmp_path, armsight):

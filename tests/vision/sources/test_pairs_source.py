@@ -9,8 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from armsight.errors import InputError
+from armsight.files import natural_key
 from armsight.vision.sources import FolderSource, PairsSource, open_source
-from armsight.vision.sources.pairs import match, natural_key
+from armsight.vision.sources.pairs import match
 
 
 def shots(source):

@@ -21,7 +21,7 @@ from armsight.app.progress import bar, steps
 from armsight.app.record.recording import record
 from armsight.data import SIDES, Detections, Shot
 from armsight.errors import CalibrationError, InputError
-from armsight.files import unused
+from armsight.files import natural_key, unused
 from armsight.vision.calibrate import MODELS
 from armsight.vision.calibrate.boards import Pair, calibrate_boards, calibrate_recording
 from armsight.vision.calibrate.bodies import calibrate_bodies
@@ -37,7 +37,7 @@ from armsight.vision.markers.calibrated_board import save_board_file
 from armsight.vision.markers.marker import CalibrationBoard
 from armsight.vision.rig import CONTRADICTED
 from armsight.vision.sources import LIVE, Source, notes_of, open_source
-from armsight.vision.sources.pairs import StoredSource, image_files, natural_key, no_files, two_globs
+from armsight.vision.sources.pairs import StoredSource, image_files, no_files, two_globs
 
 #: Fewest markers of a family by which it is named as the one in view; in families of few cells less are chance.
 _LEAST_CODES = 4

@@ -19,10 +19,11 @@ from armsight.app.check.result import (
     JumpResult,
     WorkspaceResult,
 )
-from armsight.app.check.rows import SAME_M, TESTS, Attained, Reversal, Row, first_few, natural, read_rows
+from armsight.app.check.rows import SAME_M, TESTS, Attained, Reversal, Row, first_few, read_rows
 from armsight.app.check.run_folder import attained_in
 from armsight.data import Array
 from armsight.errors import InputError
+from armsight.files import natural_key
 from armsight.loop.iso9283 import poses as iso9283
 from armsight.loop.iso9283.paths import PathMetrics, circle_metrics, path_metrics, plane_axes
 from armsight.loop.iso9283.statistic import Metric
@@ -101,7 +102,7 @@ def evaluate(attained: Attained) -> CheckResult:
 def _often(rows: list[Row]) -> tuple[dict[str, list[Row]], list[str]]:
     """Return the rows of each pose that was attained often enough, and what is said of the others and of outliers."""
     groups = _groups(rows, lambda row: row.pose)
-    often = {name: groups[name] for name in sorted(groups, key=natural) if len(groups[name]) >= iso9283.MIN_POSES}
+    often = {name: groups[name] for name in sorted(groups, key=natural_key) if len(groups[name]) >= iso9283.MIN_POSES}
     rare = [f"left out: {name}, attained too seldom ({len(groups[name])})" for name in groups if name not in often]
     said = first_few(rare, "poses, attained too seldom") if often else []
     return often, said + [note for group in often.values() for note in _outliers(group)]

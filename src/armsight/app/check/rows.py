@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -155,11 +154,6 @@ def _pose(where: str, numbers: dict[str, float], prefix: str) -> Array:
     if not 0.999 < (length := np.linalg.norm(q)) < 1.001:
         raise InputError(f"{where}: quaternion {prefix}qw .. {prefix}qz has length {length:.4g}, not 1")
     return pose(from_quaternion_wxyz(q / length), np.array([numbers[prefix + name] for name in _POSITION]))
-
-
-def natural(name: str) -> list[tuple[int, str]]:
-    """Return a key by which P2 comes before P10."""
-    return [(int(part), "") if part.isdecimal() else (0, part) for part in re.split(r"(\d+)", name)]
 
 
 def first_few(notes: list[str], what: str) -> list[str]:

@@ -21,12 +21,12 @@ from typing import Any
 
 import numpy as np
 
-from armsight.app.check.rows import SAME_M, Attained, Reversal, Row, first_few, natural
+from armsight.app.check.rows import SAME_M, Attained, Reversal, Row, first_few
 from armsight.app.run.report import VERSION
 from armsight.app.run.tracks import ToolTrack, read_track
 from armsight.data import Array, Record
 from armsight.errors import InputError
-from armsight.files import read_json, read_toml, require_version
+from armsight.files import natural_key, read_json, read_toml, require_version
 from armsight.geometry.pose import mean_pose, pose
 from armsight.loop.iso9283.paths import plane_axes
 from armsight.loop.iso9283.poses import MIN_POSES
@@ -264,7 +264,7 @@ def _rests(
     said = [f"left out: {name} approached from {came}, too seldom ({n})" for (name, came), n in rare.items()]
     notes = [f"{unseen} rests were not seen, and are left out"] if unseen else []
     notes += first_few(said, "approaches, too seldom")
-    return sorted(rows, key=lambda row: (natural(row.pose), row.t_s)), notes
+    return sorted(rows, key=lambda row: (natural_key(row.pose), row.t_s)), notes
 
 
 def _rare(visits: dict[tuple[str, str], list[Row]]) -> dict[tuple[str, str], int]:

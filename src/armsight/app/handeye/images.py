@@ -15,6 +15,7 @@ import numpy as np
 
 from armsight.data import Array, Detections, Missed
 from armsight.errors import InputError
+from armsight.files import natural_key
 from armsight.geometry.pose import pose
 from armsight.geometry.rotation import nearest_rotation
 from armsight.loop.handeye.poses import LEVER_M
@@ -31,7 +32,6 @@ from armsight.vision.pose.pnp import body_poses
 from armsight.vision.pose.posefit import PixelObservations, fit_pose
 from armsight.vision.rig import StereoRig
 from armsight.vision.source import Source
-from armsight.vision.sources.pairs import natural_key
 
 #: Fewest images to calibrate a camera from; half: a camera of two views, double: sets of eight are rejected.
 MIN_IMAGES = 5

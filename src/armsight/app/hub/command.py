@@ -34,10 +34,13 @@ _HUB = click.option(
 )
 @click.option("--http", default="127.0.0.1:8730", show_default=True, metavar="HOST:PORT", help="Where the page is.")
 @click.option("--keys", metavar="DIR", type=PATH, help="Folder of the site's keys (armsight hub keys).")
+@click.option("--mqtt", metavar="ADDRESS", help="Publish Sparkplug B to a broker: mqtt[s]://[USER@]HOST[:PORT].")
 @output("DIR", "Folder of events and history.", default="hub")
 @_JSON
 @click.pass_context
-def command(ctx: click.Context, listen: str, http: str, keys: Path | None, output: Path, as_json: bool) -> None:
+def command(
+    ctx: click.Context, listen: str, http: str, keys: Path | None, mqtt: str | None, output: Path, as_json: bool
+) -> None:
     """Show many cells on one page, first the one that needs a look; keep their events and history.
 
     A cell is a command with --stream cell:NAME: measure, run, live, record, replay. It sends who it is, its state once a
@@ -60,7 +63,9 @@ def command(ctx: click.Context, listen: str, http: str, keys: Path | None, outpu
     require("a hub", "cells", "zenoh", "pyarrow")
     check_folder(output, problem="no hub can be kept here")
     host_and_port(http, "--http")
-    hub = Hub(output, endpoint(listen, "--listen"), http, keys, lambda line: click.echo(f"note: {line}", err=True))
+    hub = Hub(
+        output, endpoint(listen, "--listen"), http, keys, lambda line: click.echo(f"note: {line}", err=True), mqtt
+    )
     try:
         if as_json:
             click.echo(json.dumps({"address": hub.pages.address, "listen": listen, "directory": str(output)}))
@@ -122,6 +127,27 @@ def hold_command(cell: str, reason: str, keys: Path, address: str, as_json: bool
         raise ArmsightError(f"{cell} does not hold: {answer or 'it does not answer; stop it there'}")
     if not as_json:
         click.echo(f"{cell} holds")
+
+
+@command.command("clocks")
+@click.argument("first", metavar="POSES", type=PATH)
+@click.argument("second", metavar="OTHERS", type=PATH)
+@_JSON
+def clocks_command(first: Path, second: Path, as_json: bool) -> None:
+    """Say how far two rigs' clocks are apart, by a motion of one body that both measured.
+
+    POSES and OTHERS are tables of poses with times, such as the shots.csv of measure.
+    """
+    from armsight.loop.delay import time_between
+    from armsight.tables.poses import read_pose_table
+
+    found = time_between(*(read_pose_table(each, side="seen") for each in (first, second)))
+    if as_json:
+        click.echo(json.dumps({"delay_s": found.delay_s, "sigma_s": found.sigma_s}))
+    else:
+        click.echo(
+            f"times of {second} less those of {first}: {1e3 * found.delay_s:+.3f} ± {1e3 * found.sigma_s:.3f} ms"
+        )
 
 
 @command.command("push")

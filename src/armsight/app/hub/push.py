@@ -60,11 +60,15 @@ def push(cell: Cell, folder: Path, store: str, rate_mb_s: float, advance: Callab
     )  # no command of this cell may run meanwhile
     try:
         fs, root = fsspec.core.url_to_fs(store)
+        if (bucket := root.partition("/")[0]) and not fs.exists(bucket):  # s3fs would make one of a mistyped name
+            raise InputError(f"{store}: no {bucket!r} is there, or it cannot be reached: is its name right?")
         done, pace = Pushed(), _Pace(rate_mb_s, advance)
         for run in runs:
             day = datetime.fromtimestamp(min(each.stat().st_mtime for each in _files(run)), UTC)
             _push_run(fs, f"{root}/{cell.site}/{day:%Y-%m-%d}/{cell.name}/{run.name}", run, done, pace)
         return done
+    except InputError:
+        raise
     except (ImportError, ValueError) as error:
         raise InputError(f"{store}: {error}") from None
     except Exception as error:  # noqa: BLE001 - a store's library has errors of its own; our own code has its tests

@@ -17,7 +17,7 @@ from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any, TextIO
 
-from armsight.app.hub.keys import sign_hold, site_of
+from armsight.app.hub.keys import HUB, sign_hold, site_of
 from armsight.app.stream.cell_file import ANSWER_S, LONGEST, Cell, endpoint, require_here, zenoh_config
 from armsight.errors import InputError
 
@@ -31,6 +31,8 @@ _REJECTED = re.compile(r"zenoh_link_tls::unicast: (.+?)(?:\. Hint|$)")
 #: What came from a cell: its site, its name, which of its keys, when (s), and the JSON; None of JSON: the token is
 #: gone.
 Heard = tuple[str, str, str, float, Any]
+#: A connection with a cell's key: site and cell of the key, its session, and its address.
+Link = tuple[tuple[str, str], str, str]
 
 
 class Router:
@@ -82,6 +84,11 @@ class Router:
                 if reply.ok is not None and len(reply.ok.payload) < LONGEST:
                     return bytes(reply.ok.payload.to_bytes())
         return b""
+
+    def links(self) -> list[Link]:
+        """Return the connections that have the key of a cell."""
+        named = [(each, str(each.auth_identifier or "").partition(".")) for each in self._session.info.links()]
+        return [((n[0], n[2]), str(each.zid), each.dst) for each, n in named if n[2] not in ("", HUB)]
 
     def close(self) -> None:
         """Stop listening."""

@@ -14,10 +14,10 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
-from armsight.app.hub.cells import CellView, look_for_drifts, number, ranked
-from armsight.app.hub.drift import LOOK_S
+from armsight.app.hub.cells import LOOK_S, CellView, look_for_drifts, number, ranked
 from armsight.app.hub.keys import HUB, site_of
-from armsight.app.hub.router import Heard, Router
+from armsight.app.hub.router import Heard, Link, Router
+from armsight.app.hub.sparkplug import Node, check_address
 from armsight.app.hub.store import FLUSH_S, Store
 from armsight.app.show.http import Answer, Pages, metrics_text
 from armsight.app.stream.cell_file import NAME, STATE_S
@@ -26,16 +26,18 @@ from armsight.app.stream.cell_file import NAME, STATE_S
 _STATE_S = STATE_S / 2
 #: messages that wait at most; half: a burst of 200 cells is dropped, double: more memory.
 _WAITING = 10_000
-#: Metric -> its kind and help; the labels are site and cell.
-METRICS = {
-    "cell_up": ("gauge", "1 while the cell is connected and sends its state"),
-    "cell_need": ("gauge", "how much to look: -1 ended, 0 well, 1 look, 2 drifting, 3 finding, 4 lost"),
-    "cell_error_millimetres": ("gauge", "distance of the points from the body, RMS"),
-    "cell_sigma_millimetres": ("gauge", "standard deviation of the position"),
-    "cell_rate_hertz": ("gauge", "shots a second"),
-    "cell_missed_ratio": ("gauge", "share of shots without a measurement"),
-    "cell_temperature_celsius": ("gauge", "of the hottest motor"),
-    "cell_clock_seconds": ("gauge", "the cell's clock less the hub's"),
+#: Gauge of a cell -> what the page shows of it, and its help; the labels are site and cell.
+_GAUGES = {
+    "cell_up": ("up", "1 while the cell is connected and sends its state"),
+    "cell_need": ("level", "how much to look: -1 ended, 0 well, 1 look, 2 drifting, 3 finding, 4 lost"),
+    "cell_error_millimetres": ("error_mm", "distance of the points from the body, RMS"),
+    "cell_sigma_millimetres": ("sigma_mm", "standard deviation of the position"),
+    "cell_rate_hertz": ("rate_hz", "shots a second"),
+    "cell_missed_ratio": ("missed", "share of shots without a measurement"),
+    "cell_temperature_celsius": ("temperature_c", "of the hottest motor"),
+    "cell_clock_seconds": ("clock_s", "the cell's clock less the hub's"),
+}
+_OF_HUB = {
     "hub_events": ("gauge", "events stored"),
     "hub_dropped_total": ("counter", "states dropped because too many waited"),
 }
@@ -45,13 +47,6 @@ _REJECTED_S = 60.0
 _ASK_AGAIN_S = 10.0
 #: Texts that a cell says of itself.
 _TEXTS = ("armsight", "host", "mode", "arm", "body", "rig_made_utc")
-_OF_STATE = {
-    "cell_error_millimetres": "error_mm",
-    "cell_sigma_millimetres": "sigma_mm",
-    "cell_rate_hertz": "rate_hz",
-    "cell_missed_ratio": "missed",
-    "cell_temperature_celsius": "temperature_c",
-}
 
 
 class Hub:
@@ -62,18 +57,30 @@ class Hub:
         listen: zenoh endpoint for cells.
         http: address of the page.
         keys: folder of the site's keys; None on this computer alone.
+        mqtt: address of a broker that is given Sparkplug B; None: nobody is.
         say: is given a line for what a person should know at once.
 
     Raises:
         InputError: an address is in use or not safe, or nothing can be written.
     """
 
-    def __init__(self, folder: Path, listen: str, http: str, keys: Path | None, say: Callable[[str], None]) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        listen: str,
+        http: str,
+        keys: Path | None,
+        say: Callable[[str], None],
+        mqtt: str | None = None,
+    ) -> None:
+        if mqtt is not None:
+            check_address(mqtt)
         self._say, self._cells = say, dict[tuple[str, str], CellView]()
+        self._mqtt, self._nodes = mqtt, dict[str, Node]()
         self._heard: queue.Queue[Heard] = queue.Queue()
         self._dropped, self._problem = 0, ""
         self._site = None if keys is None else site_of(keys)[0]
-        self._rejected, self._rejected_s = 0, -math.inf
+        self._rejected, self._rejected_s, self._misnamed = 0, -math.inf, set[Link]()
         self._lock = threading.Lock()  # of the cells
         self._cached: tuple[float, bytes] = (0.0, b"")
         self._asking = ThreadPoolExecutor(4, "ask")
@@ -97,16 +104,24 @@ class Hub:
         self.pages.close()
         self._ended.set()
         self._thread.join(10.0)
+        for node in self._nodes.values():
+            node.close()
         self._asking.shutdown(wait=False, cancel_futures=True)
         self._store.close()
 
     def rejected(self, why: str) -> None:
         """Say and keep that a connection was rejected, and how many were since the last time."""
         self._rejected += 1
-        if self._site is None or time.monotonic() - self._rejected_s < _REJECTED_S:
+        if time.monotonic() - self._rejected_s < _REJECTED_S:
             return
         text = f"{self._rejected} connections rejected: no valid key of this site (the last: {why})"
-        self._rejected, self._rejected_s, now = 0, time.monotonic(), time.time()
+        self._rejected, self._rejected_s = 0, time.monotonic()
+        self._reject(text)
+
+    def _reject(self, text: str) -> None:
+        now = time.time()
+        if self._site is None:
+            return
         self._say(text)
         event = {"n": 1, "kind": "rejected", "level": "warning", "text": text, "t": now}
         self._store.add_events(self._site, HUB, {"outbox": str(now), "events": [event]}, now)
@@ -129,7 +144,7 @@ class Hub:
         return n
 
     def _run(self) -> None:
-        flushed = looked = time.monotonic()
+        flushed = looked = published = time.monotonic()
         while not (self._ended.is_set() and self._heard.empty()):
             with suppress(queue.Empty):
                 heard = self._heard.get(timeout=0.2)
@@ -141,6 +156,10 @@ class Hub:
                 looked = time.monotonic()
                 with self._lock:
                     look_for_drifts(self._cells, time.time())
+                self._look_for_names()
+            if self._mqtt is not None and time.monotonic() - published > STATE_S:
+                published = time.monotonic()
+                self._publish(self._mqtt)
             if time.monotonic() - flushed > FLUSH_S:
                 flushed = time.monotonic()
                 self._store.flush()
@@ -148,6 +167,23 @@ class Hub:
                 self._problem = self._store.problem
                 if self._problem:
                     self._say(self._problem)
+
+    def _publish(self, mqtt: str) -> None:
+        """Publish the cells as devices of a node a site."""
+        cells = self.snapshot()["cells"]
+        for site in {cell["site"] for cell in cells} - self._nodes.keys():
+            self._nodes[site] = Node(site, mqtt, self._say)
+        for site, node in self._nodes.items():
+            node.update([cell for cell in cells if cell["site"] == site])
+
+    def _look_for_names(self) -> None:
+        """Reject whoever has the key of a cell and for a minute another name."""
+        links = set(self._router.links())
+        with self._lock:
+            wrong = {each for each in links if each[1] not in self._cells.get(each[0], CellView("", "")).sessions}
+        for (_, name), _, address in sorted(wrong & self._misnamed):
+            self._reject(f"{address} has the key of {name} and sends under another name: correct its cell.toml")
+        self._misnamed = wrong
 
     def _take(self, heard: Heard) -> None:
         site, name, what, at_s, content = heard
@@ -226,15 +262,12 @@ class Hub:
 
     def _metrics(self, _: dict[str, str]) -> Answer:
         found = self.snapshot()
-        rows: dict[str, dict[str, float]] = {name: {} for name in METRICS}
-        for cell in found["cells"]:
-            labels = f'{{site="{cell["site"]}",cell="{cell["name"]}"}}'
-            rows["cell_up"][labels] = float(cell["alive_s"] is not None and cell["level"] < 4)
-            rows["cell_need"][labels] = cell["level"]
-            values = {name: cell["state"].get(key) for name, key in _OF_STATE.items()}
-            values |= {"cell_clock_seconds": cell["clock_s"]}
-            for name, value in values.items():
-                if value is not None:
-                    rows[name][labels] = value
-        rows["hub_events"][""], rows["hub_dropped_total"][""] = found["events"], found["dropped"]
-        return 200, "text/plain; version=0.0.4", metrics_text(METRICS, rows)
+        rows = {"hub_events": {"": float(found["events"])}, "hub_dropped_total": {"": float(found["dropped"])}}
+        for name, (key, _help) in _GAUGES.items():
+            rows[name] = {
+                f'{{site="{cell["site"]}",cell="{cell["name"]}"}}': float(value)
+                for cell in found["cells"]
+                if (value := {**cell["state"], **cell}.get(key)) is not None
+            }
+        metrics = {gauge: ("gauge", text) for gauge, (_, text) in _GAUGES.items()} | _OF_HUB
+        return 200, "text/plain; version=0.0.4", metrics_text(metrics, rows)

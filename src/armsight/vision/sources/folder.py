@@ -15,8 +15,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from armsight.errors import InputError
-from armsight.files import read_text
-from armsight.vision.sources.pairs import IMAGES, StoredPair, StoredSource, halves, match, names_of, natural_key
+from armsight.files import natural_key, read_text
+from armsight.vision.sources.pairs import IMAGES, StoredPair, StoredSource, halves, match, names_of
 
 #: The index of a recording, and its columns; t_s is empty where the source has no clock, left and right where the shot
 #: has a problem.

@@ -20,6 +20,7 @@ import numpy as np
 
 from armsight.data import Image, Shot
 from armsight.errors import InputError
+from armsight.files import natural_key
 from armsight.vision.image import read_image
 from armsight.vision.source import Source
 
@@ -162,11 +163,6 @@ def split_names(text: str, is_there: Callable[[str], bool]) -> tuple[str, str] |
     there = [split for split in splits if all(map(is_there, split))] if len(splits) > 1 else []
     middle = splits[len(splits) // 2 : len(splits) // 2 + len(splits) % 2]
     return next((split for split in (there if len(there) == 1 else middle) if all(split)), None)
-
-
-def natural_key(path: Path) -> tuple[tuple[int, str] | tuple[int, int], ...]:
-    """Return a sorting key under which numbers in a path count as numbers: left2 before left10."""
-    return tuple((0, int(part)) if part.isdecimal() else (1, part) for part in re.split(r"(\d+)", str(path)) if part)
 
 
 def match(lefts: Iterable[Path], rights: Iterable[Path], said_left: str, said_right: str) -> tuple[StoredPair, ...]:

@@ -14,7 +14,7 @@ import struct
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from armsight.vision.sources.pairs import natural_key
+from armsight.files import natural_key
 
 #: request number -> how many bytes; videodev2.h's _IOWR('V', n, struct ...).
 QUERYCAP, ENUM_FMT, ENUM_FRAMESIZES, ENUM_FRAMEINTERVALS = 0x80685600, 0xC0405602, 0xC02C564A, 0xC034564B
