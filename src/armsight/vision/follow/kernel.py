@@ -435,7 +435,7 @@ def _seek(
     code = NOT_THERE
     low = _surround(image, x, y, shape)
     if sign * (image[y, x] - low) >= least:
-        code = outline(image, x, y, int(low), sign, theta, room, half_chord)
+        code = outline(image, x, y, int(low), sign, theta, room, half_chord, 0.0)
         if code == 0 and (theta[0] - uv[0]) ** 2 + (theta[1] - uv[1]) ** 2 <= margin * margin:
             return 0
     # Not there: of the pixels in the window that differ from the surround by half the contrast, the nearest one.
@@ -451,7 +451,7 @@ def _seek(
     if x1 < 0:
         return code
     low = _surround(image, x1, y1, shape)
-    code = outline(image, x1, y1, int(low), sign, theta, room, half_chord)
+    code = outline(image, x1, y1, int(low), sign, theta, room, half_chord, 0.0)
     if code == 0 and (theta[0] - uv[0]) ** 2 + (theta[1] - uv[1]) ** 2 > margin * margin:
         return NOT_THERE
     return code

@@ -20,7 +20,6 @@ from armsight.kernels import kernel
 from armsight.vision.markers.disc.common import FIELDS, SHARED, common, correct
 from armsight.vision.markers.disc.fit import (
     MOST_DISCS,
-    NOT_UNIFORM,
     PARAMETERS,
     REASONS,
     SURROUND,
@@ -35,7 +34,7 @@ from armsight.vision.markers.disc.fit import (
     shape_of,
 )
 from armsight.vision.markers.disc.fit import workspace as workspace_of_fits
-from armsight.vision.markers.disc.search import Grey, Room, Words64, noise_of, search, workspace
+from armsight.vision.markers.disc.search import OUTLINED, Grey, Room, Words64, noise_of, search, workspace
 from armsight.vision.markers.discs import copies, enlarged
 
 #: Directions in which the contrast at a rim is compared, and how many must have this share of the median contrast.
@@ -113,7 +112,7 @@ def _outlines(
     n, _ = search(image, words, noise_of(image), bright, dark, starts, codes, signs, room)
     across, good = np.empty(_RAYS), 0
     for i in range(n):
-        if codes[i] not in (0, NOT_UNIFORM):
+        if codes[i] != 0 and codes[i] not in OUTLINED:
             continue
         found, _ = _rim_contrast(image, starts[i], signs[i], across)
         if found > 0.0:

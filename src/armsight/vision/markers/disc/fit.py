@@ -731,7 +731,7 @@ REASONS = {
     10: "its surround is not uniform: text, a ring, a square of a board",
     11: "a duplicate of another disc",
 }
-NOT_UNIFORM, FOUND_TWICE = 10, 11
+FAINT, HILLY, NOT_UNIFORM, FOUND_TWICE = 6, 8, 10, 11
 #: Reasons of candidates that have a closed rim, those that look most like a disc first.
 LOOK_ALIKES = (5, 8, 1, 10, 3, 4, 6)
 _MOST_BLUR = 0.8  # of the smaller half axis
@@ -747,7 +747,7 @@ _MOST_RESIDUAL = 0.1
 #: A centre that a textured surround makes less certain than this is rejected, px.
 _MOST_SIGMA_PX = 0.2
 #: Largest variation of the inside beyond the image's noise, as a share of the contrast.
-_UNEVEN = 0.12
+UNEVEN = 0.12
 _LEAST_SNR = 3.0
 
 
@@ -866,7 +866,7 @@ def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, 
     if minor < LEAST_RATIO * major:
         return 4
     if not abs(theta[6]) > _LEAST_SNR * np.sqrt(variance):
-        return 6
+        return FAINT
     excess = np.sqrt(max(variance - noise_sigma * noise_sigma, 0.0)) / abs(theta[6])
     if excess > _MOST_RESIDUAL:
         return NOT_UNIFORM
@@ -877,8 +877,8 @@ def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, 
         return 5
     spread(n, work, sectors[0])
     v_in = sectors[0, 0] * (1.0 + max(-texture, 0.0))
-    if sectors[0, 2] > 10.0 and np.sqrt(max(v_in - noise_sigma * noise_sigma, 0.0)) > _UNEVEN * abs(theta[6]):
-        return 8
+    if sectors[0, 2] > 10.0 and np.sqrt(max(v_in - noise_sigma * noise_sigma, 0.0)) > UNEVEN * abs(theta[6]):
+        return HILLY
     slope_inside(n, theta, x0, y0, variance, work)
     power, information = rim_power(n, theta, x0, y0, variance, work)
     work.shown[0], work.shown[1], work.shown[2] = power, off / max(count, 1), information / variance

@@ -17,10 +17,13 @@ from armsight.data import Array
 from armsight.kernels import kernel
 from armsight.vision.markers.disc.common import common, correct
 from armsight.vision.markers.disc.fit import (
+    FAINT,
     FOUND_TWICE,
+    HILLY,
     LEAST_RATIO,
     NOT_UNIFORM,
     PARAMETERS,
+    UNEVEN,
     FitBuffers,
     factor,
     fit,
@@ -32,6 +35,8 @@ from armsight.vision.markers.disc.fit import (
 #: Longest half chord, px: half of the largest disc of a search, blur and all. Larger ones are searched in smaller copies.
 REACH = 44
 _RAYS = 16
+#: From one ray to the next one followed: those along a stripe, which has no end there, are met early.
+_STRIDE = 5
 _COS = np.cos(2 * np.pi * np.arange(_RAYS) / _RAYS)
 _SIN = np.sin(2 * np.pi * np.arange(_RAYS) / _RAYS)
 
@@ -44,6 +49,11 @@ _LONGER = 2.0
 #: deviation over its mean is at most the third: of discs before strong textures 1 % have 0.25, of their outlines 0.2 % more
 #: than 0.8, of those that a fit rejects 30 to 80 %. At 0.6 a fifth to a half fewer are fitted, and a disc in 3,000 is lost.
 _ACROSS_PX, _ACROSS, _UNEVEN = 1.0, 0.2, 0.8
+#: The ring on which the inside is compared, as a share of the half axes, and the smaller half axis below which it is not,
+#: px: blur reaches it there. Sixteen pixels of noise exceed the third times its variance in one ring of 14,000.
+_INSIDE, _INSIDE_PX, _CHANCE = 0.5, 4.0, 3.0
+#: Reasons of candidates whose ellipse is known.
+OUTLINED = (FAINT, HILLY, NOT_UNIFORM)
 #: Steps from a pixel of a blurred rim onto the disc, at most, and the least difference of grey that is a step.
 _CLIMB, _CLIMB_GREY = 8, 5
 
@@ -192,8 +202,8 @@ def _ellipse(radii: Array, room: Room) -> tuple[float, float, float]:
 
 
 @kernel
-def _uneven(image: Grey, theta: Array) -> float:
-    """Return the standard deviation of the contrast across an ellipse's rim, in sixteen directions, over its mean."""
+def _across(image: Grey, theta: Array) -> tuple[float, float]:
+    """Return the mean contrast across an ellipse's rim, in sixteen directions, and its standard deviation over that."""
     height, width = image.shape
     u0, v0, m11, m12, m22 = theta[0], theta[1], theta[2], theta[3], theta[4]
     minor = 1.0 / np.sqrt(0.5 * (m11 + m22) + np.sqrt(0.25 * (m11 - m22) ** 2 + m12 * m12))
@@ -209,11 +219,31 @@ def _uneven(image: Grey, theta: Array) -> float:
         contrast += image[j, i]
         total += contrast
         square += contrast * contrast
-    return float(np.sqrt(max(_RAYS * square / max(total * total, 1.0) - 1.0, 0.0)))
+    return abs(total) / _RAYS, float(np.sqrt(max(_RAYS * square / max(total * total, 1.0) - 1.0, 0.0)))
 
 
 @kernel
-def outline(image: Grey, x: int, y: int, low: int, sign: int, theta: Array, room: Room, reach: int) -> int:
+def _hilly(image: Grey, noise: float, theta: Array) -> bool:
+    """Whether a ring inside an ellipse varies as no disc's inside may, beyond the noise's chance in sixteen pixels."""
+    height, width = image.shape
+    m11, m12, m22, total, square = theta[2], theta[3], theta[4], 0.0, 0.0
+    if 0.5 * (m11 + m22) + np.sqrt(0.25 * (m11 - m22) ** 2 + m12 * m12) > _INSIDE_PX**-2:
+        return False
+    for k in range(_RAYS):
+        c, s = _COS[k], _SIN[k]
+        radius = _INSIDE / np.sqrt(c * (m11 * c + m12 * s) + s * (m12 * c + m22 * s))
+        i, j = int(theta[0] + radius * c + 0.5), int(theta[1] + radius * s + 0.5)
+        level = np.float64(image[min(max(j, 0), height - 1), min(max(i, 0), width - 1)])
+        total += level
+        square += level * level
+    variance = (square - total * total / _RAYS) / (_RAYS - 1)
+    return bool(variance > _CHANCE * noise * noise + (UNEVEN * theta[6]) ** 2)
+
+
+@kernel
+def outline(
+    image: Grey, x: int, y: int, low: int, sign: int, theta: Array, room: Room, reach: int, least: float
+) -> int:
     """Estimate a disc's ellipse around one of its pixels, as the start of its fit.
 
     Args:
@@ -225,9 +255,10 @@ def outline(image: Grey, x: int, y: int, low: int, sign: int, theta: Array, room
         theta: (10,) filled: centre, M, blur, contrast, base, gradient.
         room: what :func:`workspace` returns.
         reach: longest half chord, px.
+        least: mean contrast across the rim, at least, grey levels.
 
     Returns:
-        0, or the reason why there is no disc (``fit.REASONS``); for NOT_UNIFORM, too, ``theta`` is filled.
+        0, or the reason why there is no disc (``fit.REASONS``); for those of OUTLINED, too, ``theta`` is filled.
     """
     height, width = image.shape
     x, y = _uphill(image, x, y, sign)
@@ -241,7 +272,8 @@ def outline(image: Grey, x: int, y: int, low: int, sign: int, theta: Array, room
     # Half chords at right angles, a and b, have 1 / a^2 + 1 / b^2 of the half axes, and these are at most so unlike.
     longest = across * down / (LEAST_RATIO * np.sqrt(4.0 * (across * across + down * down)))
     reach = min(reach, int(_LONGER * longest) + 3)
-    for k in range(_RAYS):
+    for ray in range(_RAYS):
+        k = _STRIDE * ray % _RAYS
         radii[k] = _ray(image, x, y, k, start, reach, half, sign)
         if radii[k] < 0.0:
             return 9 if radii[k] > -1.5 else 1
@@ -262,7 +294,8 @@ def outline(image: Grey, x: int, y: int, low: int, sign: int, theta: Array, room
     if not sign * theta[6] > 0.0:
         theta[6] = 2.0 * (inside - half)
         theta[7] = half - (inside - half)
-    return NOT_UNIFORM if _uneven(image, theta) > _UNEVEN else 0
+    contrast, uneven = _across(image, theta)
+    return NOT_UNIFORM if uneven > _UNEVEN else FAINT if contrast < least else 0
 
 
 def workspace() -> Room:
@@ -277,6 +310,9 @@ _TOGETHER = 8 * _ROW_STEP
 #: Least contrast, grey levels, and in standard deviations of the noise of a difference.
 LEAST_CONTRAST = 10.0
 _CONTRAST_SIGMAS = 5.0
+#: Of that the mean across a rim, at least: the most blurred disc that a fit accepts shows 0.55. Half: twice as many stripes
+#: of a texture are fitted; double: of discs below 10 standard deviations 4 % are lost.
+_FAINT = 0.5
 #: A candidate this near to the rim of a known disc is that disc, px, unless its contrast is so many times as large: then a
 #: disc lies on something faint.
 _RIM_PX, _FAINTER = 3.0, 4.0
@@ -386,7 +422,7 @@ def _known(x: int, y: int, gap: int, starts: Array, codes: NDArray[np.int64], ce
     n = cells[y >> 3, x >> 3]
     if n < 0:
         return False
-    if codes[n] != 0 and codes[n] != NOT_UNIFORM:
+    if codes[n] != 0 and codes[n] not in OUTLINED:
         return True
     if gap > _FAINTER * abs(starts[n, 6]):
         return False
@@ -476,8 +512,10 @@ def search(
                     if n == len(starts):
                         return n, True  # the rest was not looked at
                     low, signs[n] = int(image[y, x - 8]), sign
-                    codes[n] = outline(image, x, y, low, sign, starts[n], room, REACH)
-                    if codes[n] == 0 or codes[n] == NOT_UNIFORM:
+                    codes[n] = outline(image, x, y, low, sign, starts[n], room, REACH, _FAINT * contrast)
+                    if codes[n] == 0 and _hilly(image, noise, starts[n]):
+                        codes[n] = HILLY
+                    if codes[n] == 0 or codes[n] in OUTLINED:
                         _note(n, starts, mine)
                     else:
                         starts[n, 0], starts[n, 1] = x, y
@@ -505,7 +543,7 @@ def outlines(
 
 @kernel
 def _again(n: int, starts: Array, signs: NDArray[np.int64], cells: NDArray[np.int16]) -> bool:
-    """Whether disc n repeats one of those before it; if not, enter it into its cell of 8 px.
+    """Whether disc n repeats one of those in the cells of 8 px.
 
     Two discs in one cell are not checked for repeats: they are smaller than 5 px then.
     """
@@ -517,7 +555,6 @@ def _again(n: int, starts: Array, signs: NDArray[np.int64], cells: NDArray[np.in
                 continue
             if (starts[m, 0] - starts[n, 0]) ** 2 + (starts[m, 1] - starts[n, 1]) ** 2 < 4.0:
                 return True
-    cells[y, x] = n
     return False
 
 
@@ -545,6 +582,8 @@ def find(
     for i in range(good):
         cells[int(starts[i, 1]) >> 3, int(starts[i, 0]) >> 3] = i
     for i in range(first, n):
+        if codes[i] == 0 and _again(i, starts, signs, cells):
+            codes[i] = FOUND_TWICE
         if codes[i] == 0:
             codes[i] = fit(image, noise, starts[i], cov[good], work)
         if codes[i] != 0:
@@ -556,6 +595,7 @@ def find(
         if _again(good, starts, signs, cells):
             codes[good] = FOUND_TWICE
         else:
+            cells[int(starts[good, 1]) >> 3, int(starts[good, 0]) >> 3] = good
             shape_of(starts[good], shape[good])
             work.discs[good, :] = work.shown
             good += 1
