@@ -147,7 +147,7 @@ def main() -> None:
     board = open_board(spec)
     pairs = [Pair(each.name, board.detect(each.left), board.detect(each.right)) for each in shots[: given.pairs]]
     found = calibrate_boards(board, pairs, (SIZE_PX, SIZE_PX))
-    rig, held = found.rig, found.heldout
+    rig, held = found.rig, found.held_out
     print(f"{spec}, seed {given.seed}: {given.pairs} pairs, held-out epipolar {held.epipolar_rms_px:.3f} px, ", end="")
     print(f"board {1e3 * held.rigid_rms_m:.3f} mm RMS; baseline {1e3 * rig.baseline_m:.3f} mm, ", end="")
     print(f"truth {1e3 * np.linalg.norm(T_LEFT_RIGHT[:3, 3]):.3f}")

@@ -88,8 +88,8 @@ def heldout_beside_opencv() -> None:
         c = calibrate_boards(board, pairs, (size, size))
         left, right = c.rig.left.intrinsics, c.rig.right.intrinsics
         print(
-            f"  {name}: {len(c.pairs)} of {len(pairs)} pairs, epipolar {c.heldout.epipolar_rms_px:.3f} px (pairs' median "
-            f"{np.median(c.errors.epipolar_px):.3f}), board {1e3 * c.heldout.rigid_rms_m:.4f} mm, the board's deviation "
+            f"  {name}: {len(c.pairs)} of {len(pairs)} pairs, epipolar {c.held_out.epipolar_rms_px:.3f} px (pairs' median "
+            f"{np.median(c.errors.epipolar_px):.3f}), board {1e3 * c.held_out.rigid_rms_m:.4f} mm, the board's deviation "
             f"{1e3 * c.deviation_m:.4f} mm, {c.rig.left.model}\n    f {left[0]:.1f} {left[1]:.1f}, {right[0]:.1f} "
             f"{right[1]:.1f} px, baseline {1e3 * c.rig.baseline_m:.2f} mm, radius {1e3 * c.disc_radius_m:.3f} mm\n"
             f"    published: {published}"

@@ -31,11 +31,11 @@ def skews() -> None:
     for left, right in PAIRS:
         pairs = [Pair(f"{k:03d}", seen[left, k], seen[right, k]) for k in range(frames)]
         both = [p for p in pairs if min(len(p.left.ids), len(p.right.ids)) >= CORNERS]
-        plain = calibrate_boards(board, both, (SIZE, SIZE), models=("brown5",)).heldout.epipolar_rms_px
+        plain = calibrate_boards(board, both, (SIZE, SIZE), models=("brown5",)).held_out.epipolar_rms_px
         c = calibrate_recording(board, pairs, np.arange(frames) / RATE_HZ, (SIZE, SIZE), models=("brown5",))
         print(
             f"  cameras {left}, {right}: {len(both)} frames, as simultaneous {plain:.2f}; "
-            f"at one time {c.heldout.epipolar_rms_px:.2f} ({len(c.pairs)} frames); {c.notes[-1]}",
+            f"at one time {c.held_out.epipolar_rms_px:.2f} ({len(c.pairs)} frames); {c.notes[-1]}",
             flush=True,
         )
 

@@ -27,7 +27,7 @@ def main(folder: Path) -> None:
     calibration = calibrate(BOARD, str(folder / "board"), models=("brown5",))
     calibration.rig.save(folder / "rig.json")
 
-    heldout, rig = calibration.heldout, calibration.rig
+    heldout, rig = calibration.held_out, calibration.rig
     print(f"held-out: epipolar {heldout.epipolar_rms_px:.3f} px, board {1e3 * heldout.rigid_rms_m:.3f} mm RMS")
     print(f"baseline {1e3 * rig.baseline_m:.3f} mm, truth {1e3 * truth.rig.baseline_m:.3f} mm")
     for weakness in calibration.weaknesses:

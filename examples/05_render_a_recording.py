@@ -33,7 +33,7 @@ def main(folder: Path, *, small: bool = False) -> None:
     calibration.rig.save(folder / "rig.json")
     print(
         f"{folder}: board and arm rendered; baseline {1e3 * calibration.rig.baseline_m:.3f} mm, "
-        f"truly {1e3 * truth.rig.baseline_m:.3f}; held-out epipolar RMS {calibration.heldout.epipolar_rms_px:.4f} px"
+        f"truly {1e3 * truth.rig.baseline_m:.3f}; held-out epipolar RMS {calibration.held_out.epipolar_rms_px:.4f} px"
     )
 
 

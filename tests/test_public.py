@@ -172,6 +172,15 @@ def test_pictures_to_a_rig_to_a_table(boards):
     assert tuple(columns) == CSV_COLUMNS
     assert columns["shot"] == [shot.shot for shot in table]
     assert pyarrow.table(table).column("z_m").to_pylist() == columns["z_m"].tolist()
+    in_mm = table.columns("mm")
+    np.testing.assert_allclose(in_mm["sigma_z_mm"], 1e3 * columns["sigma_z_m"])
+    assert (set(in_mm) & set(columns), in_mm["shot"]) == ({n for n in columns if not n.endswith("_m")}, columns["shot"])
+    with pytest.raises(ArmsightError, match="lengths are in"):
+        table.columns("cm")
+    with pytest.raises(
+        ArmsightError, match=r"found\.json: is a calibration of cameras \(T_left_right_m\), no table of poses"
+    ):
+        armsight.read_pose_table(boards / "found.json")
     table.write_csv(boards / "poses.csv")
     assert (boards / "poses.csv").read_text().splitlines()[0] == ",".join(CSV_COLUMNS)
     again = armsight.read_pose_table(boards / "poses.csv")

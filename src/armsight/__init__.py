@@ -5,7 +5,7 @@
     target = open_target("plate.toml")                                     # what is on the arm
     for shot in open_source("recording"):
         print(measure(rig, target, shot))                                  # mm, degrees and sigma, or why there is none
-    table = measure_all(rig, target, open_source("recording")).columns()   # for pandas, polars
+    table = measure_all(rig, target, open_source("recording")).columns("mm")   # for pandas, polars
 
 To open: ``open_source`` images or cameras, ``open_board`` a board, ``open_target`` and ``open_body`` what is measured,
 ``StereoRig.load`` a rig, ``open_arm`` an arm, ``open_corrected`` an identified one; ``read_poses`` joint angles with
@@ -14,7 +14,8 @@ To compute: ``calibrate``, ``calibrate_boards``, ``calibrate_bodies`` the pair o
 ``Follower`` the pose of a body; ``handeye`` where rig and body are on the arm; ``identify`` what the arm really is,
 ``validate`` how far off it is on other poses; ``time_between`` the clocks of two rigs; ``budget`` what a rig would measure.
 To exchange: ``as_transform`` reads a transform of pinocchio, SciPy, spatialmath or ROS, ``ros_fields`` writes ROS' fields.
-Records: ``Shot``, ``Body``, ``PoseEstimate`` or ``Missed``, ``Pair``, ``Camera``, ``StereoRig``, ``Arm``, ``Corrected``;
+Records: ``Shot``, ``Body``, ``PoseEstimate`` or ``Missed``, ``Pair``, ``Camera``, ``StereoRig``, ``Arm``, ``Corrected``,
+``Calibration``, ``HandEye`` and ``Identified``, which ``calibrate``, ``handeye`` and ``identify`` return;
 ``Measured`` joint angles with what was measured there, as ``identify`` takes them from arrays.
 Wrong input raises ``ArmsightError``, with what was found, what was expected and what to do.
 
@@ -40,9 +41,10 @@ if TYPE_CHECKING:
     from armsight.errors import ArmsightError
     from armsight.geometry.convert import as_transform, ros_fields
     from armsight.loop.delay import time_between
+    from armsight.loop.handeye.handeye import HandEye
     from armsight.loop.handeye.handeye import calibrate_handeye as handeye
     from armsight.loop.identify.corrected import Corrected, open_corrected
-    from armsight.loop.identify.identify import identify
+    from armsight.loop.identify.identify import Identified, identify
     from armsight.loop.identify.measured import Measured
     from armsight.loop.identify.read import read_poses
     from armsight.loop.identify.validate import validate
@@ -53,6 +55,7 @@ if TYPE_CHECKING:
     from armsight.vision.calibrate.boards import Pair, calibrate_boards
     from armsight.vision.calibrate.bodies import calibrate_bodies
     from armsight.vision.calibrate.images import calibrate
+    from armsight.vision.calibrate.result import Calibration
     from armsight.vision.camera import Camera
     from armsight.vision.follow.follower import Follower
     from armsight.vision.markers.board import open_board
@@ -71,9 +74,12 @@ __all__ = [
     "Arm",
     "ArmsightError",
     "Body",
+    "Calibration",
     "Camera",
     "Corrected",
     "Follower",
+    "HandEye",
+    "Identified",
     "Measured",
     "Missed",
     "Pair",
@@ -111,11 +117,12 @@ _HOME = {
     "calibrate": "armsight.vision.calibrate.images",
     **dict.fromkeys(("Pair", "calibrate_boards"), "armsight.vision.calibrate.boards"),
     "calibrate_bodies": "armsight.vision.calibrate.bodies",
+    "Calibration": "armsight.vision.calibrate.result",
     "Camera": "armsight.vision.camera",
     "Follower": "armsight.vision.follow.follower",
-    "handeye": "armsight.loop.handeye.handeye",
+    **dict.fromkeys(("HandEye", "handeye"), "armsight.loop.handeye.handeye"),
     **dict.fromkeys(("Corrected", "open_corrected"), "armsight.loop.identify.corrected"),
-    "identify": "armsight.loop.identify.identify",
+    **dict.fromkeys(("Identified", "identify"), "armsight.loop.identify.identify"),
     "Measured": "armsight.loop.identify.measured",
     "read_poses": "armsight.loop.identify.read",
     "read_pose_table": "armsight.tables.poses",

@@ -90,7 +90,8 @@ class ByColumns:
 @pytest.mark.parametrize(
     ("given", "words"),
     [
-        (np.eye(3), "expected a 4x4 matrix"),
+        (np.eye(3), "a rotation without a translation: give the pair"),
+        (Rotation.identity(), "a rotation without a translation"),
         (np.tile(np.eye(4), (3, 1, 1)), "holds 3 transforms; expected one"),
         ((Rotation.identity(), np.zeros(2)), r"expected \(3,\), m"),
         ("pose", "expected a 4x4 matrix"),
@@ -117,7 +118,7 @@ def test_what_is_none_is_rejected(given, words):
     ("given", "words"),
     [
         ([T, np.tile(T, (2, 1, 1))], "holds 2 transforms; expected one"),
-        ([Rotation.identity(), Rotation.identity()], "expected a 4x4 matrix"),
+        ([Rotation.identity(), Rotation.identity()], "a rotation without a translation"),
         ([T, np.full((4, 4), np.nan)], "no rigid transform"),
         ([T, 2 * T], "no rigid transform"),
         (np.array([T, 2 * T]), "no rigid transform"),

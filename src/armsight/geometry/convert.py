@@ -104,6 +104,10 @@ def _matrix(given: Any) -> Array:  # noqa: ANN401 - any library's object
         given.as_matrix() if hasattr(given, "as_matrix") else getattr(given, "homogeneous", getattr(given, "A", given))
     )
     T = _numbers(given)
+    if T.shape[-2:] == (3, 3):
+        raise InputError(
+            f"{type(given).__name__}: a rotation without a translation: give the pair (rotation, [x, y, z] in m)"
+        )
     if T.shape[-2:] != (4, 4) or T.ndim > 3:
         raise InputError(
             f"{type(given).__name__}: expected a 4x4 matrix, m, as an array or the list of its rows, or a transform of "

@@ -53,6 +53,7 @@ _ECHO = re.compile(
 )
 #: Suffixes of documents that are text, and of those that are not.
 _TEXTS, PACKED = (".yaml", ".yml", ".json"), (".npy", ".npz", ".mat", ".xml", ".gz")
+_CAMERAS = re.compile(r"'(intrinsics|distortion|camera_?matrix)\w*': ", re.IGNORECASE)
 _MOST_RECORDS = 200_000  # poses of a document, of 40 bytes each; half: the same; double: a hostile list takes 500 MB
 
 
@@ -102,7 +103,10 @@ def _records(path: Path, document: Any, side: str, whose: str | None) -> list[Re
             )
         if groups:
             poses = [key for key, one in groups.items() if not _is_joints(one)]
-            record = dict(groups[_chosen(path, poses or list(groups), side, whose)])
+            chosen = _chosen(path, poses or list(groups), side, whose)
+            if len(items) == 1 and _CAMERAS.search(str(item)) and not any(_score(chosen, each) for each in SIDES):
+                raise InputError(f"{path}: is a calibration of cameras ({chosen}), no table of poses")
+            record = dict(groups[chosen])
             joints = (one for one in groups.values() if poses and _is_joints(one, r"q\d_(deg|rad)"))
             record |= next(joints, {})
             records.append({**record, **({} if name is None else {"name": name}), **_beside(item)})

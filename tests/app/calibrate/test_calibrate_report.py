@@ -129,7 +129,7 @@ def test_every_section_is_there_in_order_and_says_something(written):
 
 
 def test_the_held_out_metrics_stand_beside_the_fits_in_mm_and_px(written, calibration):
-    text, h = page_of(written).text["result"], calibration.heldout
+    text, h = page_of(written).text["result"], calibration.held_out
     for figure in (
         f"{1e3 * h.rigid_rms_m:.3g} mm",
         f"{h.epipolar_rms_px:.3g} px",
@@ -303,7 +303,7 @@ def test_the_assessment_follows_the_held_out_metrics(calibration, changes, grade
     sound = {"epipolar_rms_px": 0.1, "scale_error": 0.0002, "normalised_rms": 1.0}
     fit = changes.get("epipolar_rms_px", 0.1)
     changed = replace(
-        calibration, heldout=replace(calibration.heldout, **{**sound, **changes}), epipolar_rms_px=fit, weaknesses=()
+        calibration, held_out=replace(calibration.held_out, **{**sound, **changes}), epipolar_rms_px=fit, weaknesses=()
     )
     found = assess(changed)
     assert found.grade == grade
@@ -314,8 +314,8 @@ def test_the_assessment_follows_the_held_out_metrics(calibration, changes, grade
 
 
 def test_overfitting_is_reported(calibration):
-    sound = replace(calibration.heldout, epipolar_rms_px=0.28, scale_error=0.0, normalised_rms=1.0)
-    overfitted = replace(calibration, heldout=sound, epipolar_rms_px=0.1, weaknesses=())
+    sound = replace(calibration.held_out, epipolar_rms_px=0.28, scale_error=0.0, normalised_rms=1.0)
+    overfitted = replace(calibration, held_out=sound, epipolar_rms_px=0.1, weaknesses=())
     assert assess(overfitted).grade == "poor"
     assert "take more pairs" in advice(overfitted)[0]
 

@@ -27,7 +27,7 @@ def test_the_true_rig_is_found_within_its_covariance(flat):
     # the held-out pairs say of it (a fifth as many, so twice as vague), is allowed.
     assert c.rig.sigma_px == pytest.approx(0.1, rel=0.12)
     assert c.reprojection_rms_px == pytest.approx(0.1 * np.sqrt(2), rel=0.06)
-    assert 0.9 < c.heldout.normalised_rms < 1.1
+    assert 0.9 < c.held_out.normalised_rms < 1.1
     assert c.pairs == tuple(f"p{n:02d}" for n in range(len(Ts)))
     assert not c.rejected
     assert (c.deviation_m < 1e-15) == flat
@@ -55,7 +55,7 @@ def test_a_bowed_board_is_found_and_taken_out_of_the_cameras():
     flat, shaped = (
         calibrate_boards(board, pairs, SIZES, models=("brown5",), flat=flat, folds=2) for flat in (True, False)
     )
-    assert shaped.heldout.epipolar_rms_px < 0.8 * flat.heldout.epipolar_rms_px
+    assert shaped.held_out.epipolar_rms_px < 0.8 * flat.held_out.epipolar_rms_px
     assert np.linalg.norm(rig_error(shaped.rig, true)[:4]) < 0.3 * np.linalg.norm(rig_error(flat.rig, true)[:4])
     # Size cannot be distinguished from the distance of the cameras: shapes are compared at the same size.
     size = fit_scale(printed, shaped.body.points)
@@ -90,7 +90,7 @@ def test_the_model_is_chosen_on_held_out_error(model, focal_px, tried):
     c = calibrate_boards(board, board_pairs(true, board.body.points, Ts, sigma=0.05), SIZES, models=tried, folds=2)
     assert c.rig.left.model == c.rig.right.model == model
     assert set(c.models) == {tried[0], model}  # others cannot be worth it: their first step promises too little
-    assert c.heldout == c.models[model]
+    assert c.held_out == c.models[model]
     error = rig_error(c.rig, true)
     assert (np.abs(error) < 4.5 * np.sqrt(np.diag(c.rig.cov))).all()
 
@@ -112,8 +112,8 @@ def test_gross_corners_and_a_wrong_pair_are_named_and_cost_nothing():
     assert [note.split(":")[0] for note in c.notes] == ["p02", "p05", "p11"]
     assert all("1 of 108 points of both images dropped" in note for note in c.notes)
     # The pairs' positions in the folds shift by one, so held-out metrics differ a little whatever is done.
-    assert c.heldout.epipolar_rms_px == pytest.approx(best.heldout.epipolar_rms_px, rel=0.03)
-    assert c.heldout.rigid_rms_m == pytest.approx(best.heldout.rigid_rms_m, rel=0.03)
+    assert c.held_out.epipolar_rms_px == pytest.approx(best.held_out.epipolar_rms_px, rel=0.03)
+    assert c.held_out.rigid_rms_m == pytest.approx(best.held_out.rigid_rms_m, rel=0.03)
     assert c.rig.left.intrinsics == pytest.approx(best.rig.left.intrinsics, abs=0.1)
 
 

@@ -47,7 +47,7 @@ def test_large_discs_calibrate_without_bias_and_show_their_radius():
         np.testing.assert_allclose(camera.intrinsics[:2], known.intrinsics[:2], rtol=1e-3)
     assert c.disc_radius_m == pytest.approx(RADIUS_M, rel=1e-3)
     assert c.rig.baseline_m == pytest.approx(true.baseline_m, rel=1e-3)
-    assert c.heldout.epipolar_rms_px < 0.05
+    assert c.held_out.epipolar_rms_px < 0.05
     assert c.reprojection_rms_px < 0.04
     points = [replace(pair, left=replace(pair.left, shape=np.zeros((0, 3)))) for pair in pairs]
     points = [replace(pair, right=replace(pair.right, shape=np.zeros((0, 3)))) for pair in points]

@@ -64,7 +64,7 @@ def test_boards_that_stood_still_have_no_motion():
     true, board, Ts = rig_and_board()
     c = calibrate_boards(board, board_pairs(true, board.body.points, Ts), SIZES, models=("brown5",), folds=2, flat=True)
     assert c.motion is None
-    assert c.heldout.motion_rms_m == c.heldout.motion_rms_rad == 0
+    assert c.held_out.motion_rms_m == c.held_out.motion_rms_rad == 0
     assert not any("synchronised" in w for w in c.weaknesses)
 
 
@@ -88,7 +88,7 @@ def test_a_rippled_lens_is_not_called_unsynchronised():
 
 def test_motion_is_learned_and_stated(moved):
     _, motions, c = moved
-    factor = c.heldout.normalised_rms
+    factor = c.held_out.normalised_rms
     # The far pairs make most of the mean square, which is to be met whatever a pair's weight; a way is seen to
     # 0.05 px * 0.7 m / 450 px / sqrt(54) = 0.01 mm sideways and some five times that along the line of sight.
     assert c.motion.rms_m / factor == pytest.approx(np.sqrt((motions[:, :3] ** 2).mean()), rel=0.15)
@@ -99,7 +99,7 @@ def test_motion_is_learned_and_stated(moved):
     assert not c.rejected
     (said,) = (w for w in c.weaknesses if "synchronised" in w)
     assert f"{1e3 * c.motion.rms_m:.2f} mm" in said
-    assert c.heldout.motion_rms_m * factor == pytest.approx(c.motion.rms_m)
+    assert c.held_out.motion_rms_m * factor == pytest.approx(c.motion.rms_m)
 
 
 def test_the_rig_of_moving_boards_is_within_its_covariance_and_better_than_without(moved, monkeypatch):
@@ -129,7 +129,7 @@ def test_what_is_predicted_for_other_pairs_holds_their_motion(moved):
     )
     assert 0.8 < with_motion < 1.25
     assert without > 2
-    assert 0.8 < c.heldout.normalised_rms < 1.25
+    assert 0.8 < c.held_out.normalised_rms < 1.25
     # Who measures with the rig's file knows of no motion: its noise holds it, as if it were the corners'.
     assert 0.8 < summary(pair_errors(c.rig, board.body.points, rows), 1).normalised_rms < 1.25
 
@@ -227,6 +227,6 @@ def test_the_skew_is_found_from_a_recording():
     assert found is not None, c.notes
     assert abs(found.skew_s - skew_s) < max(4 * found.sigmas[0], 1e-3)
     assert found.sigmas[0] < 1e-3
-    assert c.heldout.epipolar_rms_px < 2 * SIGMA_PX
+    assert c.held_out.epipolar_rms_px < 2 * SIGMA_PX
     assert abs(c.rig.baseline_m - true.baseline_m) < 1e-3
     assert any("do not expose at one time" in note for note in c.notes)

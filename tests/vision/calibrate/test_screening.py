@@ -199,7 +199,7 @@ def test_each_weakness_is_reported_where_it_is_and_only_there(calibration):
     assert not said(c, "exchanged")
     assert not said(c, "the square size")
     large = replace(c.errors, scale=c.errors.scale + 0.03)
-    wrong = replace(c, errors=large, heldout=replace(c.heldout, scale_error=0.03))
+    wrong = replace(c, errors=large, held_out=replace(c.held_out, scale_error=0.03))
     assert said(wrong, "3.00% too large")
     assert said(replace(c, rig=replace(c.rig, cov=900 * c.rig.cov)), "the focal length is known to")
 

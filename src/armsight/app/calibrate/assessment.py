@@ -167,7 +167,7 @@ def _grade(value: float, limits: tuple[float, float]) -> Grade:
 
 def graded_metrics(calibration: Calibration) -> tuple[GradedMetric, ...]:
     """Return the held-out metrics of a calibration with their grades, the most important first."""
-    c, h, fit, before = calibration, calibration.heldout, calibration.epipolar_rms_px, calibration.solution.sigma_px
+    c, h, fit, before = calibration, calibration.held_out, calibration.epipolar_rms_px, calibration.solution.sigma_px
     distance, what, deviation_mm = distance_m(c), target(c), 1e3 * c.deviation_m
     large = max(1.0, max(max(camera.image_size_px) for camera in c.rig.cameras) / LARGE_PX)
     epipolar = (large * EPIPOLAR_PX[0], large * EPIPOLAR_PX[1])
@@ -236,7 +236,7 @@ def advice(calibration: Calibration) -> tuple[str, ...]:
 
 def assess(calibration: Calibration) -> CalibrationAssessment:
     """Return the assessment of a calibration: poor if a metric is, fair if there is advice, else good."""
-    h, rig, points = calibration.heldout, calibration.rig, len(advice(calibration))
+    h, rig, points = calibration.held_out, calibration.rig, len(advice(calibration))
     along = rig.T_left_right[:3, :3].T @ rig.T_left_right[:3, 3] / rig.baseline_m
     baseline_share = float(np.sqrt(along @ rig.cov[-6:-3, -6:-3] @ along)) / rig.baseline_m
     grade: Grade = "fair" if points else "good"

@@ -219,7 +219,7 @@ def _enlargement(vectors: list[Array], length: float, least: float = 1e-9) -> fl
 
 def pairs_figure(calibration: Calibration) -> Figure:
     """Plot the held-out errors of every pair, one bar each; pairs that were not used are named with their reason."""
-    errors, heldout = calibration.errors, calibration.heldout
+    errors, heldout = calibration.errors, calibration.held_out
     order = np.sort(np.argsort(-errors.rigid_m)[:MOST_BARS])
     names = [plain(calibration.pairs[int(errors.pair[k])], 28) for k in order]
     rejected = calibration.rejected[: max(MOST_BARS // 3, MOST_BARS - len(order))]

@@ -71,7 +71,7 @@ def headline_table(calibration: Calibration) -> str:
     meaning = "Error of the fitted model at the points it was fitted to. It does not predict errors in millimetres."
     meaning += "" if calibration.motion is None else f" {MOTION_FITTED}"
     rows.append(("reprojection RMS", "–", f"{calibration.reprojection_rms_px:.3g} px", "", meaning))
-    return table(("", f"held out, {calibration.heldout.folds} folds", "fit", "", "meaning"), rows, "headline")
+    return table(("", f"held out, {calibration.held_out.folds} folds", "fit", "", "meaning"), rows, "headline")
 
 
 def models_table(calibration: Calibration) -> str:
@@ -281,7 +281,7 @@ def _provenance(rig: StereoRig) -> str:
 
 def _printed(calibration: Calibration, output: Path, board_file: Path | None, page: Path | None) -> str:
     """Return what is printed: the held-out errors first, then those of the fit, then what is weak."""
-    c, h, poor = calibration, calibration.heldout, _poor(calibration)
+    c, h, poor = calibration, calibration.held_out, _poor(calibration)
     rows = (
         ("epipolar RMS", f"{h.epipolar_rms_px:.3f} px"),
         ("rigid RMS (shape of the target)", f"{1e3 * h.rigid_rms_m:.3f} mm"),
@@ -354,7 +354,7 @@ def calibration_report(
         "grade": found.grade,
         "poor": _poor(c),
         "fit": {"epipolar_rms_px": c.epipolar_rms_px, "reprojection_rms_px": c.reprojection_rms_px},
-        "heldout": c.heldout,
+        "heldout": c.held_out,
         "models": c.models,
         "baseline_m": c.rig.baseline_m,
         "convergence_deg": c.rig.convergence_deg,

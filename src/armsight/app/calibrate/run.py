@@ -307,7 +307,7 @@ def _one_size(
 
 def provenance(given: dict[str, str], calibration: Calibration) -> dict[str, Any]:
     """Return how the rig was made, as its file records it."""
-    h = calibration.heldout
+    h = calibration.held_out
     return {
         "made_by": f"armsight {importlib.metadata.version('armsight')} calibrate, OpenCV {cv2.__version__}",
         "made_utc": datetime.now(UTC).isoformat(timespec="seconds"),

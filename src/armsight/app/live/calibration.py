@@ -383,7 +383,7 @@ class CalibrationStep(Guided[CalibrationState]):
         """Take in a fit: what it determines, and how good it is."""
         self._result, self._rig = result, result.rig
         self._knowledge = Knowledge.of(result, self.board, self.aim)
-        h, shots, error_m = result.heldout, result.pairs_found, self._knowledge.error_m
+        h, shots, error_m = result.held_out, result.pairs_found, self._knowledge.error_m
         floor = h.rigid_rms_m / h.over_noise_rms if h.over_noise_rms > 0 else float("nan")
         self.learned(shots, Progress(shots, 1e3 * h.rigid_rms_m, 1e3 * floor, 1e3 * error_m))
         for rejected in result.rejected:
@@ -416,7 +416,7 @@ class CalibrationStep(Guided[CalibrationState]):
         with self.lock:
             self._learned(result)
             self.show(rig=str(path), advice=tuple(advice(result)))
-        found, mm = assess(result), 1e3 * result.heldout.rigid_rms_m
+        found, mm = assess(result), 1e3 * result.held_out.rigid_rms_m
         text = f"{found.headline} {mm:.2g} mm RMS on held-out pairs; written to {path}"
         self.say("good" if found.grade == "good" else "hint", text)
         self._changed(rig, path)

@@ -114,43 +114,67 @@ def _transform_of(eye: Eye, name: str, field_name: str, what: str) -> property:
 
 @dataclass(frozen=True, eq=False)
 class HandEye(Record):
-    """A hand-eye calibration: two constant transforms, their covariance, and the error on poses left out of the fit."""
+    """A hand-eye calibration: two constant transforms, their covariance, and the error on poses left out of the fit.
 
-    eye: Eye  #: "to_hand": the rig stands still and the flange carries the body; "in_hand": the other way round
-    T_base_still: Array  #: (4, 4) what stands still, in the base: the rig, or in_hand the body
-    T_flange_held: Array  #: (4, 4) what the flange carries: the body, or in_hand the rig
-    cov: Array  #: (12, 12) covariance of the right tangents of T_base_still and T_flange_held, m and rad
-    scale: float  #: true lengths over those of the measured body; 1 where it was taken as given
-    sigma_scale: float  #: its sigma; zero where it was not fitted
-    #: what is left of the time offset, s, to be added to the eye's times; sigma_step_s its sigma; zero without
+    Attributes:
+        eye: "to_hand": the rig stands still and the flange carries the body; "in_hand": the other way round.
+        T_base_still: (4, 4) what stands still, in the base: the rig, or in_hand the body.
+        T_flange_held: (4, 4) what the flange carries: the body, or in_hand the rig.
+        cov: (12, 12) covariance of the right tangents of T_base_still and T_flange_held, m and rad.
+        scale: true lengths over those of the measured body; 1 where it was taken as given.
+        sigma_scale: its sigma; zero where it was not fitted.
+        step_s: what is left of the time offset, s, to be added to the eye's times; sigma_step_s its sigma; zero
+            without.
+        structure: what is found beside independent errors, as people read it; "robot and camera" if nothing is.
+        sigmas: source -> most probable sigma of one axis, m, rad, s, or a factor.
+        likelihoods: sources -> mean logarithm of the probability density of a pose left out.
+        arm_off: the probability that the arm is not as its model says, by the residuals; 0 where it was not asked.
+        arm_m: what the arm's error moves the body's middle by, RMS of the distance, m.
+        camera_m: what vision's error does, m.
+        held_out: the error on poses left out of the fit, of transforms found as these were, the arm as its model is.
+            Where the links are found to be off (``sigmas`` has them) they go with the true arm, not with the model.
+        held_out_nominal: the same with the mounting that suits the arm's nominal model; another only with links.
+        held_out_geometry: the same as held_out where the arm's error, as the other poses show it, is taken into
+            account: its geometry with ``links``, else its smooth error over its poses; None where it is rather as its
+            model.
+        used: (N,) whether a pose was used, and not taken for a blunder.
+        distance: (N,) Mahalanobis distance of each pose's residual, in units of its expectation.
+        common: (K,) the errors that all poses share (``Poses.common``), as found, in sigmas.
+        common_m: what they move the body's middle by, RMS of the distance, m.
+        leverage: (N,) by which factor a sigma grows where that pose is left out, the worst direction's; 1 unused.
+    """
+
+    eye: Eye
+    T_base_still: Array
+    T_flange_held: Array
+    cov: Array
+    scale: float
+    sigma_scale: float
     step_s: float
     sigma_step_s: float
-    structure: str  #: what is found beside independent errors, as people read it; "robot and camera" if nothing is
-    sigmas: dict[str, float]  #: source -> most probable sigma of one axis, m, rad, s, or a factor
-    likelihoods: dict[str, float]  #: sources -> mean logarithm of the probability density of a pose left out
-    arm_off: float  #: the probability that the arm is not as its model says, by the residuals; 0 where it was not asked
-    arm_m: float  #: what the arm's error moves the body's middle by, RMS of the distance, m
-    camera_m: float  #: what vision's error does, m
-    #: the error on poses left out of the fit, of transforms found as these were, the arm as its model is. Where the
-    #: links are found to be off (``sigmas`` has them) they go with the true arm, not with the model.
+    structure: str
+    sigmas: dict[str, float]
+    likelihoods: dict[str, float]
+    arm_off: float
+    arm_m: float
+    camera_m: float
     held_out: HeldOut
-    held_out_nominal: HeldOut  #: the same with the mounting that suits the arm's nominal model; another only with links
-    #: the same as held_out where the arm's error, as the other poses show it, is taken into account: its geometry with
-    #: ``links``, else its smooth error over its poses; None where it is rather as its model
+    held_out_nominal: HeldOut
     held_out_geometry: HeldOut | None
-    used: NDArray[np.bool_]  #: (N,) whether a pose was used, and not taken for a blunder
-    distance: Array  #: (N,) Mahalanobis distance of each pose's residual, in units of its expectation
-    common: Array  #: (K,) the errors that all poses share (``Poses.common``), as found, in sigmas
-    common_m: float  #: what they move the body's middle by, RMS of the distance, m
-    leverage: Array  #: (N,) by which factor a sigma grows where that pose is left out, the worst direction's; 1 unused
+    used: NDArray[np.bool_]
+    distance: Array
+    common: Array
+    common_m: float
+    leverage: Array
 
     def __repr__(self) -> str:
         """Return the error on poses left out of the fit, and both translations with one sigma, mm."""
         position_m, angle_rad = self.held_out.rms()
         shown = []
-        for k, (name, T) in enumerate((("still", self.T_base_still), ("held", self.T_flange_held))):
-            R, cov = T[:3, :3], self.cov[6 * k : 6 * k + 3, 6 * k : 6 * k + 3]
-            both = zip(1e3 * T[:3, 3], 1e3 * np.sqrt(np.diag(R @ cov @ R.T)), strict=True)
+        for name, T, sigma_mm in zip(
+            ("still", "held"), (self.T_base_still, self.T_flange_held), self.sigma_mm, strict=True
+        ):
+            both = zip(1e3 * T[:3, 3], sigma_mm, strict=True)
             shown.append(f"{name} at {', '.join(f'{x:.2f} +- {sigma:.2f}' for x, sigma in both)} mm")
         return (
             f"HandEye({self.eye}, {int(self.used.sum())} of {len(self.used)} poses; held out {1e3 * position_m:.3f} mm "
@@ -206,6 +230,13 @@ class HandEye(Record):
     T_flange_body = _transform_of("to_hand", "T_flange_body", "T_flange_held", "the body on the flange")
     T_flange_rig = _transform_of("in_hand", "T_flange_rig", "T_flange_held", "the rig on the flange")
     T_base_body = _transform_of("in_hand", "T_base_body", "T_base_still", "the body in the base")
+
+    @property
+    def sigma_mm(self) -> Array:
+        """(2, 3) sigmas of the translations, mm: of T_base_still along the base's axes, T_flange_held the flange's."""
+        R = np.stack([self.T_base_still[:3, :3], self.T_flange_held[:3, :3]])
+        cov = np.stack([self.cov[:3, :3], self.cov[6:9, 6:9]])
+        return np.asarray(1e3 * np.sqrt(np.einsum("kij,kjl,kil->ki", R, cov, R)))
 
     @property
     def sigma_flange(self) -> tuple[float, float]:

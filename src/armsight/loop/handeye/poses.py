@@ -170,10 +170,15 @@ MIN_POSES = 4  # fewest poses: three determine both transforms, and what is left
 
 @dataclass(frozen=True, eq=False)
 class HeldOut(Record):
-    """Prediction errors of poses left out of the fit."""
+    """Prediction errors of poses left out of the fit.
 
-    position_m: Array  #: (N,) distance between the body's middle measured and predicted; NaN where a pose was not used
-    angle_rad: Array  #: (N,) angle between the body's rotations measured and predicted
+    Attributes:
+        position_m: (N,) distance between the body's middle measured and predicted; NaN where a pose was not used.
+        angle_rad: (N,) angle between the body's rotations measured and predicted.
+    """
+
+    position_m: Array
+    angle_rad: Array
 
     def mean(self) -> tuple[float, float]:
         """Return the means, m and rad."""

@@ -36,13 +36,21 @@ _NOMINAL = {key: unit for key, unit in _UNITS.items() if key != "beta"}
 
 @dataclass(frozen=True, eq=False)
 class Corrected(Record):
-    """An identified arm."""
+    """An identified arm.
 
-    model: Model  #: the nominal arm with every parameter
-    x: Array  #: (P,) the vector
-    sigma: Array  #: (P,) of every parameter, zero where it was not fitted
-    moved_m: tuple[float, float] = (np.nan, np.nan)  #: as :meth:`Identified.moved_all_over`; NaN where it is not known
-    notes: tuple[str, ...] = ()  #: what was missing in the file that it was read from, as text
+    Attributes:
+        model: the nominal arm with every parameter.
+        x: (P,) the vector.
+        sigma: (P,) of every parameter, zero where it was not fitted.
+        moved_m: as :meth:`Identified.moved_all_over`; NaN where it is not known.
+        notes: what was missing in the file that it was read from, as text.
+    """
+
+    model: Model
+    x: Array
+    sigma: Array
+    moved_m: tuple[float, float] = (np.nan, np.nan)
+    notes: tuple[str, ...] = ()
 
     @staticmethod
     def of(found: Identified) -> Corrected:

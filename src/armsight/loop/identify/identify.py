@@ -38,24 +38,36 @@ _TABLE = ("offset", "d", "a", "alpha", "beta")
 
 @dataclass(frozen=True, eq=False)
 class Identified(Record):
-    """An identified arm: every number of its table, base and tool, and the error sources that lower the held-out error."""
+    """An identified arm: every number of its table, base and tool, and the error sources that lower the held-out error.
 
-    model: Model  #: the nominal arm with every parameter
-    nominal: Array  #: (P,) base and tool fitted, the rest nominal
-    solution: Solution  #: the fit
-    reasons: Mapping[str, str]  #: name -> why a parameter is not fitted, or what its value shares
-    steps: tuple[SelectionStep, ...]  #: of the forward selection
-    singular_values: Array  #: of the Jacobian of the observable parameters, in units of prior sigmas
-    prior: Array  #: (P,) prior sigmas, those of the error sources as large as the data show them to be
-    #: (P, P) covariance of all that may be off, fitted or not: a fitted number's sigma includes what the error sources
-    #: that were not selected, or hardly show, could still be, and how far leaving them out has moved it.
-    #: ``solution.cov`` is that of the fitted ones, the rest taken for nominal.
+    Attributes:
+        model: the nominal arm with every parameter.
+        nominal: (P,) base and tool fitted, the rest nominal.
+        solution: the fit.
+        reasons: name -> why a parameter is not fitted, or what its value shares.
+        steps: of the forward selection.
+        singular_values: of the Jacobian of the observable parameters, in units of prior sigmas.
+        prior: (P,) prior sigmas, those of the error sources as large as the data show them to be.
+        cov: (P, P) covariance of all that may be off, fitted or not: a fitted number's sigma includes what the error
+            sources that were not selected, or hardly show, could still be, and how far leaving them out has moved it.
+            ``solution.cov`` is that of the fitted ones, the rest taken for nominal.
+        cov_everything: (P, P) covariance of all that may be off in the fit of all of it, ``solution.x - moved``.
+        moved: (P,) fitted numbers less those of the fit of everything that can be observed: what the selection has
+            moved.
+        joint_sigma_rad: (n,) scatter of each joint from pose to pose, rad; zero where the instrument's covariance is
+            not known, because the joints' and the instrument's share cannot be separated then.
+    """
+
+    model: Model
+    nominal: Array
+    solution: Solution
+    reasons: Mapping[str, str]
+    steps: tuple[SelectionStep, ...]
+    singular_values: Array
+    prior: Array
     cov: Array
-    cov_everything: Array  #: (P, P) covariance of all that may be off in the fit of all of it, ``solution.x - moved``
-    #: (P,) fitted numbers less those of the fit of everything that can be observed: what the selection has moved
+    cov_everything: Array
     moved: Array
-    #: (n,) scatter of each joint from pose to pose, rad; zero where the instrument's covariance is not known, because
-    #: the joints' and the instrument's share cannot be separated then
     joint_sigma_rad: Array
 
     def __repr__(self) -> str:

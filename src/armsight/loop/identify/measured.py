@@ -25,22 +25,29 @@ Rows = NDArray[np.bool_] | NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class Measured(Record):
-    """Joint angles, and where the tool was measured at them."""
+    """Joint angles, and where the tool was measured at them.
 
-    q: Array  #: (N, n) joint angles as the joints' sensors read them, rad
-    p_rig: Array  #: (N, K, 3) tracked points, m; K is 1 with full poses (the body's origin)
-    #: (N, 3, 3) rotation of the body in the rig, with full poses; None with points only
+    Attributes:
+        q: (N, n) joint angles as the joints' sensors read them, rad.
+        p_rig: (N, K, 3) tracked points, m; K is 1 with full poses (the body's origin).
+        R_rig_body: (N, 3, 3) rotation of the body in the rig, with full poses; None with points only.
+        cov: (N, M, M) covariance of what was seen; None where not known. Points: M = 3 K, along the rig's axes, m^2.
+            Poses: M = 6, of the right tangent [translation; rotation], as ``PoseEstimate.cov``.
+        approach: (N, n) from which side each joint came to rest: +1 while its angle grew, -1 while it fell, 0 unknown;
+            None where nothing is known.
+        angles_deg: (N, 3) rx, ry, rz as in the file, degrees, where the rotations came as angles; None else.
+        rotation: the convention that these were read in, one of ROTATIONS; "" else.
+        length_m: (N,) distance of the one point from the rig's origin, m, where only that was measured; ``p_rig`` is
+            then unused.
+    """
+
+    q: Array
+    p_rig: Array
     R_rig_body: Array | None = None
-    #: (N, M, M) covariance of what was seen; None where not known. Points: M = 3 K, along the rig's axes, m^2. Poses: M
-    #: = 6, of the right tangent [translation; rotation], as ``PoseEstimate.cov``.
     cov: Array | None = None
-    #: (N, n) from which side each joint came to rest: +1 while its angle grew, -1 while it fell, 0 unknown; None where
-    #: nothing is known
     approach: Array | None = None
-    #: (N, 3) rx, ry, rz as in the file, degrees, where the rotations came as angles; None else
     angles_deg: Array | None = None
-    rotation: str = ""  #: the convention that these were read in, one of ROTATIONS; "" else
-    #: (N,) distance of the one point from the rig's origin, m, where only that was measured; ``p_rig`` is then unused
+    rotation: str = ""
     length_m: Array | None = None
 
     def __post_init__(self) -> None:
@@ -101,11 +108,17 @@ def visits(q: Array) -> NDArray[np.int64]:
 
 
 class Read(NamedTuple):
-    """The contents of a file."""
+    """The contents of a file.
 
-    measured: Measured  #: its good rows
-    lines: Array  #: (N,) the line of the file that each row comes from
-    notes: tuple[str, ...]  #: what was left out, and why, as text
+    Attributes:
+        measured: its good rows.
+        lines: (N,) the line of the file that each row comes from.
+        notes: what was left out, and why, as text.
+    """
+
+    measured: Measured
+    lines: Array
+    notes: tuple[str, ...]
 
     def __repr__(self) -> str:
         """Return how many poses of how many joints there are, and the notes."""

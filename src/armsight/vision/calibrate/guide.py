@@ -106,7 +106,7 @@ class Knowledge(Record):
         state, points = calibration.solution.state, board.body.points
         model = printed_board(points) if len(state.shape) else rigid_board(points)
         model = replace(model, disc_radius_m=calibration.disc_radius_m or 0.0)
-        cov = calibration.solution.cov_shared * calibration.heldout.normalised_rms**2
+        cov = calibration.solution.cov_shared * calibration.held_out.normalised_rms**2
         root = covariance_root(cov)
         variance, points = corner_variance_px2(calibration), working_points(calibration.rig, aim.distance_m)
         goal_m = aim.error_m or noise_m(calibration.rig, points, variance)

@@ -88,7 +88,7 @@ class Calibration(Record):
         observations: the detections that were fitted.
         solution: the adjusted state and residuals.
         epipolar_rms_px: epipolar RMS of the fit, px.
-        heldout: errors on held-out pairs.
+        held_out: errors on held-out pairs.
         errors: the same per pair.
         models: held-out errors of every distortion model that was tried.
         rejected: pairs rejected, and why.
@@ -107,7 +107,7 @@ class Calibration(Record):
     observations: Observations
     solution: BundleSolution
     epipolar_rms_px: float
-    heldout: HeldOutErrors
+    held_out: HeldOutErrors
     errors: PairErrors
     models: dict[str, HeldOutErrors]
     rejected: tuple[RejectedPair, ...]
@@ -119,7 +119,7 @@ class Calibration(Record):
 
     def __repr__(self) -> str:
         """Return the errors on pairs left out of the fit, px and mm."""
-        errors, rig = self.heldout, self.rig
+        errors, rig = self.held_out, self.rig
         return (
             f"Calibration({len(self.pairs)} of {self.pairs_found} pairs; held out {errors.epipolar_rms_px:.3f} px "
             f"epipolar, {1e3 * errors.rigid_rms_m:.3f} mm; {rig.left.model}, baseline {1e3 * rig.baseline_m:.3f} mm; "

@@ -50,7 +50,7 @@ def contradicted(calibration: Calibration) -> bool:
     """
     longest = max(max(camera.image_size_px) for camera in calibration.rig.cameras)
     motion_px = 0.0 if calibration.motion is None else _way_px(calibration, calibration.motion)
-    return calibration.heldout.epipolar_rms_px > max(_CONTRADICTION * longest, _OF_MOTION * motion_px)
+    return calibration.held_out.epipolar_rms_px > max(_CONTRADICTION * longest, _OF_MOTION * motion_px)
 
 
 def _way_px(calibration: Calibration, motion: ExposureMotion) -> float:
@@ -63,9 +63,9 @@ def _agreement(calibration: Calibration) -> str | None:
     if not contradicted(calibration):
         return None
     return (
-        f"the images of both cameras contradict each other by {calibration.heldout.epipolar_rms_px:.0f} px: do not measure "
-        "with this rig. Does a driver mirror the images of one camera, do left and right images belong to different "
-        "moments, or do they show different boards?"
+        f"the images of both cameras contradict each other by {calibration.held_out.epipolar_rms_px:.0f} px: do not "
+        "measure with this rig. Does a driver mirror the images of one camera, do left and right images belong to "
+        "different moments, or do they show different boards?"
     )
 
 
@@ -243,7 +243,7 @@ def _focal(calibration: Calibration) -> str | None:
 def _scale(calibration: Calibration) -> str | None:
     scale = calibration.errors.scale
     spread = float(np.std(scale, ddof=1) / np.sqrt(len(scale))) if len(scale) > 2 else np.inf
-    error = calibration.heldout.scale_error
+    error = calibration.held_out.scale_error
     if abs(error) > max(0.005, _SCALE_SIGMAS * spread):
         return (
             f"held-out boards come out {100 * error:+.2f}% too {'large' if error > 0 else 'small'}: lens and board do "

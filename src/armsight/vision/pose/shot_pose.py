@@ -253,8 +253,17 @@ class ShotPoses:
         """Return the pose of one shot."""
         return self.poses[row]
 
-    def columns(self) -> dict[str, Array | list[str | None]]:
-        """Return the columns by name: (N,) numbers, NaN where a shot was missed; lists of text."""
+    def columns(self, lengths: str = "m") -> dict[str, Array | list[str | None]]:
+        """Return the columns by name: (N,) numbers, NaN where a shot was missed; lists of text.
+
+        Args:
+            lengths: "m", the columns of ``armsight measure -o``; "mm": lengths in mm, as x_mm and sigma_x_mm.
+
+        Raises:
+            InputError: another unit.
+        """
+        if lengths not in ("m", "mm"):
+            raise InputError(f'columns({lengths!r}): lengths are in "m" or "mm"')
         names, rows = rows_of(self.poses)
         found: dict[str, Array | list[str | None]] = {}
         for k, name in enumerate(names):
@@ -264,7 +273,12 @@ class ShotPoses:
                 if k < CSV_COLUMNS.index("t_s")
                 else np.array([math.nan if v is None else v for v in cells], float)
             )
-        return found
+        if lengths == "m":
+            return found
+        return {
+            f"{name}m" if name.endswith("_m") else name: 1e3 * np.asarray(each) if name.endswith("_m") else each
+            for name, each in found.items()
+        }
 
     def write_csv(self, path: str | Path) -> None:
         """Write the file that ``armsight measure -o`` writes.
