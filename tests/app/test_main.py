@@ -1,6 +1,7 @@
 """The command line as a whole: its own errors, its version, what it needs, its colours."""
 
 import importlib.metadata
+import io
 import json
 import os
 import pty
@@ -187,3 +188,12 @@ def test_a_glob_that_the_shell_expanded_is_said_with_retired_options_too(armsigh
     said = armsight("calibrate", "-o", "r", "--target", "b", "--left", "a1", "a2", "--right", "b1", "b2")
     assert said.code == 2
     assert "quote a glob" in said.err
+
+
+def test_a_question_to_a_closed_standard_input_is_one_line(tmp_path, armsight, monkeypatch):
+    monkeypatch.setattr("sys.stdin", io.StringIO(""))
+    (tmp_path / "arm.urdf").write_text("kept")
+    said = armsight("arm", "calibrated", "ur5", "ur5", "-o", tmp_path / "arm.urdf")
+    assert said.code == 2
+    assert "nobody answers, as the standard input is closed" in said.err
+    assert (tmp_path / "arm.urdf").read_text() == "kept"

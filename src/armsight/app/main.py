@@ -17,7 +17,7 @@ import click
 
 from armsight.app.interrupts import terminate_as_interrupt
 from armsight.app.retired import in_todays_options
-from armsight.app.show.messages import colour, print_error, print_notes, silence_stdout
+from armsight.app.show.messages import UNANSWERED, colour, print_error, print_notes, silence_stdout
 from armsight.errors import ArmsightError
 
 #: What a person is about -> the commands, each with the first sentence of its help; each has a folder of its name, whose
@@ -159,7 +159,9 @@ def _run(arguments: list[str], at_exit: list[Callable[[int, str], None]]) -> tup
         if sys.stdout is not None:
             sys.stdout.flush()
         return code if isinstance(code, int) else 0, ""
-    except (click.exceptions.Abort, KeyboardInterrupt):
+    except (click.exceptions.Abort, KeyboardInterrupt) as error:
+        if isinstance(error.__context__, EOFError):
+            return 2, UNANSWERED
         click.echo("armsight: interrupted", err=True)
         return 130, ""
     except click.exceptions.NoArgsIsHelpError as error:  # a group by itself: its help

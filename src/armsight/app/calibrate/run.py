@@ -88,8 +88,8 @@ def _open(spec: str, folder: Path) -> Source:
     if not spec.startswith((*LIVE, SIM)):
         return open_source(spec)
     stored = unused(folder)
-    click.echo(f"recording for {_RECORDED_S:g} s into {stored}: move the target; Ctrl-C ends it earlier", err=True)
     opened = _SimulatedBoard(spec) if spec.startswith(SIM) else open_source(spec)
+    click.echo(f"recording for {_RECORDED_S:g} s into {stored}: move the target; Ctrl-C ends it earlier", err=True)
     with contextlib.closing(opened) as live, bar("recording shots", live.count) as advance:
         done = record(live, stored, seconds=_RECORDED_S, on_shot=lambda _: advance())
     if (done.stopped and not done.interrupted) or not done.shots:

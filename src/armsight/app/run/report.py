@@ -147,16 +147,14 @@ def report_of(
         "result": ("Result", [*shown, Lines(notes, most=0), Fact(values=values), Text("\n".join(lines))]),
         **sections,
     }
-    seed = (
-        f" · {result.properties.get('cameras')} · seed {result.properties['seed']}"
-        if "seed" in result.properties
-        else ""
+    about, name = result.properties, result.setup.arm.name
+    simulated = (
+        f"simulated, {about.get('arm')} · {about.get('cameras')} · seed {about['seed']}" if "seed" in about else ""
     )
-    sub = f"{result.properties.get('arm', '')}{seed}"
     return Report(
         "run",
-        "A run of the arm, measured",
-        sub,
+        f"A {'simulated ' if simulated else ''}run of the arm {name}, measured",
+        simulated or name,
         "",
         sections,
         _said(result),

@@ -11,6 +11,7 @@ from typing import Any
 import click
 
 from armsight.app.options import SIM
+from armsight.app.show.messages import UNANSWERED
 from armsight.errors import InputError
 
 
@@ -52,7 +53,9 @@ def command(arm: str, source: str | None, board: str | None, begin: int | None, 
     with stdout, simulated(walk, source or "") if simulate else contextlib.nullcontext():
         try:
             code = walk.go(lambda line: click.echo(line, err=True), result)
-        except (KeyboardInterrupt, click.Abort):
+        except (KeyboardInterrupt, click.Abort) as error:
+            if isinstance(error.__context__, EOFError):
+                raise InputError(UNANSWERED) from None
             click.echo(f"\nwhat is done is kept: armsight setup {arm} goes on there", err=True)
     if as_json:
         click.echo(json.dumps(result))

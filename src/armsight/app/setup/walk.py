@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import shlex
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from importlib import resources
@@ -31,7 +32,7 @@ class SetupWalk:
         arm: its name.
         words: what the page says -> what is so here.
         done: commands of the page -> done, or left out.
-        simulated: how the board is called where nobody is at the terminal; empty with a person.
+        simulated: how the emulated board is called; empty with an arm.
     """
 
     arm: str
@@ -117,7 +118,8 @@ class SetupWalk:
             row["command"] = f"armsight {self.typed(step)}"
             self.keep()
             say(f"$ {row['command']}" if possible else "left out: there is no such file")
-            answer = "" if self.simulated or not possible else _asked("Enter runs it, s leaves it out, q ends here")
+            nobody = self.simulated and not sys.stdin.isatty()
+            answer = "" if nobody or not possible else _asked("Enter runs it, s leaves it out, q ends here")
             if answer.lower().startswith("q"):
                 return 0
             row["state"] = "left out"

@@ -19,6 +19,10 @@ Level = Literal["note", "weak", "untrusted", "good", "hint", "warn", "error"]
 UNTRUSTED = 3
 
 
+#: What is wrong where a question is asked and the standard input is closed.
+UNANSWERED = "nobody answers, as the standard input is closed: run it at a terminal, or with --yes where there is one"
+
+
 @dataclass(frozen=True)
 class Note:
     """A line for a person, and how it is meant."""

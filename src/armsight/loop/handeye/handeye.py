@@ -233,7 +233,7 @@ class HandEye(Record):
 
     @property
     def sigma_mm(self) -> Array:
-        """(2, 3) sigmas of the translations, mm: of T_base_still along the base's axes, T_flange_held the flange's."""
+        """(2, 3) sigmas of the translations in mm, of T_base_still along the base's axes, T_flange_held the flange's."""
         R = np.stack([self.T_base_still[:3, :3], self.T_flange_held[:3, :3]])
         cov = np.stack([self.cov[:3, :3], self.cov[6:9, 6:9]])
         return np.asarray(1e3 * np.sqrt(np.einsum("kij,kjl,kil->ki", R, cov, R)))

@@ -26,15 +26,10 @@ MIN_POSES = 10  # poses needed to fit base and tool again
 
 
 class Errors(NamedTuple):
-    """Distances between the predicted and the measured tool.
+    """Distances between the predicted and the measured tool."""
 
-    Attributes:
-        position_m: (N, K) of every point.
-        angle_rad: (N,) of the body's rotation; empty with points only.
-    """
-
-    position_m: Array
-    angle_rad: Array
+    position_m: Array  #: (N, K) of every point
+    angle_rad: Array  #: (N,) of the body's rotation; empty with points only
 
     def summary(self) -> dict[str, float]:
         """Return mean_m, rms_m and max_m, and of full poses also mean_rad, rms_rad and max_rad."""
@@ -47,19 +42,12 @@ class Errors(NamedTuple):
 
 
 class Validation(NamedTuple):
-    """Nominal and identified arm on one set of poses.
+    """Nominal and identified arm on one set of poses."""
 
-    Attributes:
-        nominal: errors of the nominal arm, its base and tool fitted to the same poses as the identified one's.
-        identified: errors of the identified arm.
-        placement_refitted: whether base and tool were fitted to these very poses.
-        residual_over_predicted: RMS residual over the predicted sigma; 1 where the sigmas are honest.
-    """
-
-    nominal: Errors
-    identified: Errors
-    placement_refitted: bool
-    residual_over_predicted: float
+    nominal: Errors  #: errors of the nominal arm, its base and tool fitted to the same poses as the identified one's
+    identified: Errors  #: errors of the identified arm
+    placement_refitted: bool  #: whether base and tool were fitted to these very poses
+    residual_over_predicted: float  #: RMS residual over the predicted sigma; 1 where the sigmas are honest
 
     def __repr__(self) -> str:
         """Return the mean errors of both arms, mm, and whether the sigmas are honest."""

@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from armsight.data import Array, Body, Correspondences
+from armsight.data import Array, Body, Correspondences, PoseEstimate
 from armsight.errors import CalibrationError, InputError
 from armsight.geometry.pose import inverse, transform
 from armsight.geometry.rigid import fit_rigid, fit_scale
@@ -28,9 +28,10 @@ from armsight.vision.camera import DISTORTION_MODELS
 from armsight.vision.discs.bias import disc_bias
 from armsight.vision.match import epipolar_distances
 from armsight.vision.pose.bundle import DAMPING, NEAR, BundleModel, BundleSolution, BundleState, Observations, minimise
+from armsight.vision.pose.locate import locate
 from armsight.vision.pose.projection import of_middles
 from armsight.vision.rig import StereoRig
-from armsight.vision.triangulate import optimal_points
+from armsight.vision.triangulate import optimal_points, triangulate
 
 #: The perspective bias depends on the pose and the pose on the bias: it shrinks a hundredfold each round.
 _BIAS_ROUNDS = 4
@@ -392,4 +393,22 @@ def concluded(
         motion,
         disc_radius_m,
     )
-    return replace(calibration, weaknesses=weaknesses(calibration))
+    return replace(calibration, weaknesses=(*weaknesses(calibration), *_misfits(calibration)))
+
+
+def _misfits(calibration: Calibration) -> list[str]:
+    """Return a weakness where most pairs, measured with the rig, fit the board as found worse than their noise allows."""
+    rig, body, found = calibration.rig, calibration.body, list[float]()
+    for shot in range(len(calibration.pairs)):
+        seen = correspondences(calibration.observations, shot)
+        if calibration.disc_radius_m:
+            seen = middles(rig, body.points, seen, calibration.disc_radius_m)
+        if isinstance(pose := locate(rig, body, triangulate(rig, body, seen)), PoseEstimate):
+            found.append(pose.misfit)
+    if not found or (usual := float(np.median(found))) <= 1.0:
+        return []
+    return [
+        f"most pairs fit the {body.name} as it was found worse than the noise of its points allows (a misfit of "
+        f"{usual:.1f} is usual; `armsight measure` says it too, and enlarges its sigmas): images that are not sharp, a "
+        "board that bends between pairs, or lenses that the model cannot express (--lens-model)"
+    ]

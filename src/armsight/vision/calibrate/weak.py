@@ -9,7 +9,7 @@ from armsight.data import Array
 from armsight.errors import CalibrationError
 from armsight.estimate.chance import chi_square_limit
 from armsight.vision.calibrate.motion import ExposureMotion
-from armsight.vision.calibrate.result import Calibration
+from armsight.vision.calibrate.result import Calibration, corner_variance_px2
 
 _LEAST_TILT_DEG = 15.0
 _GOOD_PAIRS = 12
@@ -170,7 +170,7 @@ def _by_position(calibration: Calibration) -> float | None:
     return float(np.sqrt(explained / len(residuals))) if explained > max(_FIELD_SHARE, by_chance) * whole else None
 
 
-def _moved(calibration: Calibration, motion: ExposureMotion) -> str:
+def _moved(calibration: Calibration, motion: ExposureMotion) -> str | None:
     state = calibration.solution.state
     ways = np.linalg.norm(state.motions[:, :3], axis=1)
     far = [int(j) for j in np.argsort(-ways) if ways[j] > _FAR_MOTION * np.sqrt(3) * motion.rms_m][:_FARTHEST]
@@ -182,7 +182,9 @@ def _moved(calibration: Calibration, motion: ExposureMotion) -> str:
             f"{1e3 * motion.rms_m:.2f} mm RMS along each axis{most}, may be the lenses too: try a richer --lens-model, "
             "look for a lens that is loose or behind a window, and hold the board still to distinguish the two"
         )
-    way_px = _way_px(calibration, motion)
+    way_px, corner_px = _way_px(calibration, motion), float(np.sqrt(corner_variance_px2(calibration).min()))
+    if way_px**2 * len(calibration.body.points) < corner_px**2:  # it moves a pose by less than the corners' noise
+        return None
     return (
         f"the board moved between the two exposures of a pair, by {1e3 * motion.rms_m:.2g} mm and "
         f"{1e3 * motion.rms_rad:.2g} mrad RMS along and about each axis ({way_px:.2g} px{most}): the cameras are not "
