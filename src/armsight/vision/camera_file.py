@@ -38,40 +38,15 @@ SIZE = (
     *("framesize", "camerasize", "imsize", "shape"),
 )
 _SIZE_PAIRS = (
-    ("imagewidth", "imageheight"),
-    ("width", "height"),
-    ("w", "h"),
-    ("nx", "ny"),
-    ("camerawidth", "cameraheight"),
+    *(("imagewidth", "imageheight"), ("width", "height"), ("w", "h"), ("nx", "ny"), ("camerawidth", "cameraheight")),
 )
 _MODEL = ("distortionmodel", "cameratype", "distortiontype", "model", "type", "fisheye")
 #: Distortion models by the names that programs give them; fisheye is Kannala and Brandt's of four coefficients.
 FISHEYES = ("fisheye", "equidistant", "equi", "kannalabrandt", "kannalabrandt4", "kannalabrandt8", "kb4", "true")
 BROWNS = (
-    *(
-        "",
-        "none",
-        "false",
-        "brown",
-        "brownconrady",
-        "radtan",
-        "plumbbob",
-        "rationalpolynomial",
-        "radialtangential",
-        "rectified",
-    ),
-    *(
-        "standard",
-        "rational",
-        "pinhole",
-        "opencv",
-        "pinholeradtan8",
-        "radtan8",
-        "perspective",
-        "brown4",
-        "brown5",
-        "brown8",
-    ),
+    *("", "none", "false", "brown", "brownconrady", "radtan", "plumbbob", "rationalpolynomial", "radialtangential"),
+    *("rectified", "standard", "rational", "pinhole", "opencv", "pinholeradtan8", "radtan8", "perspective"),
+    *("brown4", "brown5", "brown8"),
 )
 #: Lenses that are none of these, by the names that stand beside a camera's own ("model: Logitech C920").
 _OTHER_LENSES = ("omni", "mei", "ds", "doublesphere", "ucm", "eucm", "fov", "cahvor", "scaramuzza", "ocam", "ftheta")

@@ -51,6 +51,7 @@ from armsight.geometry.check import checked
 from armsight.geometry.pose import inverse, pose
 from armsight.geometry.rotation import exp_so3, from_quaternion_wxyz
 from armsight.tables.document import Foreign
+from armsight.tables.lengths import UNITS_M
 from armsight.vision.camera_file import camera_of, found, is_camera
 from armsight.vision.rig import StereoRig
 from armsight.vision.rigfiles.rigfile import (
@@ -322,15 +323,7 @@ def _orbslam_part(document: Document, name: str) -> dict[str, Foreign]:
 
 
 #: Names of units in MATLAB, m.
-_WORLD_UNITS = {
-    "millimeters": 1e-3,
-    "mm": 1e-3,
-    "meters": 1.0,
-    "m": 1.0,
-    "centimeters": 1e-2,
-    "cm": 1e-2,
-    "inches": 0.0254,
-}
+_WORLD_UNITS = {**UNITS_M, "millimeters": 1e-3, "meters": 1.0, "centimeters": 1e-2, "inches": 0.0254}
 
 
 def _matlab_inner(document: Document) -> Mapping[str, Foreign] | None:

@@ -41,15 +41,14 @@ _ENCODINGS: dict[str, tuple[str, int, int | None]] = {
     "rgba8": ("u1", 4, cv2.COLOR_RGBA2BGR),
     "bgr16": ("u2", 3, None),
     "rgb16": ("u2", 3, cv2.COLOR_RGB2BGR),
-    # OpenCV names a Bayer pattern by its second row and column: ROS's RGGB is its BG.
-    "bayer_rggb8": ("u1", 1, cv2.COLOR_BayerBG2BGR),
-    "bayer_bggr8": ("u1", 1, cv2.COLOR_BayerRG2BGR),
-    "bayer_gbrg8": ("u1", 1, cv2.COLOR_BayerGR2BGR),
-    "bayer_grbg8": ("u1", 1, cv2.COLOR_BayerGB2BGR),
-    "bayer_rggb16": ("u2", 1, cv2.COLOR_BayerBG2BGR),
-    "bayer_bggr16": ("u2", 1, cv2.COLOR_BayerRG2BGR),
-    "bayer_gbrg16": ("u2", 1, cv2.COLOR_BayerGR2BGR),
-    "bayer_grbg16": ("u2", 1, cv2.COLOR_BayerGB2BGR),
+    **{
+        f"bayer_{pattern}{bits}": (f"u{bits // 8}", 1, code)
+        for bits in (8, 16)
+        for pattern, code in (  # OpenCV names a pattern by its second row and column: ROS's RGGB is its BG.
+            *(("rggb", cv2.COLOR_BayerBG2BGR), ("bggr", cv2.COLOR_BayerRG2BGR)),
+            *(("gbrg", cv2.COLOR_BayerGR2BGR), ("grbg", cv2.COLOR_BayerGB2BGR)),
+        )
+    },
     "yuyv": ("u1", 2, cv2.COLOR_YUV2BGR_YUY2),
     "yuv422_yuy2": ("u1", 2, cv2.COLOR_YUV2BGR_YUY2),
     "uyvy": ("u1", 2, cv2.COLOR_YUV2BGR_UYVY),
