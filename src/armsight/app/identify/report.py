@@ -57,7 +57,7 @@ def map_figure(run: Identification) -> Figure:
     for column, (name, error) in enumerate((("nominal", before), ("identified", after))):
         rising = np.argsort(error)  # large errors on top
         for ax, (x, y, across, up) in zip(axes[:, column], views, strict=True):
-            size = float(np.clip(2000 / len(x), 7, 25))  # few poses must not be lost on the page
+            size = float(np.clip(2000 / len(x), 9, 36))  # few poses must not be lost on the page
             style: dict[str, Any] = {"cmap": "viridis", "vmin": 0, "vmax": top, "linewidths": 0}
             plotted = ax.scatter(x[rising], y[rising], c=error[rising], s=size, **style)
             ax.set_aspect("equal", adjustable="datalim")
@@ -80,7 +80,8 @@ def joints_figure(run: Identification) -> Figure:
         at, middle = np.digitize(degrees, edges) - 1, (edges[:-1] + edges[1:]) / 2
         filled = np.unique(at)
         for name, error, colour in (("nominal", before, ORANGE), ("identified", after, BLUE)):
-            ax.scatter(degrees, error, s=4, color=colour, alpha=0.25, linewidths=0)
+            few = float(np.clip(100 / len(q), 0.25, 1.0))  # many hide each other, few must not be lost
+            ax.scatter(degrees, error, s=20 * few, color=colour, alpha=0.2 + 0.6 * few, linewidths=0)
             ax.plot(middle[filled], [error[at == k].mean() for k in filled], color=colour, linewidth=2, label=name)
         ax.set_title(run.arm.joint_names[i])
         ax.set_xlabel("deg")

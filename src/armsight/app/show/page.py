@@ -61,6 +61,8 @@ figcaption p { margin: .3rem 0; }
 @media screen and (max-width: 48rem) { table { display: block; overflow-x: auto; }
   th, td { overflow-wrap: break-word; } td:not(.number) { min-width: 7rem; }
   td:last-child:not(.number):not(:empty) { min-width: 20rem; }
+  figure { overflow-x: auto; } figure img { width: 46rem; max-width: none; }  /* its letters stay readable: it scrolls */
+  .zoom { width: 46rem; touch-action: pan-x pan-y !important; } figcaption { position: sticky; left: 0; }
   table.numbers tbody th, table.headline th { white-space: normal; } }
 @media print { body { max-width: none; padding: 0; } nav { display: none; } table { font-size: .7rem; }
   th, td { padding: .25rem .5rem .25rem 0; } figure { break-inside: avoid; }

@@ -409,6 +409,6 @@ def _misfits(calibration: Calibration) -> list[str]:
         return []
     return [
         f"most pairs fit the {body.name} as it was found worse than the noise of its points allows (a misfit of "
-        f"{usual:.1f} is usual; `armsight measure` says it too, and enlarges its sigmas): images that are not sharp, a "
+        f"{usual:.1f} is usual; armsight measure says it too, and enlarges its sigmas): images that are not sharp, a "
         "board that bends between pairs, or lenses that the model cannot express (--lens-model)"
     ]
