@@ -5,6 +5,9 @@
     python cells.py 200 --rate 1       latency and cost alone, with a shot a second of each cell
     python cells.py 50 --drift 5       three of them drift: where they stand in the list after 5 minutes
     python cells.py --alarms 7         false alarms of healthy cells in so many days, without any process
+    python cells.py 50 --beside 600    image to command of a workcell beside them, alternately without them: the workcell
+                                       has a core to itself, as a cell has its computer
+    python cells.py 200 --page         how often Chromium draws the page, and its memory; the hub is fed in one process
 
 Cells are processes of their own with the sink that commands have; they are fed with measured poses of a simulated rig
 at 10 Hz, or --rate. The hub runs in a process of its own, and is looked at through its pages.
@@ -14,6 +17,7 @@ import argparse
 import json
 import multiprocessing
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -31,6 +35,31 @@ NOISE_PX, BREATH_RAD, BREATH_S = 0.05, 3e-6, 40.0
 DRIFT_DEG_H = 0.05
 #: From a block's middle to the hub's look at it, s: the next block is being filled.
 LATE_S = 12.0
+#: s that the cells go on and are stopped alternately, less than a zenoh session lasts without a sign of life; s of each
+#: that do not count.
+BLOCK_S, BEGIN_S = 2.5, 0.3
+#: Runs the simulated workcell again and again, and writes when each shot's command was sent, and how long it took.
+BESIDE = """
+import sys, time
+from armsight.app.main import main
+from armsight.loop.running import log
+
+class Timed(log.Rows):
+    def append(self, *columns):
+        super().append(*columns)
+        print(time.monotonic(), float(columns[0]), file=file, flush=True)
+
+before, file = log.Log.__init__, open(sys.argv[1], "w")
+def timed(self, *arguments, **named):
+    before(self, *arguments, **named)
+    self.latency_s = Timed()
+log.Log.__init__ = timed
+for k in range(1000):
+    try:
+        main([*sys.argv[2:], "-o", f"beside{k}"])
+    except SystemExit:
+        pass
+"""
 
 
 def measured(rig, true, rng):
@@ -224,6 +253,133 @@ def losses(cells, http, folder, port, process, cable):
     return process
 
 
+def workcell(folder):
+    """Return the command of a run in a simulated workcell, with what a demo calibrated."""
+    subprocess.run(
+        [sys.executable, "-m", "armsight", "demo", "--quick"], cwd=folder, check=True, stdout=subprocess.DEVNULL
+    )
+    files = ("--rig", "demo/rig.json", "--target", "demo/body.toml", "--motion", "demo/motion.toml")
+    return ["run", "--source", "sim:", "--board", "emulated:", *files]
+
+
+def beside(seconds, run, core, others, folder, port):
+    """Print how long a workcell takes from image to command, alternately with and without the others."""
+    taken = folder / "taken"
+    alone = subprocess.Popen(
+        [sys.executable, "-c", BESIDE, taken, *run],
+        cwd=folder,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        preexec_fn=lambda: os.sched_setaffinity(0, {core}),
+    )
+    until(lambda: taken.exists() and taken.stat().st_size, 600)
+    turn, number, ends, end = None, 0, [], time.monotonic() + seconds
+    while time.monotonic() < end:
+        if turn is None or turn.poll() is not None:
+            cell, number = f"w{number % 4}", number + 1
+            command = [sys.executable, "-m", "armsight", *run, "-o", cell, "--stream", f"cell:{cell}@127.0.0.1:{port}"]
+            quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "start_new_session": True}
+            turn = subprocess.Popen(command, cwd=folder, **quiet)
+        time.sleep(BLOCK_S)
+        ends.append(time.monotonic())
+        for what in (signal.SIGSTOP, signal.SIGCONT):
+            for pid in others:
+                os.kill(pid, what)
+            os.killpg(turn.pid, what)
+            if what == signal.SIGSTOP:
+                time.sleep(BLOCK_S)
+                ends.append(time.monotonic())
+    alone.kill()
+    os.killpg(turn.pid, signal.SIGKILL)
+    at, took = np.loadtxt(taken).T
+    block = np.searchsorted(ends, at)
+    inside = (block > 0) & (block < len(ends))
+    inside &= at - np.array(ends)[np.maximum(block, 1) - 1] > BEGIN_S
+    print(f"{number} workcells in turn on the core of cells and hub; blocks of {BLOCK_S} s")
+    found = {}
+    kinds = {"with": block % 2 == 0, "without": block % 2 == 1, "without, half of the blocks": block % 4 == 1}
+    for label, kind in kinds.items():
+        mine = inside & kind
+        found[label] = np.percentile(1e3 * took[mine], [50, 99])
+        print(f"image to command {label}: {mine.sum()} shots, p50 {found[label][0]:.3f}, p99 {found[label][1]:.3f} ms")
+    for label in ("with", "without, half of the blocks"):
+        change = 100 * (found[label] / found["without"] - 1)
+        print(f"{label} over without: p50 {change[0]:+.1f} %, p99 {change[1]:+.1f} % (5 asked)")
+
+
+def renderers():
+    """Return the processes in which a Chromium draws pages."""
+    found = set()
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            if b"--type=renderer" in path.read_bytes():
+                found.add(path.parent.name)
+        except OSError:
+            continue
+    return found
+
+
+def fed(count, folder, port):
+    """Return the page's address of a hub in this process that hears so many cells once a second, with a day's errors."""
+    from armsight.app.hub.service import Hub
+
+    rng, site, names = (
+        np.random.default_rng(ARGUMENTS.seed),
+        Hub(folder, f"tcp/127.0.0.1:{port}", "127.0.0.1:0", None, print),
+        [f"c{number:03d}" for number in range(count)],
+    )
+    for name in names:
+        site._hear(("site", name, "alive", time.time(), (name, True)))
+
+    def states():
+        while True:
+            for name in names:
+                now = time.time()
+                values = {"rate_hz": 30.0, "missed": 0.01, "error_mm": rng.uniform(0.03, 0.06), "sigma_mm": 0.03}
+                site._hear(("site", name, "state", now, {"t": now, "mode": "run", "shots": 9, "health": [], **values}))
+            time.sleep(1.0)
+
+    threading.Thread(target=states, daemon=True).start()
+    until(lambda: len(site._cells) == count, 20)
+    for cell in site._cells.values():
+        cell.about = {"limit_mm": 0.1, "arm": "six_r", "body": "body", "rig_heldout_mm": 0.03}
+        cell.day = {int(time.time() // 300) - n: rng.uniform(0.03, 0.06) for n in range(288)}
+    return site.pages.address
+
+
+def page_drawn(address):
+    """Print how often Chromium draws the hub's page in 30 s while it is scrolled, and what its processes take."""
+    from selenium import webdriver
+
+    options = webdriver.ChromeOptions()
+    for each in ("--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--window-size=1500,1000"):
+        options.add_argument(each)
+    before = renderers()
+    driver = webdriver.Chrome(options, webdriver.ChromeService(shutil.which("chromedriver")))
+    driver.get(address)
+    time.sleep(5.0)
+    driver.execute_script(
+        "window.took = []; let before = performance.now(), down = 1; const draw = now => { took.push(now - before);"
+        "before = now; scrollBy(0, 6 * down); if (scrollY <= 0) down = 1;"
+        "if (scrollY + innerHeight >= document.body.scrollHeight - 1) down = -1; requestAnimationFrame(draw); };"
+        "requestAnimationFrame(draw);"
+    )
+    time.sleep(30.0)
+    took = np.array(driver.execute_script("return took.slice(1)"))
+    cards = driver.execute_script("return document.querySelectorAll('.card').length")
+    script = driver.execute_script("return performance.memory.usedJSHeapSize") / 1e6
+    memory = [
+        int(Path(f"/proc/{pid}/smaps_rollup").read_text().partition("Pss:")[2].split()[0]) / 1e3
+        for pid in renderers() - before
+    ]
+    driver.quit()
+    print(
+        f"page of {cards} cells in Chromium, scrolled: {len(took) / (took.sum() / 1e3):.0f} images a second (30 asked), "
+        f"longest {took.max():.0f} ms, p99 {np.percentile(took, 99):.0f} ms; JavaScript {script:.0f} MB, "
+        f"its process {max(memory):.0f} MB (150 asked)"
+    )
+
+
 def counted(folder):
     """Print how many events are missing or twice in the database of a hub that has ended."""
     import sqlite3
@@ -265,7 +421,14 @@ def main():
     folder = Path(tempfile.mkdtemp())
     os.environ["XDG_STATE_HOME"] = str(folder / "state")
     port, http, count = free_port(), free_port(), ARGUMENTS.cells
+    if ARGUMENTS.beside:
+        run = workcell(folder)
+        core, *_, last = sorted(os.sched_getaffinity(0))
+        os.sched_setaffinity(0, {last})  # of hub and cells, too
     drifting = set(np.random.default_rng(ARGUMENTS.seed).choice(count, 3, replace=False)) if ARGUMENTS.drift else set()
+    if ARGUMENTS.page:
+        page_drawn(fed(count, folder, port))
+        return
     process = hub(folder / "hub", port, http)
     cut = free_port()
     cells = started(count, port, ARGUMENTS.seed, drifting, cut)
@@ -281,6 +444,8 @@ def main():
                 f"minute {minute + 1}: drifting are {sorted(f'c{n:03d}' for n in drifting)}; first on the page {first}",
                 flush=True,
             )
+    elif ARGUMENTS.beside:
+        beside(ARGUMENTS.beside, run, core, [process.pid, *(each.pid for each in cells)], folder, port)
     else:
         before = cpu_s(process.pid)
         began = time.monotonic()
@@ -311,6 +476,8 @@ if __name__ == "__main__":
     PARSER.add_argument("--rate", type=float, default=10.0, help="shots a second of a cell")
     PARSER.add_argument("--drift", type=int, default=0)
     PARSER.add_argument("--alarms", type=int, default=0)
+    PARSER.add_argument("--beside", type=float, default=0.0, help="s that a workcell runs beside the cells")
+    PARSER.add_argument("--page", action="store_true")
     PARSER.add_argument("--seed", type=int, default=4301)
     ARGUMENTS = PARSER.parse_args()
     main()

@@ -1,11 +1,13 @@
 """Cells and a hub, each with its own zenoh session, over loopback."""
 
+import contextlib
 import json
 import os
 import re
 import socket
 import subprocess
 import sys
+import threading
 import time
 import urllib.error
 import urllib.request
@@ -82,6 +84,8 @@ def test_a_cell_that_began_before_its_hub_arrives_with_all_its_events(hub_at, ce
     assert found["state"]["temperature_c"] == 41.2
     assert [each["kind"] for each in json.loads(fetched(hub, "events?q=camera+moved"))] == ["health"]
     assert fetched(hub, "image?site=site&cell=table-1").startswith(b"\xff\xd8")
+    assert "day" not in json.loads(fetched(hub, "state"))["cells"][0]
+    assert json.loads(fetched(hub, "state?day=1"))["cells"][0]["day"] == []
     assert 'armsight_cell_missed_ratio{site="site",cell="table-1"}' in fetched(hub, "metrics").decode()
     cell.put(NoteDatum(2.0, "no longer found: rig: a camera moved", "info", ()))
     wait(lambda: shown(hub)["table-1"]["level"] != 3)
@@ -191,6 +195,49 @@ def test_a_cell_writes_below_its_own_name_alone(hub_at, cell_at, port, tmp_path,
     (found,) = [each for each in hub._store.events() if each["cell"] == "hub"]
     assert found["kind"] == "rejected"
     assert re.fullmatch(r"tls/127.0.0.1:\d+ has the key of b and sends under another name: .*", found["text"])
+
+
+class Wire:
+    """A relay that keeps what passes."""
+
+    def __init__(self, to):
+        self.passed, self._to = bytearray(), to
+        self._listening = socket.create_server(("127.0.0.1", 0))
+        self.port = self._listening.getsockname()[1]
+        self.thread = threading.Thread(target=self._accept, daemon=True)
+        self.thread.start()
+
+    def _accept(self):
+        with self._listening:
+            near = self._listening.accept()[0]
+        with near, socket.create_connection(("127.0.0.1", self._to)) as far:
+            back = threading.Thread(target=self._carry, args=(far, near), daemon=True)
+            back.start()
+            self._carry(near, far)
+            back.join()
+
+    def _carry(self, one, other):
+        with contextlib.suppress(OSError):
+            while data := one.recv(1 << 16):
+                self.passed += data
+                other.sendall(data)
+            other.shutdown(socket.SHUT_RDWR)
+
+
+@pytest.mark.parametrize("secret", [True, False])
+def test_who_listens_on_the_wire_sees_no_state(secret, hub_at, cell_at, port, tmp_path, wait):
+    """Without keys, on one computer, it is seen: the words that are looked for are those that are sent."""
+    if secret:
+        make_keys(tmp_path / "keys", "lab", ["a"], "127.0.0.1", port)
+    hub, wire = hub_at(port, tmp_path / "keys" if secret else None), Wire(port)
+    spec = f"a@127.0.0.1:{wire.port}"
+    if secret:
+        spec = with_line(tmp_path / "keys/cells/a/cell.toml", f":{port}", f":{wire.port}")
+    cell = cell_at(spec)
+    wait(lambda: (f := shown(hub).get("a", {})).get("state") and f["about"])
+    cell.close()
+    wire.thread.join()
+    assert all((word in wire.passed) is not secret for word in (b"armsight", b"error_mm", b"rig_heldout_mm"))
 
 
 def test_a_connection_without_a_key_is_rejected_and_that_is_an_event(port, tmp_path, wait):
