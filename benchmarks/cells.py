@@ -273,29 +273,29 @@ def beside(seconds, run, core, others, folder, port):
         preexec_fn=lambda: os.sched_setaffinity(0, {core}),
     )
     until(lambda: taken.exists() and taken.stat().st_size, 600)
-    turn, number, ends, end = None, 0, [], time.monotonic() + seconds
+    other, number, ends, end = None, 0, [], time.monotonic() + seconds
     while time.monotonic() < end:
-        if turn is None or turn.poll() is not None:
+        if other is None or other.poll() is not None:
             cell, number = f"w{number % 4}", number + 1
             command = [sys.executable, "-m", "armsight", *run, "-o", cell, "--stream", f"cell:{cell}@127.0.0.1:{port}"]
             quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "start_new_session": True}
-            turn = subprocess.Popen(command, cwd=folder, **quiet)
+            other = subprocess.Popen(command, cwd=folder, **quiet)
         time.sleep(BLOCK_S)
         ends.append(time.monotonic())
         for what in (signal.SIGSTOP, signal.SIGCONT):
             for pid in others:
                 os.kill(pid, what)
-            os.killpg(turn.pid, what)
+            os.killpg(other.pid, what)
             if what == signal.SIGSTOP:
                 time.sleep(BLOCK_S)
                 ends.append(time.monotonic())
     alone.kill()
-    os.killpg(turn.pid, signal.SIGKILL)
+    os.killpg(other.pid, signal.SIGKILL)
     at, took = np.loadtxt(taken).T
     block = np.searchsorted(ends, at)
     inside = (block > 0) & (block < len(ends))
     inside &= at - np.array(ends)[np.maximum(block, 1) - 1] > BEGIN_S
-    print(f"{number} workcells in turn on the core of cells and hub; blocks of {BLOCK_S} s")
+    print(f"{number} workcells in other on the core of cells and hub; blocks of {BLOCK_S} s")
     found = {}
     kinds = {"with": block % 2 == 0, "without": block % 2 == 1, "without, half of the blocks": block % 4 == 1}
     for label, kind in kinds.items():
