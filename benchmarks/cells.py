@@ -295,7 +295,7 @@ def beside(seconds, run, core, others, folder, port):
     block = np.searchsorted(ends, at)
     inside = (block > 0) & (block < len(ends))
     inside &= at - np.array(ends)[np.maximum(block, 1) - 1] > BEGIN_S
-    print(f"{number} workcells in other on the core of cells and hub; blocks of {BLOCK_S} s")
+    print(f"{number} workcells one after another on the core of cells and hub; blocks of {BLOCK_S} s")
     found = {}
     kinds = {"with": block % 2 == 0, "without": block % 2 == 1, "without, half of the blocks": block % 4 == 1}
     for label, kind in kinds.items():

@@ -26,7 +26,7 @@ _ADDRESS = re.compile(r"(mqtts?)://(?:([^@/]+)@)?(\[[0-9a-fA-F:]+\]|[\w.-]+)(?::
 #: Where the password of the broker is: a command line is read by all of a computer.
 _PASSWORD = "ARMSIGHT_MQTT_PASSWORD"
 _TEXTS = ("why", "mode", "armsight", "host", "arm", "body", "rig_made_utc")
-#: Type -> its number in the specification, 6.4.16 (Int64, Double, Boolean, String), and the field of a value.
+#: Type -> its number in the specification (Int64, Double, Boolean, String), and the field of a value.
 _KINDS = {int: (4, 11), float: (10, 13), bool: (11, 14), str: (12, 15)}
 Value = bool | int | float | str | None
 
