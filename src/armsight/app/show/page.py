@@ -64,7 +64,8 @@ figcaption p { margin: .3rem 0; }
   figure { overflow-x: auto; } figure img { width: 46rem; max-width: none; }  /* its letters stay readable: it scrolls */
   .zoom { width: 46rem; touch-action: pan-x pan-y !important; } figcaption { position: sticky; left: 0; }
   table.numbers tbody th, table.headline th { white-space: normal; } }
-@media print { body { max-width: none; padding: 0; } nav { display: none; } table { font-size: .7rem; }
+@media print { body { max-width: none; padding: 0; } nav { display: none; }
+  table, table.headline { font-size: .7rem; } table.headline th { white-space: normal; overflow-wrap: normal; }
   th, td { padding: .25rem .5rem .25rem 0; } figure { break-inside: avoid; }
   h2, h3, summary { break-after: avoid; } tr { break-inside: avoid; }
   details::details-content { content-visibility: visible; block-size: auto; } }  /* paper is not unfolded */

@@ -75,7 +75,7 @@ class Identified(Record):
         used, free, weak = self.solution.used, self.solution.free, undetermined(*self.moved_all_over())
         return (
             f"Identified({self.model.arm.name}, {int(free.sum())} of {len(free)} numbers fitted, {int(used.sum())} of "
-            f"{len(used)} poses used{weak and f'; {weak}'}; columns() lists them, validate() evaluates them on others)"
+            f"{len(used)} poses used{weak and f'; {weak}'}; columns() lists them, armsight.validate tests them on others)"
         )
 
     def __str__(self) -> str:
