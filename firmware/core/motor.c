@@ -143,7 +143,7 @@ static float window_noise(motor_state *motor, const motor_config *config, float 
 }
 
 /* Learn both scales from a window: v = r (R i) + k (K w), by recursive least squares (Kalman's form). */
-static void learn(motor_state *motor, const motor_config *config, float angle_rad, float noise_rad)
+static void learn(motor_state *motor, const motor_config *config, float angle_rad, float noise_rad, bool rests)
 {
     const float ticks = (float)motor->window_ticks;
     const float per_tick = 1.0f / ticks;
@@ -157,6 +157,11 @@ static void learn(motor_state *motor, const motor_config *config, float angle_ra
     const float ir_v = motor->window_ir_v * per_tick;
     const float kw_v = config->constant_v_s * (angle_rad - motor->window_rad) * per_s;
     const float noise_v = config->constant_v_s * noise_rad * per_s;
+    /* What a joint that rests hides in its backlash goes with the current: all such windows err alike, and one says what
+     * many do. */
+    if (rests && motor->variance_rr * ir_v * ir_v < noise_v * noise_v) {
+        return;
+    }
     const float gain_r = motor->variance_rr * ir_v + motor->variance_rk * kw_v;
     const float gain_k = motor->variance_rk * ir_v + motor->variance_kk * kw_v;
     const float variance = ir_v * gain_r + kw_v * gain_k + noise_v * noise_v;
@@ -205,7 +210,7 @@ static void window(motor_state *motor, const motor_config *config, float angle_r
     }
     /* A gap that R and K may explain must be learnt from: else they would stay wrong for good. */
     if (motor->heard_rad_s > 0.0f && number_size(motor->gap_rad) < 0.5f * config->apart_rad + motor_explains(motor)) {
-        learn(motor, config, angle_rad, noise_rad);
+        learn(motor, config, angle_rad, noise_rad, motor->window_side == SIDE_UNKNOWN);
     }
     window_begin(motor, angle_rad);
 }
