@@ -145,6 +145,15 @@ def test_a_clock_that_jumps_is_converted_anew(fed, jump_s):
     assert losses == (f"a stamp was more than 1 s off ({lost.sum()} times)", "its clock jumped")
 
 
+@pytest.mark.parametrize("jump_s", [-0.4, -0.07, 0.07, 0.9])
+def test_a_clock_that_jumps_by_less_than_a_second_is_said_and_costs_no_reading(fed, jump_s):
+    arrivals = 105.0 + 0.002 * np.arange(1000)
+    stamps = arrivals - 98.0 + np.where(arrivals > 106.0, jump_s, 0.0)
+    t_s, losses = fed([(t, line(stamp)) for t, stamp in zip(arrivals, stamps, strict=True)])
+    np.testing.assert_allclose(t_s, arrivals, atol=1e-3)
+    assert losses == ("its clock jumped",)
+
+
 def test_lines_that_are_late_do_not_move_the_clock(fed):
     late = [(109.0 + 1e-3 * n, line(9.005 + 0.1 * n)) for n in range(20)]  # after a stall of 2 s
     t_s, losses = fed([(105.0, line(7.0)), (106.9, line(8.9)), *late, (109.1, line(11.1))])

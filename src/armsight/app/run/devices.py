@@ -48,6 +48,9 @@ _LINES_BYTES = 65_536
 #: s: stamps so far off their arrival, for so long, are of a clock that jumped; half: a stall of the network passes for a
 #: jump, double: a smaller jump leaves readings late, and a jump costs more of them.
 JUMP_S = 1.0
+#: Stamps that fall by more, or are so much later than now, s, are of a clock that jumped; half: those that overtook others
+#: on their way are, double: jumps of 80 ms are not seen.
+STEP_S = 0.05
 
 
 class LiveReadings:
@@ -151,11 +154,11 @@ class LiveReadings:
         with self._lock:
             if self._stamp_s == -np.inf:
                 self.losses.clear()  # the first line of a port may be cut
-            elif abs(t_s + self._own.offset_s - now) > JUMP_S:
+            elif abs(late_s := now - self._own.offset_s - t_s) > JUMP_S and now - self._off_s < JUMP_S:
                 self._off_s = min(self._off_s, now)
-                if now - self._off_s < JUMP_S:
-                    self.losses[f"a stamp was more than {JUMP_S:g} s off"] += 1
-                    return
+                self.losses[f"a stamp was more than {JUMP_S:g} s off"] += 1
+                return
+            elif abs(late_s) > JUMP_S or max(self._stamp_s - t_s, -late_s) > STEP_S:
                 self._own, self._stamp_s = HostClock(self._now), -np.inf
                 self.losses["its clock jumped"] += 1
             self._heard_s, self._off_s = now, np.inf

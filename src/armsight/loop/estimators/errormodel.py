@@ -66,13 +66,29 @@ class Until(NamedTuple):
     t_s: float
 
 
+class StateStep(NamedTuple):
+    """How a state came from the one before, for the smoother: what motion kept of it, and one measurement.
+
+    ``kept`` (K,), ``by`` (m, K + B) and ``gain`` (K + B, m), the arm's errors before what is beside: derivative of the
+    residual ``z`` (m,), whose covariance is ``S``, by the state before, and what of it was added to the state;
+    ``velocity`` (3, K + B): derivative of the velocity by the state before, None where it stayed.
+    """
+
+    kept: Array
+    by: Array
+    gain: Array
+    z: Array
+    S: Array
+    velocity: Array | None = None
+
+
 class ErrorState(NamedTuple):
     """The filter right after a pose measurement, or before the first.
 
     ``x`` (size,) and ``P`` (size, size): the arm's error and its covariance; ``t_s``: when that was; ``joints``: how the
     readings smoothed them then, N = 1; ``pose_measurement``: what went in last of vision. Where a reading of a reference
     went in last: ``taken``, that, and ``vision_s``, when vision's was; ``considered``: see :mod:`..references.update`;
-    ``beside``: what an inertial unit adds to the state, None without one.
+    ``beside``: what an inertial unit adds to the state, None without one; ``steps``: how it came, then.
     """
 
     t_s: float
@@ -84,6 +100,7 @@ class ErrorState(NamedTuple):
     vision_s: float | None = None
     considered: Considered = NONE_CONSIDERED
     beside: Navigated | None = None
+    steps: tuple[StateStep, ...] = ()
 
     @property
     def measurement(self) -> PoseMeasurement | Taken | Until | None:

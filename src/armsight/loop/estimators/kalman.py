@@ -34,6 +34,7 @@ from armsight.loop.estimators.errormodel import (
     ErrorState,
     Predicted,
     Propagation,
+    StateStep,
     Taken,
     Until,
     chi_square,
@@ -44,10 +45,10 @@ from armsight.loop.estimators.errormodel import (
 from armsight.loop.estimators.estimator import ArmEstimate, Delay, Innovation, Learned, Outcome, PoseMeasurement, Track
 from armsight.loop.estimators.parabola import SPAN_S
 from armsight.loop.estimators.readings import GAP_RAD, Readings, Smoothed
-from armsight.loop.estimators.smoothing import Interval, blended, by_state, intervals
+from armsight.loop.estimators.smoothing import Interval, blended, by_state, intervals, smoothed_back
 from armsight.loop.references.inertial import Inertial
 from armsight.loop.references.reference import Reading, Reference, ToolMotion
-from armsight.loop.references.strapdown import Advanced, Samples, Strapdown
+from armsight.loop.references.strapdown import Advanced, Navigated, Samples, Strapdown
 from armsight.loop.references.update import Considered, Shares, gained, passed
 from armsight.robot.kinematics.arm import Arm
 
@@ -64,6 +65,8 @@ HISTORY_S = 1.0
 #: Measurements newer than the joints' readings are kept waiting for so long, s; half: slow boards lose some, double: more
 #: memory where the joints' readings stop.
 WAITING_S = 0.5
+#: Measurements of so long after a time serve to smooth it, at least, s; half: worse tracks, double: half as cheap.
+AHEAD_S = 0.3
 _GATE = chi_square_limit(6, CHANCE)
 #: The tool's acceleration is the difference of its twists so long before and after, s; half: noisier, double: bends cut.
 APART_S = 0.01
@@ -82,6 +85,14 @@ ALIKE = 5.0
 def _carried(considered: Considered, step: Propagation) -> dict[str, Array]:
     """Return how the state's error hangs on parameters that are considered after motion."""
     return {name: C * step.kept[0][:, None] for name, C in considered.items()}
+
+
+def _measured(beside: Navigated, kept: Array, H: Array, HP: Array, z: Array, S: Array) -> tuple[Navigated, Array]:
+    """Return what is beside the arm's errors after a measurement of these, and what (B, m) of its residual was added."""
+    C = beside.C * kept[:, None]
+    HC = H @ C
+    gain = np.asarray(np.linalg.solve(S, HC).T, np.float64)
+    return Navigated(beside.t_s, beside.y + gain @ z, C - HP.T @ gain.T, beside.Y - gain @ HC), gain
 
 
 class Remembered(NamedTuple):
@@ -143,6 +154,7 @@ class KalmanEstimator:
         self._without: Remembered | None = None
         self._against, self._rejected, self._window = dict[type, int](), no_reference, Outcome.WAITING
         self._outliers: list[Array] = []
+        self._back: list[ErrorState] = []  # the newest states, smoothed, while a unit is used
         self._backlash_set = True  # whether the readings have the newest estimate of the backlash
         # At the newest reading, until something is heard: the state, the joints and what came of the state, and the tool.
         self._here: tuple[ErrorState, Smoothed, Propagation] | None = None
@@ -200,6 +212,15 @@ class KalmanEstimator:
         P[np.diag_indices(self._at.size)] += np.where(np.diag(P) > 0.0, 0.0, self._model.sigmas**2)
         return x, P
 
+    def unit_differs(self) -> dict[str, float]:
+        """Return by how many of its sigma before each parameter of the inertial unit, biases left out, is found off."""
+        if self._unit is None or (beside := self._states[-1].beside) is None:
+            return {}
+        sensor = self._unit.sensor
+        sigma = np.maximum(np.append(sensor.sigma_delay_s, np.sqrt(np.diag(sensor.cov))), 1e-12)
+        found = zip(("delay_s", *sensor.parameters), (np.abs(beside.y[3:]) / sigma).tolist(), strict=True)
+        return {name: off for name, off in found if "bias" not in name}
+
     def restore(self, state: Remembered) -> None:
         """Go on from an earlier state: what was measured since is dropped, and what motion makes it forget is unknown.
 
@@ -209,7 +230,7 @@ class KalmanEstimator:
         if self.clock is not None:
             self.clock.restore(state.clock, self._forgets)
         self._states = [newest._replace(x=x, P=P, taken=None, considered=NONE_CONSIDERED, beside=None)]
-        self._outliers, self._newest, self._here = [], None, None
+        self._outliers, self._back, self._newest, self._here = [], [], None, None
         self._waiting, self._backlash_set = [], False
 
     def as_before(self, state: Remembered) -> KalmanEstimator:
@@ -259,6 +280,10 @@ class KalmanEstimator:
                 return Outcome.WAITING
             if self._unit is None or self._unit.sensor is not reference:
                 self._unit, self._without = Strapdown(reference), self.remembered()
+                del self._states[:-1]
+                P = self._states[-1].P.copy()
+                P[self._at.delay] = P[:, self._at.delay] = 0.0
+                self._states[-1] = self._states[-1]._replace(P=P)
             self._unit.add(reading)
             self._newest = self._here = None
             return self._go_on()
@@ -384,7 +409,11 @@ class KalmanEstimator:
 
     def intervals(self, t_s: Array) -> list[Interval]:
         """Return times (N,), rising, grouped by the measurements around them so far: for :meth:`blended`, soon after."""
-        return intervals(self._states, t_s)
+        if self._states[-1].beside is None:
+            return intervals(self._states, t_s)
+        if not self._back or self._back[-1].t_s < t_s[-1] + AHEAD_S:
+            self._back = smoothed_back([state for state in self._states if state.t_s > t_s[0] - HISTORY_S])
+        return intervals(self._back, t_s)
 
     def blended(self, parts: list[Interval]) -> Track:
         """Return the poses of the tool at the times of intervals as :meth:`smoothed` does; many cost little extra."""
@@ -458,7 +487,11 @@ class KalmanEstimator:
         """Return the state after a measurement, None where it is an outlier; report how it came about."""
         t_s = max(self._seen_s(pose_measurement, before), before.t_s)
         times, jitter_s = np.array([t_s]), self._delay.jitter_s
-        before, joints = self._anew(self._felt(before, t_s, report=report is not None), times)
+        if self._unit is not None:
+            jitter_s = float(np.hypot(jitter_s, self._delay.sigma_s))
+        felt = self._felt(before, t_s, report=report is not None)
+        steps = () if felt is before else felt.steps
+        before, joints = self._anew(felt, times)
         step = self._model.moved(before, joints, times, learning=LEARNING)
         at, chi = self._model.predicted(before, step, joints, pose_measurement, jitter_s)
         outcome = self._gate(at, chi)
@@ -474,7 +507,10 @@ class KalmanEstimator:
         x, P, beside = at.x, at.P, before.beside
         if beside is not None:
             noise = pose_measurement.cov_noise + jitter_s**2 * np.outer(H[:, self._at.delay], H[:, self._at.delay])
-            beside = beside.measured(step.kept[0], H, at.HP, z, noise + at.HP @ H.T)
+            S = noise + at.HP @ H.T
+            beside, gain = _measured(beside, step.kept[0], H, at.HP, z, S)
+            by = np.hstack([H * step.kept[0], np.zeros((6, len(gain)))])
+            steps = *steps, StateStep(step.kept[0], by, np.vstack([K, gain]), z, S)
         if not (np.abs(x) < self._furthest).all():  # NaN neither
             return None, Outcome.OUTLIER
         if report is not None:
@@ -484,7 +520,9 @@ class KalmanEstimator:
                 by_delay = P[:, self._at.delay] / P[self._at.delay, self._at.delay]
                 P += (self.clock.sigma_s**2 - P[self._at.delay, self._at.delay]) * np.outer(by_delay, by_delay)
         considered = passed(_carried(before.considered, step), K, at.H) if before.considered else NONE_CONSIDERED
-        return ErrorState(t_s, x, P, joints, pose_measurement, considered=considered, beside=beside), outcome
+        return ErrorState(
+            t_s, x, P, joints, pose_measurement, considered=considered, beside=beside, steps=steps
+        ), outcome
 
     def _alone(self, before: ErrorState, t_s: float, by: tuple[Smoothed, Propagation] | None = None) -> ErrorState:
         """Return the state at a time by the joints alone; ``by``: the joints then, and what the motion does to it."""
@@ -493,10 +531,11 @@ class KalmanEstimator:
             by = joints, self._model.moved(before, joints, np.array([t_s]), learning=LEARNING)
         joints, step = by
         x, P = self._propagated(before, step)
-        beside, considered = before.beside, _carried(before.considered, step)
+        beside, considered, steps = before.beside, _carried(before.considered, step), tuple[StateStep, ...]()
         if beside is not None:
-            beside = beside._replace(C=beside.C * step.kept[0][:, None])
-        return ErrorState(t_s, x, P, joints, before.pose_measurement, None, before.seen_s, considered, beside)
+            beside, size = beside._replace(C=beside.C * step.kept[0][:, None]), len(x) + len(beside.y)
+            steps = (StateStep(step.kept[0], np.zeros((0, size)), np.zeros((size, 0)), np.zeros(0), np.zeros((0, 0))),)
+        return ErrorState(t_s, x, P, joints, before.pose_measurement, None, before.seen_s, considered, beside, steps)
 
     @staticmethod
     def _propagated(before: ErrorState, step: Propagation) -> tuple[Array, Array]:
@@ -512,26 +551,38 @@ class KalmanEstimator:
             return before
         before, joints = self._anew(before, np.array([t_s]))
         step, loose = self._model.moved(before, joints, np.array([t_s]), learning=LEARNING), self._loose
+        kept, added = step.kept[0], step.added[0]
+        if not np.isfinite(window).all():  # clipped: links may be anywhere within their gaps
+            kept[loose], added[loose] = 0.0, self._anywhere
+            if report and self.on_reading is not None:
+                none = np.zeros((0, 0)), np.zeros((0, len(kept))), kept, np.zeros((len(kept), 0))
+                self.on_reading(self._unit.sensor.name, Innovation(t_s, np.eye(4), np.zeros(0), *none, Outcome.OUTLIER))
+            return self._alone(before, t_s, (joints, step))
         share = float(np.exp(-window[0] / LOOSE_S))
-        step.kept[:, loose] *= share
-        step.added[:, loose] += LOOSE_RAD**2 * (1.0 - share**2)
+        kept[loose] *= share
+        added[loose] += LOOSE_RAD**2 * (1.0 - share**2)
         q, unseen = (
             np.concatenate([getattr(end, part) for end in (before.joints, joints)]) for part in ("q", "unseen")
         )
         got, Ts, outcome = self._advanced(self._unit, window, before, step, q, unseen)
-        kept, added = step.kept[0], step.added[0]
         if report:
             self._window = outcome
         if report and self.on_reading is not None:
-            said = got.z, got.S, got.by, kept.copy(), got.gain, outcome
+            said = got.z, got.S, got.by, kept.copy(), got.gain[: len(kept)], outcome
             self.on_reading(self._unit.sensor.name, Innovation(t_s, Ts[1], *said, added=added.copy()))
         if outcome is Outcome.OUTLIER:  # an impact: links may be anywhere within their gaps
             kept[loose], added[loose] = 0.0, self._anywhere
             got, _, again = self._advanced(self._unit, window, before, step, q, unseen)
             if again is Outcome.OUTLIER:
                 return self._alone(before, t_s, (joints, step))
-        considered = {name: C * kept[:, None] - got.gain @ (got.by @ C) for name, C in before.considered.items()}
-        last = before.pose_measurement, None, before.seen_s, considered, got.beside._replace(t_s=t_s)
+        considered = {
+            name: C * kept[:, None] - got.gain[: len(C)] @ (got.by @ C) for name, C in before.considered.items()
+        }
+        by, velocity = np.hstack([got.by, got.by_y]), got.velocity
+        if before.beside is None or before.beside.t_s != before.t_s:  # it began with another velocity
+            by[:, len(kept) : len(kept) + 3] = velocity[:, len(kept) : len(kept) + 3] = 0.0
+        came = (StateStep(kept, by, got.gain, got.z, got.S, velocity),)
+        last = before.pose_measurement, None, before.seen_s, considered, got.beside._replace(t_s=t_s), came
         return ErrorState(t_s, got.x, got.P, joints, *last)
 
     def _advanced(
@@ -583,7 +634,7 @@ class KalmanEstimator:
             return None, outcome
         beside = before.beside
         if beside is not None:
-            beside = beside.measured(kept, H, H @ P, z, got.S)
+            beside, _ = _measured(beside, kept, H, H @ P, z, got.S)
         used = before.pose_measurement, taken, before.seen_s, got.considered, beside
         return ErrorState(t_s, x, got.P, joints, *used), outcome
 

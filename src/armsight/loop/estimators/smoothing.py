@@ -14,7 +14,15 @@ import numpy as np
 
 from armsight.data import Array, Ids
 from armsight.geometry.pose import exp_se3, inverse, log_se3
-from armsight.loop.estimators.errormodel import ErrorModel, ErrorState, Propagation, bridged, shared, smoothed_anew
+from armsight.loop.estimators.errormodel import (
+    ErrorModel,
+    ErrorState,
+    Propagation,
+    StateStep,
+    bridged,
+    shared,
+    smoothed_anew,
+)
 from armsight.loop.estimators.estimator import Track
 from armsight.loop.estimators.readings import Readings, Smoothed
 
@@ -50,6 +58,43 @@ def intervals(states: list[ErrorState], t_s: Array) -> list[Interval]:
         inner = 0 < k < len(ends)
         found.append(Interval(t_s[at == k], ends[k - 1] if inner else states[-1], ends[k] if inner else None))
     return found
+
+
+def smoothed_back(states: list[ErrorState]) -> list[ErrorState]:
+    """Return states with the measurements after them used, as far as their steps are known (Bierman, 1973: by adjoints).
+
+    Args:
+        states: of a filter with an inertial unit, oldest first.
+    """
+    found = list[ErrorState]()
+    adjoint, information, steps = np.zeros(0), np.zeros((0, 0)), tuple[StateStep, ...]()
+    for state in reversed(states):
+        for step in reversed(steps):
+            K = len(step.kept)
+            adjoint, information = _before(step, K, adjoint), _before(step, K, _before(step, K, information).T)
+            weighed = np.linalg.solve(step.S, np.column_stack([step.z, step.by]))
+            adjoint, information = adjoint + step.by.T @ weighed[:, 0], information + step.by.T @ weighed[:, 1:]
+        if state.beside is None:
+            found.append(state)
+            steps = ()
+            continue
+        if not steps:
+            size = len(state.x) + len(state.beside.y)
+            adjoint, information = np.zeros(size), np.zeros((size, size))
+        known = np.hstack([state.P, state.beside.C])
+        found.append(state._replace(x=state.x + known @ adjoint, P=state.P - known @ information @ known.T))
+        steps = state.steps
+    return found[::-1]
+
+
+def _before(step: StateStep, K: int, a: Array) -> Array:
+    """Return the product of the transposed transition of a step and an adjoint (K + B, ...)."""
+    out, felt = a.copy(), step.by.T @ (step.gain.T @ a)
+    out[:K] = (a[:K].T * step.kept).T
+    if step.velocity is not None:
+        out[K : K + 3] = 0.0
+        out += step.velocity.T @ a[K : K + 3]
+    return np.asarray(out - felt)
 
 
 def blended(model: ErrorModel, readings: Readings, parts: list[Interval]) -> Track:

@@ -134,11 +134,6 @@ class Inertial(Reference):
     def _part(self, rows: slice) -> Array:
         return self.values[rows.start - _LEVER.start : rows.stop - _LEVER.start]
 
-    @property
-    def tilt(self) -> Array:
-        """(2,) rotation vector, about x and y, of what is up in the base, rad."""
-        return self._part(_TILT)
-
     def _matrices(self) -> tuple[Array, Array]:
         """Return I + M_g and I + M_a (3, 3)."""
         gyro, force = np.eye(3) + self._part(_M_G).reshape(3, 3), np.eye(3)

@@ -43,6 +43,12 @@ _ROWS = 8192
 START_M_S = 0.1
 #: Averaging time, s, from which on a bias wanders more than noise; half: biases are learned anew faster, double: slower.
 CORNER_S = 6.0
+#: The delay is known no better, s, as each run converts the clock anew; half: more units are dropped, double: found later.
+DELAY_S = 1e-3
+#: A value beyond the least range that chips have, rad/s and m/s2, that is the same twice is the end of its chip's range.
+LEAST_RANGE = np.repeat([2.1, 19.0], 3)
+#: A window's noise is at most so many times its class's; half: hard motions claim too much, double: impacts are noise.
+SCATTER = 30.0
 #: Rows of what is estimated beside the arm: velocity, delay, and the unit's parameters.
 _V, _DELAY, _PARAMETERS = slice(0, 3), 3, 4
 _MOUNTED, _LEVERED, _TILTED = (_PARAMETERS + rows.start for rows in MOUNTING)
@@ -79,21 +85,6 @@ class Navigated(NamedTuple):
     C: Array
     Y: Array
 
-    def measured(self, kept: Array, H: Array, HP: Array, z: Array, S: Array) -> Navigated:
-        """Return it after a measurement of the arm's errors.
-
-        Args:
-            kept: (K,) what motion had kept of these.
-            H: (m, K) derivative of the measurement.
-            HP: (m, K) product of it and their covariance.
-            z: (m,) residual.
-            S: (m, m) covariance of that.
-        """
-        C = self.C * kept[:, None]
-        HC = H @ C
-        gain = np.linalg.solve(S, HC).T
-        return Navigated(self.t_s, self.y + gain @ z, C - HP.T @ gain.T, self.Y - gain @ HC)
-
 
 class Advanced(NamedTuple):
     """A filter's state at the end of a window, the window used.
@@ -102,10 +93,12 @@ class Advanced(NamedTuple):
         x: (K,) the arm's error.
         P: (K, K) its covariance.
         beside: velocity and parameters.
-        gain: (K, 6) what of the residual was added to x.
+        gain: (K + B, 6) what of the residual was added to x, and to what is beside.
         by: (6, K) derivative of the residual by the state before.
         z: (6,) residual: felt minus predicted.
         S: (6, 6) its covariance.
+        by_y: (6, B) derivative of the residual by what is beside.
+        velocity: (3, K + B) derivative of the velocity at the end by the state before, and by what is beside.
     """
 
     x: Array
@@ -115,24 +108,36 @@ class Advanced(NamedTuple):
     by: Array
     z: Array
     S: Array
+    by_y: Array
+    velocity: Array
 
 
 @kernel("f8[::1], f8[:, ::1], i8, i8, f8, f8, f8[::1]")
 def _preintegrate(t: Array, z: Array, first: int, last: int, begin: float, end: float, out: Array) -> bool:
-    """Write a window but its density, see :meth:`Strapdown.window`, of rows first to last of t (N,), z (N, 6), if complete.
+    """Write a window, see :meth:`Strapdown.window`, of rows first to last of t (N,), z (N, 6), if complete.
 
-    The newest sample is held as row last + 1.
+    The newest sample is held as row last + 1. The density is raised to what samples scatter about lines through those
+    beside: motion and vibration that are too fast for the samples are integrated as wrongly as noise is.
     """
     R, a, b = np.eye(3), np.empty(6), np.empty(6)
-    v, p, rotated = np.zeros(3), np.zeros(3), np.empty((3, 3))
+    v, p, rotated, bends, count = np.zeros(3), np.zeros(3), np.empty((3, 3)), np.zeros(6), 0
     if last < first or begin < t[first] or end <= begin or end >= t[last] + HELD_S:
         return False
+    newest = last
     if end > t[last]:
         last += 1
         t[last], z[last] = end, z[last - 1]
     k = last
     while t[k - 1] > begin:
         k -= 1
+    for row in range(max(k - 1, first + 1), newest):
+        if t[row - 1] < end:
+            for i in range(6):
+                bends[i] += (z[row + 1, i] - 2.0 * z[row, i] + z[row - 1, i]) ** 2 * (t[row + 1] - t[row - 1]) / 12.0
+            count += 1
+    for i in range(6):
+        if bends[i] > count * out[28 + i] ** 2:
+            out[28 + i] = min(math.sqrt(bends[i] / count), SCATTER * out[28 + i])
     at = begin
     for i in range(6):
         a[i] = z[k - 1, i] + (z[k, i] - z[k - 1, i]) * (begin - t[k - 1]) / (t[k] - t[k - 1])
@@ -293,7 +298,7 @@ def _add_transposed(A: Array, B: Array, out: Array) -> None:
 
 @kernel(
     "f8[::1], f8[:, ::1], f8[:, :, ::1], f8[:, :, ::1], f8[::1], f8[::1], i8, f8[::1], f8[:, ::1], f8[::1], f8[:, ::1], "
-    "f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[:, ::1]",
+    "f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[:, ::1]",
     fastmath={"contract"},
 )
 def _advance(
@@ -311,17 +316,18 @@ def _advance(
     Y: Array,
     gain: Array,
     D: Array,
+    by_y: Array,
     z: Array,
     S: Array,
 ) -> None:
-    """Overwrite x, P, y, C, Y by the state after a window; write gain (K, 6), derivative (9, K), residual and S.
+    """Overwrite x, P, y, C, Y by the state after a window; write gain (K + B, 6), D (9, K), by_y (9, B), residual and S.
 
     Arguments are as for :meth:`Strapdown.advanced` and :func:`_constraint`.
     """
     K, B = len(x), len(y)
-    r, by, by_y, W, ends = np.empty(9), np.zeros((9, 12)), np.zeros((9, B)), np.zeros((9, 9)), np.zeros((6, K))
+    r, by, W, ends = np.empty(9), np.zeros((9, 12)), np.zeros((9, 9)), np.zeros((6, K))
+    D[:] = by_y[:] = 0.0
     _constraint(felt, mount, Ts, y, by, by_y, r, W)
-    D[:] = 0.0
     _add(by[:, :6], Hs[0], D)
     _add(by[:6, 6:], Hs[1], ends)
     for i in range(6):
@@ -393,7 +399,7 @@ def _subtract(
             gain[k] = 0.0
     for k in range(B):
         for i in range(6):
-            factor = solution[i, K + k]
+            gain[K + k, i] = factor = solution[i, K + k]
             y[k] += factor * z[i]
             for j in range(B):
                 Y[k, j] -= factor * right[i, K + j]
@@ -412,8 +418,9 @@ class Strapdown:
     def __init__(self, sensor: Inertial) -> None:
         self.sensor, self._density = sensor, np.zeros(6)
         self._t, self._z = np.empty(_ROWS + 1), np.empty((_ROWS + 1, 6))  # and the one that is held
+        self._read = np.zeros((1, 6))  # the newest as read
         self._first = self._count = 0
-        self._lever, tilt = sensor.T_tool_sensor[:3, 3], np.append(sensor.tilt, 0.0)
+        self._lever, tilt = sensor.T_tool_sensor[:3, 3], np.append(sensor.values[-2:], 0.0)
         up = exp_so3(tilt)[:, 2]
         gravity = STANDARD_GRAVITY_M_S2 * np.vstack([up, (-skew(up) @ left_jacobian(tilt)).T[:2]])
         self._mount = np.vstack([sensor.T_tool_sensor[:3, :3], self._lever, gravity])
@@ -424,7 +431,7 @@ class Strapdown:
         return float(self._t[self._first + self._count - 1]) if self._count else -np.inf
 
     def add(self, samples: Samples) -> None:
-        """Take samples.
+        """Take samples; of clipped ones nothing is known.
 
         Raises:
             InputError: wrong shapes, NaN, or times that do not rise.
@@ -436,18 +443,23 @@ class Strapdown:
                 f"{self.sensor.name}: expected samples (N, 6), numbers, at times that rise from {self.newest_s:.4f} s on; "
                 f"given are {z.shape} from {t[0] if len(t) else np.nan:.4f} s on"
             )
+        clipped = ((np.diff(z, axis=0, prepend=self._read) == 0.0) & (np.abs(z) > LEAST_RANGE)).any(axis=1)
+        self._read, clipped = z[-1:] if len(z) else self._read, np.append(clipped, False)
+        z = np.where((clipped[:-1] | clipped[1:])[:, None], np.nan, self.sensor.felt(z))
         t, z, self._density = t[-_ROWS // 2 :], z[-_ROWS // 2 :], samples.density
+        if clipped[0] and self._count:
+            self._z[self._first + self._count - 1] = np.nan
         if self._first + self._count + len(t) >= _ROWS:
             kept = slice(self._first + max(self._count - _ROWS // 2, 0), self._first + self._count)
             self._count = kept.stop - kept.start
             self._t[: self._count], self._z[: self._count] = self._t[kept].copy(), self._z[kept].copy()
             self._first = 0
         rows = slice(self._first + self._count, self._first + self._count + len(t))
-        self._t[rows], self._z[rows] = t, self.sensor.felt(z)
+        self._t[rows], self._z[rows] = t, z
         self._count += len(t)
 
     def window(self, begin_s: float, end_s: float) -> Array | None:
-        """Return what was felt between two times, s, (34,); None where samples are missing.
+        """Return what was felt between two times, s, (34,); None where samples are missing, NaN in it where clipped.
 
         In the axes at the first time: length, s; rotation (9); integral of the specific force, m/s, and of that, m; mean of
         angular velocity and specific force, their change from begin to end, and the density of the noise (6 each).
@@ -470,13 +482,11 @@ class Strapdown:
         size = _PARAMETERS + len(self.sensor.cov)
         y, C, Y = np.zeros(size), np.zeros((rows, size)), np.zeros((size, size))
         if before is None:
-            Y[_DELAY, _DELAY], Y[_PARAMETERS:, _PARAMETERS:] = self.sensor.sigma_delay_s**2, self.sensor.cov
+            Y[_DELAY, _DELAY] = max(self.sensor.sigma_delay_s, DELAY_S) ** 2
+            Y[_PARAMETERS:, _PARAMETERS:] = self.sensor.cov
         else:
-            y[_DELAY:], C[:, _DELAY:], Y[_DELAY:, _DELAY:] = (
-                before.y[_DELAY:],
-                before.C[:, _DELAY:],
-                before.Y[_DELAY:, _DELAY:],
-            )
+            known = slice(_DELAY, None)
+            y[known], C[:, known], Y[known, known] = before.y[known], before.C[:, known], before.Y[known, known]
         y[_V] = T[:3, :3] @ (twist[:3] + np.cross(twist[3:], self._lever))
         Y[_V, _V] = START_M_S**2 * np.eye(3)
         return Navigated(t_s, y, C, Y)
@@ -501,7 +511,8 @@ class Strapdown:
             fixed: row of the arm's error that no reading changes.
         """
         x, P, y, C, Y = (each.copy() for each in (*state, *beside[1:]))
-        gain, D, z, S = np.empty((len(x), 6)), np.empty((9, len(x))), np.empty(6), np.empty((6, 6))
-        _advance(window, self._mount, *poses, *step, fixed, x, P, y, C, Y, gain, D, z, S)
+        gain, D, by_y = np.empty((len(x) + len(y), 6)), np.empty((9, len(x))), np.empty((9, len(y)))
+        z, S = np.empty(6), np.empty((6, 6))
+        _advance(window, self._mount, *poses, *step, fixed, x, P, y, C, Y, gain, D, by_y, z, S)
         after = Navigated(beside.t_s + float(window[0]), y, C, Y)
-        return Advanced(x, P, after, gain, D[:6], z, S)
+        return Advanced(x, P, after, gain, D[:6], z, S, by_y[:6], np.hstack([D[6:], by_y[6:]]))

@@ -114,6 +114,8 @@ class HostClock:
 #: Residuals over their sigma below which a unit agrees (as links count as loose, 1/3 is usual), and the share of outliers;
 #: half: chance is a fault, double: a loose mount agrees.
 HONEST, OUTLIERS = 1.0, 0.01
+#: Sigmas of its calibration from which on a parameter that is found off is said; half: chance is, double: 2 ms are not.
+OFF = 5.0
 #: Samples that are given at once at most: older ones are of before the estimator began.
 MOST = 1000
 #: Outliers so close together are one impact, s; half: one that rings counts twice, double: two knocks count once.
@@ -192,7 +194,7 @@ class Fused:
         self.impacts = list[float]()
         self.begin_s = np.inf
         self.rejected_s: float | None = None
-        self._impact_s = -np.inf
+        self._impact_s, self._off = -np.inf, list[str]()
         self._apart_s = self._newest_s = np.nan  # the newest reading, and how long it came after the one before, s
 
     def poll(self, estimator: Estimator, end_s: float) -> Samples | None:
@@ -212,6 +214,10 @@ class Fused:
             if outcome is Outcome.OUTLIER and self.rejected_s is None:
                 self.rejected_s = float(t_s[-1])
                 self._losses[f"it was dropped at {self.rejected_s:.1f} s: images contradict it"] += 1
+            for name, off in estimator.unit_differs().items():
+                if off > OFF and name not in self._off:
+                    self._off.append(name)
+                    self._losses[f"its {name} is more than {OFF:g} sigma off: calibrate it again"] += 1
         return samples
 
     @property
@@ -243,7 +249,9 @@ class Fused:
         if not self.windows or not len(covs):
             raise InputError("; ".join((f"[{self._sensor.name}]: {self._unused()}", *self.losses)))
         ratio = float(np.sqrt(self._squares / max(self.windows - self.outliers, 1)))
-        agrees = self.outliers < OUTLIERS * self.windows and self.rejected_s is None and ratio < HONEST
+        agrees = (
+            self.outliers < OUTLIERS * self.windows and self.rejected_s is None and ratio < HONEST and not self._off
+        )
         sigma = float(np.sqrt(np.einsum("nii->ni", covs)[:, :3].sum(axis=1).mean()))
         moved, without = (None, None) if before is None else before
         said = self.windows, self.outliers, self.begin_s, ratio, agrees, self.rejected_s
