@@ -31,8 +31,10 @@ def test_a_file_says_the_same_as_options(tmp_path):
 def test_noise_is_what_the_detector_shows():
     # White noise alone: the fit's sigma falls as the rim grows, with the root of the diameter.
     clean = CameraPipeline.load("clean")
-    small, large = marker_noise(clean, "disc", 9.0), marker_noise(clean, "disc", 36.0)
-    assert small / large == pytest.approx(2.0, rel=0.25)
+    small, large = marker_noise(clean, "disc", 16.0), marker_noise(clean, "disc", 36.0)
+    assert small / large == pytest.approx(1.5, rel=0.25)
+    assert large < marker_noise(clean, "disc", 25.0) < small  # between two charts
+    assert marker_noise(clean, "disc", 200.0) == marker_noise(clean, "disc", 64.0) < large
     assert marker_noise(CameraPipeline.load("cheap-webcam"), "disc", 16.0) > 5 * marker_noise(clean, "disc", 16.0)
 
 

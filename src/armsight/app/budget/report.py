@@ -80,7 +80,9 @@ def to_build(found: RigBudget) -> dict[str, str]:
     if plan.rig:
         return {}
     rig = replace(plan.stereo_rig, cov=plan.conditions().cov_calibration, provenance=source)
-    return {"rig.json": rig.to_text()} | ({} if plan.body else {"body.toml": body_text(plan.body_scale)})
+    return {"rig.json": rig.to_text()} | (
+        {} if plan.body else {"body.toml": body_text(plan.body_scale, plan.body_depth)}
+    )
 
 
 def _asked(plan: RigPlan) -> dict[str, Any]:
@@ -91,6 +93,7 @@ def _asked(plan: RigPlan) -> dict[str, Any]:
         "focal_widths": lens,
         "focal_mm": round(plan.focal_mm, 1),
         "verging_deg": round(plan.stereo_rig.convergence_deg, 1),
+        "body_depth": plan.body_depth,
         "exposure_ms": round(1e3 * plan.timing["exposure"], 3),
     }
 

@@ -2,13 +2,15 @@
 
 In: a camera's stages, a kind of marker, its size in the image, how far it moves during an exposure. Out: the standard
 deviation of a detected position, px. The detectors are those that measure, so there is no second model of noise: mosaic,
-denoising, sharpening and JPEG have their share, wherever in the pixels a marker is.
+denoising, sharpening and JPEG have their share, wherever in the pixels a marker is. Behind the markers' own faces is the
+renderer's grey: an automatic exposure meters what it would before a scene.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -22,21 +24,24 @@ from armsight.sim.camera.pipeline import SimulatedCamera
 from armsight.sim.camera.stages import CameraPipeline
 from armsight.sim.render.optics import Radiance
 from armsight.sim.render.render import radiance
-from armsight.sim.render.scene import BLACK, WHITE, Pattern, PosedBody, chessboard, marker_bits, plate, tag
+from armsight.sim.render.scene import BLACK, CLEAR, WHITE, Pattern, PosedBody, chessboard, marker_bits, plate, tag
 from armsight.vision.camera import Camera
 from armsight.vision.markers.board import open_board
 from armsight.vision.markers.discs import DiscTarget
 from armsight.vision.markers.tag import CORNERS, Tag, TagTarget
 
-#: Detections that a chart needs: its sigma is then known to 4 %; half: 6 %, double: 3 % in twice the time.
-LEAST_DETECTIONS = 150
-_MOST_IMAGES, _MOST_SPOTS = 6, 200
-#: Size of a chart's image and its focal length, px; both change nothing but the time.
-_SIZE_PX, _FOCAL_PX = (640, 480), 800.0
+#: Detections that a chart needs: its sigma is then known to 5 %; half: 7 %, double: 4 % in twice the time.
+LEAST_DETECTIONS = 100
+_MOST_IMAGES, _MOST_SPOTS = 3, 200
+#: Size of a chart's image, px; half: vignetting and flicker are twice as steep, double: four times the time; and its focal
+#: length, px, which changes nothing.
+_SIZE_PX, _FOCAL_PX = (960, 540), 800.0
+_CAMERA = Camera(_SIZE_PX, "none", np.array([_FOCAL_PX, _FOCAL_PX, *((n - 1) / 2 for n in _SIZE_PX)]), np.zeros(0))
 #: Images of a still scene until what a camera mixes of earlier ones has settled.
 _SETTLED = 3
-#: Sizes are rounded to this share, movements to this, px: charts are used again.
-_STEP, _STEP_PX = 0.2, 0.5
+#: Charts are of sizes of this ratio up to a largest, px, between which the noise is interpolated (larger markers are taken
+#: to be no better), and of these ways, shares of the size.
+_FIRST_PX, _LAST_PX, _RATIO, _WAYS = 8.0, 64.0, 2.0, (0.0, 0.125, 0.25, 0.5, 1.0)
 #: Share of a chart's markers that must be found.
 _LEAST_FOUND = 0.5
 FAMILY = "tag36h11"
@@ -65,15 +70,17 @@ def marker_noise(pipeline: CameraPipeline, kind: str, size_px: float, moved_px: 
     Raises:
         InputError: at this size, or so blurred, most of such markers are not found.
     """
-    size = math.exp(_STEP * round(math.log(size_px) / _STEP))
-    scale = math.sqrt(size / size_px) if kind == "disc" else 1.0  # a longer rim averages more; a corner is a corner
-    return scale * _noise(pipeline, kind, size, _STEP_PX * round(moved_px / _STEP_PX))
+    at = math.log(min(size_px, _LAST_PX) / _FIRST_PX) / math.log(_RATIO)
+    way = min(_WAYS, key=lambda each: abs(each - moved_px / size_px))
+    sizes = (_FIRST_PX * _RATIO**step for step in (math.floor(at), math.ceil(at)))
+    first, second = (math.log(_noise(pipeline, kind, size, way * size)) for size in sizes)
+    return math.exp(first + (at - math.floor(at)) * (second - first))
 
 
 @lru_cache(maxsize=512)
 def _noise(pipeline: CameraPipeline, kind: str, size_px: float, moved_px: float) -> float:
     """Render and detect charts until there are enough detections."""
-    camera = Camera(_SIZE_PX, "none", np.array([_FOCAL_PX, _FOCAL_PX, *((n - 1) / 2 for n in _SIZE_PX)]), np.zeros(0))
+    camera, imager = _CAMERA, SimulatedCamera(pipeline, _SIZE_PX, seed=0)
     rng, off, asked = np.random.default_rng(42), list[Array](), 0
     for number in range(_MOST_IMAGES):
         chart = _CHARTS[kind](size_px / _FOCAL_PX, rng)
@@ -81,9 +88,9 @@ def _noise(pipeline: CameraPipeline, kind: str, size_px: float, moved_px: float)
         light = radiance(camera, [PosedBody(chart.patterns, T)], psf_sigma_px=pipeline.psf_sigma_px)
         if moved_px > 0:
             light = _smeared(light, moved_px, rng.uniform(0, np.pi))
-        imager = SimulatedCamera(pipeline, _SIZE_PX, seed=number)
-        for _ in range(1 if moved_px > 0 else _SETTLED):
-            image = imager.expose(light)
+        imager.forget()
+        for k in range(_SETTLED if pipeline.temporal_denoise and not moved_px else 1):
+            image = imager.expose(light, number=_SETTLED * number + k)
         true = camera.project(transform(T, np.column_stack([chart.spots, np.zeros(len(chart.spots))])))
         inside = ((true > 2 * size_px) & (true < np.array(_SIZE_PX) - 2 * size_px)).all(axis=1)
         asked += max(int(inside.sum()), 1)
@@ -92,7 +99,7 @@ def _noise(pipeline: CameraPipeline, kind: str, size_px: float, moved_px: float)
             gaps = np.linalg.norm(found[:, None] - true[None], axis=2)
             near = gaps.min(axis=1) < _NEAR * size_px
             off.append((found - true[gaps.argmin(axis=1)])[near])
-        if sum(map(len, off)) >= LEAST_DETECTIONS:
+        if sum(map(len, off)) >= LEAST_DETECTIONS or asked > LEAST_DETECTIONS / _LEAST_FOUND:
             break
     every = np.concatenate([np.zeros((0, 2)), *off])
     if len(every) < max(_LEAST_FOUND * asked, 8):
@@ -111,27 +118,36 @@ def _smeared(light: Radiance, way_px: float, direction: float) -> Radiance:
     return np.fft.irfft2(spectrum, light.shape).astype(np.float32)
 
 
-def _spots(pitch_m: float, rng: np.random.Generator) -> Array:
-    """Return positions (N, 2) of a grid that fills the image, each at a phase of its own, m."""
+def _faces(pitch_m: float, side_m: float, value: float) -> tuple[Pattern, Array]:
+    """Return square faces of a reflectance on a grid that fills the image, and their middles (N, 2), m."""
     n = [max(int(0.9 * size / (pitch_m * _FOCAL_PX)), 1) for size in _SIZE_PX]
     x, y = (pitch_m * (np.arange(count) - (count - 1) / 2) for count in n)
-    spots = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    spots = rng.permutation(spots)[:_MOST_SPOTS]
+    values = np.full((2 * n[1] - 1, 2 * n[0] - 1), CLEAR)
+    values[::2, ::2] = value
+    edges = [(each[:, None] + side_m / 2 * np.array([-1.0, 1.0])).ravel() for each in (x, y)]
+    return Pattern(edges[0], edges[1], values), np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+
+
+def _spots(grid: Array, rng: np.random.Generator) -> Array:
+    """Return some positions (N, 2) of a grid, each at a phase of its own, m."""
+    spots = rng.permutation(grid)[:_MOST_SPOTS]
     return np.asarray(spots + rng.uniform(-0.5, 0.5, spots.shape) / _FOCAL_PX)
 
 
 def _discs(size_m: float, rng: np.random.Generator) -> Chart:
-    """Return bright discs on a dark plate."""
-    spots = _spots(2.3 * size_m, rng)
+    """Return bright discs on dark faces."""
+    faces, grid = _faces(2.8 * size_m, 2.2 * size_m, BLACK)
+    spots = _spots(grid, rng)
     target = DiscTarget(Body("chart", ("a",), np.zeros((1, 3))), np.ones(1), np.ones(1, bool), np.full((1, 3), np.nan))
-    discs = [(x, y, size_m / 2, WHITE) for x, y in spots]
-    return Chart((plate(2.0, 2.0, BLACK, discs),), spots, lambda image: target.find(image).uv)
+    discs = np.column_stack([spots, np.tile([size_m / 2, WHITE], (len(spots), 1))])
+    return Chart((replace(faces, discs=discs),), spots, lambda image: target.find(image).uv)
 
 
 def _tags(size_m: float, rng: np.random.Generator) -> Chart:
-    """Return tags on a white plate; their corners are found."""
-    tags, patterns, spots = list[Tag](), [plate(2.0, 2.0, WHITE)], list[Array]()
-    for k, (x, y) in enumerate(_spots(1.5 * size_m, rng)):
+    """Return tags on white faces; their corners are found."""
+    faces, grid = _faces(2 * size_m, 1.4 * size_m, WHITE)
+    tags, patterns, spots = list[Tag](), [faces], list[Array]()
+    for k, (x, y) in enumerate(_spots(grid, rng)[: LEAST_DETECTIONS // 3]):
         tags.append(Tag(f"t{k}", FAMILY, k, size_m, pose(np.eye(3), np.array([x, y, 0.0]))))
         patterns.append(tag(marker_bits(FAMILY, k), size_m).on_body(tags[-1].T_body_tag))
         spots.append(transform(tags[-1].T_body_tag, CORNERS * (size_m / 2))[:, :2])
@@ -144,8 +160,9 @@ def _squares(size_m: float, rng: np.random.Generator) -> Chart:
     columns, rows = (9, 6) if 12 * size_m * _FOCAL_PX < _SIZE_PX[0] else (4, 3)
     target = open_board(f"chessboard:{columns}x{rows}:{size_m:.9g}m")
     first = rng.uniform(-0.5, 0.5, 2) / _FOCAL_PX - size_m * np.array([columns - 1, rows - 1]) / 2
+    paper = plate((columns + 3) * size_m, (rows + 3) * size_m, WHITE)
     board = chessboard(columns, rows, size_m).on_body(pose(np.eye(3), np.array([*first, 0.0])))
-    return Chart((plate(2.0, 2.0, WHITE), board), target.body.points[:, :2] + first, lambda i: target.detect(i).uv)
+    return Chart((paper, board), target.body.points[:, :2] + first, lambda i: target.detect(i).uv)
 
 
 _CHARTS = {"disc": _discs, "tag": _tags, "chessboard": _squares}

@@ -46,9 +46,7 @@ from armsight.vision.rig import StereoRig
 #: A disc's diameter, a tag's and a square's side in the image below which detection is left to luck, px; half: half of them
 #: are lost, double: bodies twice as large are asked for.
 LEAST_DISC_PX, LEAST_TAG_PX, LEAST_SQUARE_PX = 8.0, 24.0, 8.0
-MOST_SQUARE_PX = (
-    60.0  # px; larger squares' corners are no better; half: their noise is a tenth too large, double: the same
-)
+MOST_SQUARE_PX = 60.0  # px; larger squares' corners are no better; half: their noise is a tenth too large
 #: Lengths that a table-top cell has, m: what lies outside is mm given as m.
 _LEAST_M, _MOST_M = 0.001, 20.0
 _LEAST_APART_M = 0.01  # m; half: endoscopes pass, double: the smallest camera modules are rejected
@@ -63,7 +61,8 @@ _OF_RIG = ("baseline", "verging_deg", "focal_widths", "board", "pairs", "board_b
 _OF_SHUTTERS = ("skew_ms", "start_ms")
 #: Key -> least and most that a plan may say.
 _RANGES = {
-    "verging_deg": (0.0, 120.0), "focal_widths": (0.2, 20.0), "body_scale": (0.05, 20.0), "pairs": (3, 1000),
+    "verging_deg": (0.0, 120.0), "focal_widths": (0.2, 20.0), "body_scale": (0.05, 20.0), "body_depth": (0.0, 2.0),
+    "pairs": (3, 1000),
     "board_print": (0.0, 0.1), "body_size": (0.0, 0.1), "warming_k": (0.0, 100.0), "mount_um_per_k": (0.0, 1000.0),
     "lens_ppm_per_k": (0.0, 10000.0), "skew_ms": (0.0, 1000.0), "start_ms": (0.0, 1000.0), "exposure_ms": (0.001, 1000.0),
     "rate_hz": (0.1, 1000.0), "backlash_deg": (0.0, 10.0),
@@ -132,6 +131,7 @@ class RigPlan:
         focal_widths: focal length over the image's width; by default the class's.
         body: a body file; by default the plate with wings and nine discs that `armsight demo` has.
         body_scale: by how much the default body is larger; discs grow with it.
+        body_depth: by how much further its wings stand behind its plate; beyond 2 the plate hides them.
         board: the calibration board.
         pairs: of the board.
         board_print: standard deviation of its size, as a share.
@@ -162,6 +162,7 @@ class RigPlan:
     focal_widths: float = 0.0
     body: str = ""
     body_scale: float = 1.0
+    body_depth: float = 1.0
     board: str = "chessboard:9x6:25mm"
     pairs: int = 20
     board_print: float = 3e-4
@@ -360,7 +361,7 @@ class RigPlan:
         """The body."""
         if self.body:
             return read_layout(Path(self.folder) / self.body)
-        return Composite("tool_body", (), body_target(self.body_scale).discs)
+        return Composite("tool_body", (), body_target(self.body_scale, self.body_depth).discs)
 
     @cached_property
     def stereo_rig(self) -> StereoRig:
@@ -407,8 +408,9 @@ class RigPlan:
                 raise InputError(f"{key} is {value:g}: expected {least:g} to {most:g}")
         if own := [key for key in self.named if key in self.of_rig]:
             raise InputError(f"{self.rig} has its own {', '.join(own)}: leave out what it says itself")
-        if self.body and self.body_scale != 1.0:
-            raise InputError(f"body_scale is {self.body_scale:g}: it is of the default body, not of {self.body}")
+        for key in ("body_scale", "body_depth") if self.body else ():
+            if getattr(self, key) != 1.0:
+                raise InputError(f"{key} is {getattr(self, key):g}: it is of the default body, not of {self.body}")
 
     def check(self) -> None:
         """Refuse what cannot be built.
@@ -445,11 +447,11 @@ class RigPlan:
         body = np.ptp(self.layout.body.points, axis=0).max()
         for what, extent, pixels in () if self.existing else (("wide", size[0], width), ("high", size[1], height)):
             seen = near * pixels / self.focal_px
-            if extent + body > seen:
-                least = (extent + body) * self.focal_px / pixels + size[2] / 2
+            if (needed := extent + body) > seen:
+                least = needed * self.focal_px / pixels + size[2] / 2
                 raise InputError(
-                    f"the field of view is {seen:.2g} m {what} at {near:.2g} m, volume and body are {extent + body:.2g} m: "
-                    f"a distance of {least:.2g} m, or focal_widths = {near / (extent + body) * pixels / width:.2g}"
+                    f"the field of view is {seen:.2g} m {what} at {near:.2g} m, volume and body are {needed:.2g} m: "
+                    f"a distance of {least:.2g} m, or focal_widths = {near / needed * pixels / width:.2g}"
                 )
         kind, px = self.marker(far)
         least_px = LEAST_DISC_PX if kind == "disc" else LEAST_TAG_PX
@@ -486,24 +488,13 @@ class RigPlan:
             model, sigma = open_arm(self.arm), math.radians(self.backlash_deg)
             J = model.jacobian(model.home)
             arm = tuple(sigma * float(np.sqrt((part**2).sum() / 3)) for part in (J[:3], J[3:]))  # type: ignore[assignment]
+        bent = length_m(self.body_print, "body_print"), length_m(self.body_bent, "body_bent")
+        mount, lens = (1e-6 * each * self.warming_k for each in (self.mount_um_per_k, self.lens_ppm_per_k))
         return Conditions(
-            self._noise_px(),
-            self._cov_calibration(),
-            self.board_print,
-            (length_m(self.body_print, "body_print"), length_m(self.body_bent, "body_bent")),
-            self.body_size,
-            1e-6 * self.mount_um_per_k * self.warming_k,
-            0.0,
-            1e-6 * self.lens_ppm_per_k * self.warming_k,
-            t["skew"],
-            t["start"],
-            t["readout"],
-            t["stamp"],
-            speed,
-            rotation,
-            self.handeye_errors if self.arm else (0.0, 0.0),
-            arm,
-        )
+            self._noise_px(), self._cov_calibration(), self.board_print, bent, self.body_size, mount, lens,
+            t["skew"], t["start"], t["readout"], t["stamp"], speed, rotation,
+            self.handeye_errors if self.arm else (0.0, 0.0), arm,
+        )  # fmt: skip
 
     def _cov_calibration(self) -> Array:
         """Return the covariance (P, P) of the rig's parameters."""

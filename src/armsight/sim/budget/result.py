@@ -34,7 +34,8 @@ CHANGES: dict[str, tuple[int, Callable[[RigPlan], dict[str, object]]]] = {
 #: What another class of cameras brings along.
 OF_CAMERA: Mapping[str, Any] = {"focal_widths": 0.0, "skew_ms": -1.0, "start_ms": -1.0, "exposure_ms": -1.0}
 #: What ``best`` may choose where the plan does not name it: key -> least and most, m, image widths, and a factor.
-BOUNDS = {"baseline": (0.04, 1.0), "distance": (0.15, 4.0), "focal_widths": (0.6, 4.0), "body_scale": (0.4, 1.6)}
+BOUNDS = {"baseline": (0.04, 1.0), "distance": (0.15, 4.0), "focal_widths": (0.6, 4.0), "body_scale": (0.4, 1.6),
+          "body_depth": (1.0, 2.0)}  # fmt: skip
 #: Factors by which it is changed, one after the other; a last one nearer to 1: longer, and better by less than predicted.
 _FACTORS = (1.5, 1.15)
 _ENOUGH = 0.01  # a step that gains a smaller share ends the search; half: half as long again, double: 2 % worse
@@ -223,11 +224,7 @@ class Alternative(NamedTuple):
 
     budget: RigBudget
     group: int
-
-    @property
-    def price(self) -> int:
-        """The class of its price."""
-        return self.budget.plan.cameras.price
+    price: int
 
 
 def best(plan: RigPlan, progress: Callable[[str], None] = lambda _: None) -> tuple[Alternative, ...]:
@@ -248,7 +245,7 @@ def best(plan: RigPlan, progress: Callable[[str], None] = lambda _: None) -> tup
         progress(name)
         pairs = plan.pairs if "pairs" in plan.named else PAIRS
         searched = replace(_searched(replace(plan, **_of_camera(plan, name))), pairs=pairs)
-        if math.isfinite(_loss(searched)):
+        if math.isfinite(loss(searched)):
             found.append(RigBudget(searched, planned(searched)))
     if not found:
         plan.check()
@@ -258,7 +255,7 @@ def best(plan: RigPlan, progress: Callable[[str], None] = lambda _: None) -> tup
     for one in found:
         if one.mm > PREDICTED * first.mm:
             first, group = one, group + 1
-        groups.append(Alternative(one, group))
+        groups.append(Alternative(one, group, one.plan.cameras.price))
     return tuple(sorted(groups, key=lambda one: (one.price, one.budget.mm)))
 
 
@@ -268,43 +265,43 @@ def _of_camera(plan: RigPlan, name: str) -> dict[str, Any]:
 
 
 @lru_cache(maxsize=512)
-def _loss(plan: RigPlan) -> float:
+def loss(plan: RigPlan) -> float:
     """Return what 95 % are within in motion over what was requested, or m; infinity for what cannot be built."""
     try:
-        found = planned(plan)
+        found = RigBudget(plan, planned(plan)).moving
     except InputError:
         return math.inf
-    far, rotated = (float(each.max()) for each in found.at_level(found.cov()))
     m, rad = plan.requested or (1.0, 0.0)
-    return max(far / m, rotated / rad if rad else 0.0)
+    return max(found.level_m / m, found.level_rad / rad if rad else 0.0)
 
 
 def chosen(alternatives: tuple[Alternative, ...]) -> RigBudget:
     """Return the cheapest alternative that reaches what was requested, else that with the least error."""
     enough = [one.budget for one in alternatives if one.budget.plan.requested and one.budget.reached(one.budget.moving)]
-    return enough[0] if enough else min((one.budget for one in alternatives), key=lambda one: _loss(one.plan))
+    return enough[0] if enough else min((one.budget for one in alternatives), key=lambda one: loss(one.plan))
 
 
-def _fixed(plan: RigPlan) -> set[str]:
-    """Return what the search leaves: what is named, a body of its own, and a lens that came with the camera."""
-    return {*plan.named, *(("body_scale",) if plan.body else ()), *(("focal_widths",) if plan.cameras.focus_m else ())}
+def kept(plan: RigPlan) -> set[str]:
+    """Return what the search leaves: what is named, a body of its own or its depth where mm are asked, a webcam's lens."""
+    given = {"body_scale": plan.body, "body_depth": plan.body or not (plan.requested or (0, 0))[1]}
+    return {*plan.named, *(key for key, own in (given | {"focal_widths": plan.cameras.focus_m}).items() if own)}
 
 
 def _searched(plan: RigPlan) -> RigPlan:
     """Return a plan by a pattern search over what is free (Hooke and Jeeves 1961), of the start that can be built."""
-    fixed = _fixed(plan)
+    fixed = kept(plan)
     free = [key for key in BOUNDS if key not in fixed]
 
     def changed(now: RigPlan, key: str, by: float) -> RigPlan:
         lens = now.focal_px / now.image_size_px[0]
-        values = dict(zip(BOUNDS, (now.baseline_m, now.distance_m, lens, now.body_scale), strict=True))
+        values = dict(zip(BOUNDS, (now.baseline_m, now.distance_m, lens, now.body_scale, now.body_depth), strict=True))
         value = float(f"{min(max(by * values[key], BOUNDS[key][0]), BOUNDS[key][1]):.3g}")
         new: dict[str, Any] = {key: f"{value:g}m" if key in ("baseline", "distance") else value}
         return replace(now, **new)
 
     def better(now: RigPlan, others: Iterable[RigPlan]) -> RigPlan:
         for other in others:
-            now = other if _loss(other) < (1 - _ENOUGH) * _loss(now) else now
+            now = other if loss(other) < (1 - _ENOUGH) * loss(now) else now
         return now
 
     # A larger body needs more room, and a longer baseline: two at a time lead along such ridges.
@@ -318,7 +315,7 @@ def _searched(plan: RigPlan) -> RigPlan:
                 while (other := better(now, [reduce(lambda each, key: changed(each, key, by), keys, now)])) is not now:
                     now = other
     ends: list[dict[str, Any]] = [{"verging_deg": 0.0}]
-    if math.isfinite(_loss(now)):
+    if math.isfinite(loss(now)):
         found = planned(now)
         sharp, blurred = (float(found.at_level(found.cov(scaled="exposure blur", by=by))[0].max()) for by in (0.0, 1.0))
         shorter = (2, 4) if sharp < (1 - _ENOUGH) * blurred else ()

@@ -66,19 +66,19 @@ def body_patterns() -> tuple[Pattern, ...]:
     )
 
 
-def body_target(scale: float = 1.0) -> Composite:
-    """Return the target to find: what the body's file says, see :func:`body_text`; so many times as large."""
+def body_target(scale: float = 1.0, depth: float = 1.0) -> Composite:
+    """Return what :func:`body_text` describes: so many times as large, its wings so many times as far behind the plate."""
     spots = [(face, spot) for face in _FACES for spot in face.discs]
     points = np.array([transform(face.T_body_face, np.array([x, y, 0.0])) for face, (_, x, y, _) in spots])
-    body = Body(NAME, tuple(name for _, (name, *_) in spots), scale * points)
+    body = Body(NAME, tuple(name for _, (name, *_) in spots), scale * points * (1.0, 1.0, depth))
     radii = scale * np.array([radius for _, (*_, radius) in spots])
     normals = np.array([-face.T_body_face[:3, 2] for face, _ in spots])
     return Composite(NAME, (), DiscTarget(body, radii, np.ones(len(spots), dtype=bool), normals))
 
 
-def body_text(scale: float = 1.0) -> str:
-    """Return the body's file (docs/howto/targets.md), so many times as large."""
-    discs = body_target(scale).discs
+def body_text(scale: float = 1.0, depth: float = 1.0) -> str:
+    """Return the body's file (docs/howto/targets.md)."""
+    discs = body_target(scale, depth).discs
     assert discs is not None
     lines = ["version = 2", f'name = "{NAME}"']
     for name, p, normal, radius in zip(

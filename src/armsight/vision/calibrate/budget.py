@@ -74,7 +74,6 @@ class Conditions(Record):
         body_sigma_m: of each point of the body from its file, along its face and out of it, m.
         body_scale: of the body's size, as a share.
         mount_m: of the right camera's position along each axis since the calibration, m.
-        mount_rad: of its rotation about each axis, rad.
         lens_share: of each focal length since the calibration, as a share.
         skew_s: by how much the right exposures are later, uncorrected, s.
         start_s: standard deviation of what differs from shot to shot, s.
@@ -92,7 +91,6 @@ class Conditions(Record):
     body_sigma_m: tuple[float, float] = (0.0, 0.0)
     body_scale: float = 0.0
     mount_m: float = 0.0
-    mount_rad: float = 0.0
     lens_share: float = 0.0
     skew_s: float = 0.0
     start_s: float = 0.0
@@ -208,8 +206,8 @@ def pose_budget(rig: StereoRig, points: Array, normals: Array, views: list[Predi
     at, forward = [], np.zeros(3)
     by_rig = {
         "calibration": covariance_root(given.cov_calibration),
-        "print of the board": given.board_scale * _scaled_rig(rig),
-        "warming of the mount": _mount(rig, given),
+        "print of the board": given.board_scale * scaled_rig(rig),
+        "warming of the mount": given.mount_m * np.eye(rig.parameter_count)[:, -6:-3],
         "warming of the lenses": _lenses(rig, given.lens_share),
     }
     velocity = np.repeat(np.array([given.speed_m_s, given.rotation_rad_s]) / np.sqrt(3.0), 3)
@@ -283,17 +281,10 @@ def covariance_root(cov: Array) -> Array:
     return np.asarray(size[:, None] * vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
-def _scaled_rig(rig: StereoRig) -> Array:
+def scaled_rig(rig: StereoRig) -> Array:
     """Return (P, 1) how the rig's parameters change with the size of the board: only the baseline grows with it."""
     by = np.zeros((rig.parameter_count, 1))
     by[-6:-3, 0] = rig.T_left_right[:3, :3].T @ rig.T_left_right[:3, 3]
-    return by
-
-
-def _mount(rig: StereoRig, given: Conditions) -> Array:
-    """Return (P, 6) what the mount of the right camera does."""
-    by = np.zeros((rig.parameter_count, 6))
-    by[-6:] = np.diag(np.repeat([given.mount_m, given.mount_rad], 3))
     return by
 
 
