@@ -40,8 +40,8 @@ LATE_S = 12.0
 BLOCK_S, BEGIN_S = 2.5, 0.3
 #: Runs the simulated workcell again and again, and writes when each shot's command was sent, and how long it took.
 BESIDE = """
-import sys, time
-from armsight.app.main import main
+import gc, sys, time
+from armsight.app.main import run
 from armsight.loop.running import log
 
 class Timed(log.Rows):
@@ -54,11 +54,9 @@ def timed(self, *arguments, **named):
     before(self, *arguments, **named)
     self.latency_s = Timed()
 log.Log.__init__ = timed
+gc.set_threshold(100_000)
 for k in range(1000):
-    try:
-        main([*sys.argv[2:], "-o", f"beside{k}"])
-    except SystemExit:
-        pass
+    assert run([*sys.argv[2:], "-o", f"beside{k}"]) == 0
 """
 
 
@@ -272,7 +270,9 @@ def beside(seconds, run, core, others, folder, port):
         stderr=subprocess.DEVNULL,
         preexec_fn=lambda: os.sched_setaffinity(0, {core}),
     )
-    until(lambda: taken.exists() and taken.stat().st_size, 600)
+    until(lambda: alone.poll() is not None or (taken.exists() and taken.stat().st_size), 600)
+    if alone.poll() is not None:
+        raise SystemExit("the workcell beside has ended")
     other, number, ends, end = None, 0, [], time.monotonic() + seconds
     while time.monotonic() < end:
         if other is None or other.poll() is not None:
