@@ -107,13 +107,15 @@ def test_a_file_that_is_cut_short_says_so(film, picture):
     assert found[-1].problem == f"{path} is damaged or cut short: it ends at {(len(found) - 1) / 30:.3f} s of 0.667 s"
 
 
-def recorded(path, codec, kept, late=0, ticks=1):
+def recorded(path, codec, kept, late=0, ticks=1, sound_s=0.0, live=False):
     """Write frames of 30 a second, each of which has its number as its grey level, without those that are not kept.
 
-    With ticks a frame the numbers need not be whole.
+    With ticks a frame the numbers need not be whole. A live file is Matroska without a duration.
     """
-    with av.open(str(path), "w") as file:
+    opened = {"format": "matroska", "options": {"live": "1"}} if live else {}
+    with av.open(str(path), "w", **opened) as file:
         stream = file.add_stream(codec, rate=30)
+        sound = file.add_stream("aac", rate=48000) if sound_s else None
         stream.height, stream.width, stream.pix_fmt = 48, 128, "yuvj420p" if codec == "mjpeg" else "yuv420p"
         stream.codec_context.time_base = Fraction(1, 30 * ticks)
         for k in kept:
@@ -121,6 +123,37 @@ def recorded(path, codec, kept, late=0, ticks=1):
             frame.pts, frame.time_base = round(k * ticks) + late, stream.codec_context.time_base
             file.mux(stream.encode(frame))
         file.mux(stream.encode())
+        for k in range(round(sound_s * 48000) // 1024):
+            silence = av.AudioFrame.from_ndarray(np.zeros((1, 1024), np.float32), format="fltp", layout="mono")
+            silence.sample_rate, silence.pts, silence.time_base = 48000, 1024 * k, Fraction(1, 48000)
+            file.mux(sound.encode(silence))
+        if sound:
+            file.mux(sound.encode(None))
+
+
+@pytest.mark.parametrize("suffix", ["mp4", "mkv", "ts", "avi"])
+def test_sound_that_lasts_longer_than_the_images_is_no_damage(tmp_path, suffix):
+    path = tmp_path / f"both.{suffix}"
+    recorded(path, "libx264", range(20), sound_s=1.0)
+    assert [shot.problem for shot in shots(f"video:{path}")] == [None] * 20
+
+
+def test_matroska_with_sound_that_is_cut_short_says_so(tmp_path):
+    path = tmp_path / "both.mkv"
+    recorded(path, "libx264", range(60), sound_s=3.0)
+    path.write_bytes(path.read_bytes()[:1500])
+    assert "is damaged or cut short: it ends at" in shots(f"video:{path}")[-1].problem
+
+
+def test_files_of_one_clock_without_a_duration_are_paired(tmp_path):
+    paths = [tmp_path / "left.mkv", tmp_path / "right.mkv"]
+    for path, first in zip(paths, (3, 10), strict=True):
+        recorded(path, "libx264", range(first, first + 20), live=True)
+    assert Film(str(paths[0])).promised_s == 0
+    both = [shot for shot in shots(f"video:{paths[0]},{paths[1]}") if shot.problem is None]
+    assert [[math.ceil(image.mean() / 5) for image in (shot.left, shot.right)] for shot in both] == [
+        [k, k] for k in range(10, 23)
+    ]
 
 
 @pytest.mark.parametrize("suffix", ["mkv", "ts"])

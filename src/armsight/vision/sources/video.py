@@ -16,6 +16,7 @@ import bisect
 import contextlib
 import itertools
 import os
+import re
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
 from pathlib import Path
@@ -55,6 +56,7 @@ _MIXED, _MOVED_GREY = 0.08, 12.0
 #: Share of such pixels below which nothing is said to move.
 _MOVED_LEAST = 0.002
 
+_DURATION = re.compile(r"(\d+):(\d+):(\d+(?:\.\d+)?)")
 #: What a player would fetch: a file may name others, and addresses.
 _OPTIONS = {"protocol_whitelist": "file"}
 
@@ -185,8 +187,7 @@ class Film:
         path: the file.
         size_px: width and height of its images.
         period_s: between two frames, s; infinite where the file does not say.
-        promised_s: how long the file says it is, s; an estimate in some containers. (The number of frames that an AVI says
-            is not that of those in it: it counts those that the recorder dropped; an MP4's those that an edit list hides.)
+        promised_s: how long the file says its images last, s, an estimate in some containers; 0 where it does not say.
         begin_s: when it begins by its own clock, s.
         late_s: how much later than the times' zero it begins, s.
         frames: how many were decoded.
@@ -219,10 +220,7 @@ class Film:
         self._time_base: Fraction = self._stream.time_base or Fraction(1)
         self._start = self._stream.start_time or 0
         self.begin_s, self.late_s = float(self._start * self._time_base), 0.0
-        if self._stream.frames and average and "mp4" not in self._container.format.name:
-            self.promised_s = float(self._stream.frames / average)
-        else:  # the duration counts from zero
-            self.promised_s = (self._container.duration or 0) / 1e6 - self.begin_s
+        self.promised_s = self._promised_s()
         self.frames = self.undecoded = 0
         self.t_s = self.end_s = 0.0
         self._frame: VideoFrame | None = None
@@ -241,6 +239,20 @@ class Film:
         if context.width * context.height > MOST_PIXELS:
             return f"frames of {context.width}x{context.height} px, more than {MOST_PIXELS >> 20} Mpx"
         return None if context.width * context.height else "damaged: its frames have no size"
+
+    def _promised_s(self) -> float:
+        """Return how long the file says its images last, s; the container's duration is that of its sound, too."""
+        if self._stream.frames and self._stream.average_rate and "mp4" not in self._container.format.name:
+            return float(
+                self._stream.frames / self._stream.average_rate
+            )  # an MP4 counts those that its edit list hides
+        if self._stream.duration:
+            return float(self._stream.duration * self._time_base)
+        said = _DURATION.fullmatch(self._stream.metadata.get("DURATION", ""))
+        if said:  # Matroska's, which counts from zero as the container's does
+            return 3600 * int(said[1]) + 60 * int(said[2]) + float(said[3]) - self.begin_s
+        alone_us = self._container.duration if len(self._container.streams) == 1 else None
+        return alone_us / 1e6 - self.begin_s if alone_us else 0.0
 
     def _decoded(self) -> Iterator[VideoFrame]:
         """Yield what can be decoded; a damaged packet is counted, a damaged container is the end."""
@@ -389,7 +401,7 @@ def _one_clock(first: Film, last: Film) -> tuple[str, ...]:
     late_s = later.begin_s - early.begin_s
     if late_s <= early.period_s / 2:
         return ()
-    if late_s >= early.promised_s:
+    if 0 < early.promised_s <= late_s:
         return (f"{later.path} begins {late_s:.3f} s after {early.path}, past its end: their beginnings are paired",)
     later.late_s = later.t_s = late_s
     return (
