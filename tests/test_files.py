@@ -351,3 +351,17 @@ def test_a_folder_is_for_one_process_of_a_command(tmp_path):
     with alone_in(tmp_path / "live", "hub"):
         (tmp_path / "live" / "events").touch()
     assert [each.name for each in (tmp_path / "live").iterdir()] == ["events"]
+    (own := tmp_path / "own").mkdir()
+    with alone_in(own, "run"):
+        pass
+    assert own.exists()  # nobody but its maker removes it
+
+
+@pytest.mark.parametrize(("method", "error"), [("mkdir", FileExistsError), ("open", FileNotFoundError)])
+def test_a_folder_that_another_process_is_just_removing_is_in_use(tmp_path, monkeypatch, method, error):
+    def gone(*_, **__):
+        raise error
+
+    monkeypatch.setattr(type(tmp_path), method, gone)
+    with pytest.raises(InputError, match="another run uses it"):
+        alone_in(tmp_path / "x", "run").__enter__()

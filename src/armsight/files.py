@@ -557,24 +557,29 @@ def check_outputs(outputs: Iterable[str | Path | None], inputs: Iterable[str | P
 
 @contextlib.contextmanager
 def alone_in(folder: Path, command: str) -> Iterator[None]:
-    """Keep a folder, which is made, to one process of any command; a folder that stays empty is removed again.
+    """Keep a folder, which is made, to one process of any command; one that was made and stays empty is removed again.
 
     Raises:
         InputError: another one uses it.
     """
     import fcntl  # POSIX
 
-    folder.mkdir(parents=True, exist_ok=True)
-    path = folder / "in_use.lock"
-    with path.open("a+", encoding="utf-8") as lock:
+    path, ours, used = folder / "in_use.lock", not folder.exists(), "uses it: give this one another folder, -o FOLDER"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = path.open("a+", encoding="utf-8")
+    except (FileNotFoundError, FileExistsError):
+        if os.path.lexists(folder) and not folder.is_dir():
+            raise
+        raise InputError(f"{folder}: another {command} {used}") from None  # the one who ends has just removed it
+    with lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             if not os.fstat(lock.fileno()).st_nlink:  # the one who ends has just removed it
                 raise BlockingIOError
         except BlockingIOError:
             lock.seek(0)
-            other = lock.read() or command
-            raise InputError(f"{folder}: another {other} uses it: give this one another folder, -o FOLDER") from None
+            raise InputError(f"{folder}: another {lock.read() or command} {used}") from None
         except OSError as error:  # a file system without locks
             raise InputError(
                 f"{folder}: cannot be kept to one {command}: {error.strerror}: give another folder"
@@ -587,7 +592,8 @@ def alone_in(folder: Path, command: str) -> Iterator[None]:
         finally:
             with contextlib.suppress(OSError):
                 path.unlink()
-                folder.rmdir()  # where nothing came to be in it
+                if ours:
+                    folder.rmdir()  # where nothing came to be in it
 
 
 def check_folder(

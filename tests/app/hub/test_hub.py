@@ -191,6 +191,7 @@ def test_a_cell_writes_below_its_own_name_alone(hub_at, cell_at, port, tmp_path,
     hub._look_for_names()
     assert {each["cell"] for each in hub._store.events()} == {"a"}  # a cell that is about to begin is none
     hub._look_for_names()
+    hub._look_for_names()  # it is said once
     assert set(shown(hub)) == {"a"}
     (found,) = [each for each in hub._store.events() if each["cell"] == "hub"]
     assert found["kind"] == "rejected"

@@ -11,6 +11,7 @@ import pytest
 from armsight.app.hub.cells import CHANCE, FINDING, LOOK, LOST, WELL, CellView, Slopes, drifts, look_for_drifts, ranked
 from armsight.app.hub.keys import make_keys, site_of
 from armsight.app.hub.push import push
+from armsight.app.hub.router import parsed
 from armsight.app.hub.store import Store
 from armsight.app.stream.cell_file import Cell, read_cell
 from armsight.app.stream.outbox import Outbox
@@ -331,6 +332,18 @@ def test_a_clock_that_runs_fast_is_shown_with_its_rate():
     shown = cell.to_json(1400.0)
     assert shown["clock_s"] == pytest.approx(0.54, abs=0.001)
     assert shown["clock_s_per_h"] == pytest.approx(0.36, rel=0.01)
+
+
+def test_half_a_pair_of_utf_16_is_stored_as_a_question_mark(tmp_path):
+    """JSON may hold what no text of UTF-8 is; it stopped the hub, and its cell sent the same events for ever."""
+    store, cell = Store(tmp_path), CellView("lab", "a")
+    sent = b'{"outbox": "x", "events": [{"n": 1, "t": 5.0, "text": "a\\ud800"}], "t": 5.0, "health": ["\\udc00"]}'
+    assert store.add_events("lab", "a", parsed(sent), 5.0) == 1
+    assert [each["text"] for each in store.events()] == ["a?"]
+    store.add_state(cell, cell.take(parsed(sent), 5.0))
+    store.close()
+    assert store.problem == ""
+    assert parsed(b"") == "a message that is no JSON"
 
 
 def test_unreadable_events_do_not_hold_up_the_others(tmp_path):

@@ -1,6 +1,7 @@
 """A hub's certificates at a small broker, read by protobuf itself with the messages of sparkplug_b.proto."""
 
 import socket
+import sqlite3
 import struct
 import threading
 import time
@@ -8,6 +9,7 @@ from contextlib import suppress
 
 import pytest
 
+from armsight.app.hub import service
 from armsight.app.hub.cells import CellView
 from armsight.app.hub.sparkplug import Node, payload
 from armsight.errors import InputError
@@ -125,6 +127,8 @@ def test_a_hub_is_born_sends_what_changes_and_dies(wait):
         return [(topic.removeprefix("spBv1.0/lab/"), *read(data)) for topic, data, _, _ in broker.said]
 
     wait(lambda: node._connected.is_set() and broker.subscribed)
+    asked, on_message = [], node._client.on_message
+    node._client.on_message = lambda *message: asked.append(on_message(*message))
     node.update(shown())
     born, first, second = said(3)
     assert broker.subscribed == [("spBv1.0/lab/NCMD/hub", 1)]
@@ -146,6 +150,10 @@ def test_a_hub_is_born_sends_what_changes_and_dies(wait):
     assert data[2] == {"level": 1, "why": "error 0.25 mm, more than its limit of 0.10", "error_mm": 0.25}
     assert death == ("DDEATH/hub/table-2", 4, {})
     broker.put("spBv1.0/lab/NCMD/hub", payload(1.0, {"Node Control/Reboot": (bool, True)}, None))
+    broker.put("spBv1.0/lab/NCMD/hub", payload(1.0, {"Node Control/Rebirth": (bool, False)}, None))
+    broker.put("spBv1.0/lab/NCMD/hub", payload(1.0, {"Node Control/Reboot": (bool, True)}, None) + b"\x18\x01")
+    wait(lambda: len(asked) == 3)
+    assert not node._birth.is_set()
     broker.put("spBv1.0/lab/NCMD/hub", payload(1.0, {"Node Control/Rebirth": (bool, True)}, None))
     wait(node._birth.is_set)
     node.update(shown())
@@ -161,6 +169,39 @@ def test_a_hub_is_born_sends_what_changes_and_dies(wait):
     assert [qos for _, _, qos, _ in broker.said] == [0] * 9 + [1]
     assert not any(retained for *_, retained in broker.said)
     assert notes == []
+
+
+def test_a_failure_is_said_and_ends_neither_thread_nor_store(port, wait, tmp_path, monkeypatch):
+    monkeypatch.setattr(service, "STATE_S", 0.05)
+    broker, said = Broker(), []
+    address = f"mqtt://127.0.0.1:{broker.port}"
+    hub = service.Hub(tmp_path, f"tcp/127.0.0.1:{port}", "127.0.0.1:0", None, said.append, address)
+    fails = {"table-1"}
+
+    def update(node, cells):
+        if fails & {each["name"] for each in cells}:
+            raise ValueError(cells[0]["name"])
+        of_node(node, cells)
+
+    of_node = Node.update
+    monkeypatch.setattr(Node, "update", update)
+    for name in ("table-1", "table-2"):
+        hub._heard.put(("lab", name, "alive", time.time(), ("s", True)))
+        hub._heard.put(("lab", name, "state", time.time(), {"t": time.time(), "health": ["\ud800"]}))
+    births = lambda: [topic.split("/")[-1] for topic, *_ in broker.said if "/DBIRTH/" in topic]  # noqa: E731
+    wait(births)
+    assert births() == ["table-2"]
+    assert said == ["MQTT is without lab/table-1: ValueError: table-1"]
+    fails.clear()
+    wait(lambda: births() == ["table-2", "table-1"])
+
+    def lost(*_, **__):
+        raise RuntimeError("Message publish failed: not connected")  # as of paho's wait_for_publish
+
+    monkeypatch.setattr(hub._nodes["lab"]._client, "publish", lost)
+    hub.close()
+    with pytest.raises(sqlite3.ProgrammingError):
+        hub._store.count()  # it is closed
 
 
 def test_no_broker_is_said_once(port, wait):

@@ -136,7 +136,7 @@ def hold_command(cell: str, reason: str, keys: Path, address: str, as_json: bool
 def clocks_command(first: Path, second: Path, as_json: bool) -> None:
     """Say how far two rigs' clocks are apart, by a motion of one body that both measured.
 
-    POSES and OTHERS are tables of poses with times, such as the shots.csv of measure.
+    POSES and OTHERS are tables of poses with times, such as measure -o FILE writes.
     """
     from armsight.loop.delay import time_between
     from armsight.tables.poses import read_pose_table

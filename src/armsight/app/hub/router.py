@@ -96,7 +96,7 @@ class Router:
 
     def _state(self, sample: Any) -> None:  # noqa: ANN401 - of the library
         _, site, cell, _ = str(sample.key_expr).split("/")
-        self._heard((site, cell, "state", time.time(), _json(sample.payload)))
+        self._heard((site, cell, "state", time.time(), parsed(sample.payload.to_bytes())))
 
     def _token(self, sample: Any) -> None:  # noqa: ANN401 - of the library
         _, site, cell, _, session = str(sample.key_expr).split("/")
@@ -105,17 +105,16 @@ class Router:
 
     def _events(self, query: Any) -> None:  # noqa: ANN401 - of the library
         _, site, cell, _ = str(query.key_expr).split("/")
-        if (n := self._stored(site, cell, _json(query.payload))) > 0:
+        if (n := self._stored(site, cell, parsed(query.payload.to_bytes() if query.payload else b""))) > 0:
             query.reply(query.key_expr, str(n).encode())
 
 
-def _json(payload: Any) -> Any:  # noqa: ANN401 - whatever JSON holds
-    """Return the JSON of a message; a text that says why where it is none, or too long."""
-    data = b"" if payload is None else payload.to_bytes()
+def parsed(data: bytes) -> Any:  # noqa: ANN401 - whatever JSON holds
+    """Return the JSON of a message, its texts those of UTF-8; a text that says why where it is none, or too long."""
     if len(data) > LONGEST:
         return f"a message of {len(data)} bytes: at most {LONGEST} are read"
     try:
-        return json.loads(data)
+        return json.loads(json.dumps(json.loads(data), ensure_ascii=False).encode(errors="replace"))
     except (ValueError, RecursionError):
         return "a message that is no JSON"
 

@@ -16,7 +16,7 @@ from typing import Any
 
 from armsight.app.hub.cells import LOOK_S, CellView, look_for_drifts, number, ranked
 from armsight.app.hub.keys import HUB, site_of
-from armsight.app.hub.router import Heard, Link, Router
+from armsight.app.hub.router import Heard, Link, Router, parsed
 from armsight.app.hub.sparkplug import Node, check_address
 from armsight.app.hub.store import FLUSH_S, Store
 from armsight.app.show.http import Answer, Pages, metrics_text
@@ -80,7 +80,8 @@ class Hub:
         self._heard: queue.Queue[Heard] = queue.Queue()
         self._dropped, self._problem = 0, ""
         self._site = None if keys is None else site_of(keys)[0]
-        self._rejected, self._rejected_s, self._misnamed = 0, -math.inf, set[Link]()
+        self._rejected, self._rejected_s, self._failed = 0, -math.inf, dict[str, str]()
+        self._misnamed: dict[Link, bool] = {}  # whether it has been said
         self._lock = threading.Lock()  # of the cells
         self._cached = dict[bool, tuple[float, bytes]]()  # whether with the errors of a day -> when made, the answer
         self._asking = ThreadPoolExecutor(4, "ask")
@@ -104,8 +105,8 @@ class Hub:
         self.pages.close()
         self._ended.set()
         self._thread.join(10.0)
-        for node in self._nodes.values():
-            node.close()
+        for site, node in self._nodes.items():
+            self._try(f"MQTT of {site}", node.close)
         self._asking.shutdown(wait=False, cancel_futures=True)
         self._store.close()
 
@@ -144,46 +145,53 @@ class Hub:
         return n
 
     def _run(self) -> None:
-        flushed = looked = published = time.monotonic()
+        tasks = [(LOOK_S, self._look), (FLUSH_S, self._store.flush), (STATE_S, self._publish)]
+        done = [time.monotonic()] * len(tasks)
         while not (self._ended.is_set() and self._heard.empty()):
             with suppress(queue.Empty):
                 heard = self._heard.get(timeout=0.2)
-                try:
-                    self._take(heard)
-                except Exception as error:  # noqa: BLE001 - one message must not end the hub
-                    self._say(f"a message of {heard[0]}/{heard[1]} was not taken: {type(error).__name__}: {error}")
-            if time.monotonic() - looked > LOOK_S:
-                looked = time.monotonic()
-                with self._lock:
-                    look_for_drifts(self._cells, time.time())
-                self._look_for_names()
-            if self._mqtt is not None and time.monotonic() - published > STATE_S:
-                published = time.monotonic()
-                self._publish(self._mqtt)
-            if time.monotonic() - flushed > FLUSH_S:
-                flushed = time.monotonic()
-                self._store.flush()
+                self._try(f"a message of {heard[0]}/{heard[1]} was not taken", self._take, heard)
+            for k, (every_s, task) in enumerate(tasks):
+                if time.monotonic() - done[k] > every_s:
+                    done[k] = time.monotonic()
+                    self._try(f"the hub goes on without {task.__name__}", task)
             if self._store.problem != self._problem:
                 self._problem = self._store.problem
                 if self._problem:
                     self._say(self._problem)
 
-    def _publish(self, mqtt: str) -> None:
+    def _try(self, what: str, do: Callable[..., None], *given: object) -> None:
+        """Do what must not end the hub where it fails; the same failure is said once until it succeeds."""
+        try:
+            do(*given)
+            self._failed.pop(what, None)
+        except Exception as error:  # noqa: BLE001
+            why = f"{type(error).__name__}: {error}"
+            if self._failed.get(what) != why:
+                self._failed[what] = why
+                self._say(f"{what}: {why}")
+
+    def _publish(self) -> None:
         """Publish the cells as devices of a node a site."""
-        cells = self.snapshot()["cells"]
-        for site in {cell["site"] for cell in cells} - self._nodes.keys():
-            self._nodes[site] = Node(site, mqtt, self._say)
-        for site, node in self._nodes.items():
-            node.update([cell for cell in cells if cell["site"] == site])
+        for cell in self.snapshot()["cells"] if self._mqtt else []:
+            site = cell["site"]
+            if site not in self._nodes:
+                self._nodes[site] = Node(site, str(self._mqtt), self._say)
+            self._try(f"MQTT is without {site}/{cell['name']}", self._nodes[site].update, [cell])
+
+    def _look(self) -> None:
+        with self._lock:
+            look_for_drifts(self._cells, time.time())
+        self._look_for_names()
 
     def _look_for_names(self) -> None:
         """Reject whoever has the key of a cell and for a minute another name."""
         links = set(self._router.links())
         with self._lock:
             wrong = {each for each in links if each[1] not in self._cells.get(each[0], CellView("", "")).sessions}
-        for (_, name), _, address in sorted(wrong & self._misnamed):
-            self._reject(f"{address} has the key of {name} and sends under another name: correct its cell.toml")
-        self._misnamed = wrong
+        for each in sorted(link for link in wrong if self._misnamed.get(link) is False):
+            self._reject(f"{each[2]} has the key of {each[0][1]} and sends under another name: correct its cell.toml")
+        self._misnamed = {link: link in self._misnamed for link in wrong}
 
     def _take(self, heard: Heard) -> None:
         site, name, what, at_s, content = heard
@@ -214,10 +222,7 @@ class Hub:
 
     def _ask_about(self, cell: CellView) -> None:
         """Ask a cell that has connected who it is."""
-        try:
-            about = json.loads(self._router.ask(cell.site, cell.name, "about") or b"{}")
-        except (ValueError, RecursionError):
-            return
+        about = parsed(self._router.ask(cell.site, cell.name, "about"))
         if isinstance(about, dict) and about:
             texts = {key: about[key][:200] for key in _TEXTS if isinstance(about.get(key), str)}
             numbers = {key: number(about.get(key)) for key in ("rig_heldout_mm", "limit_mm")}

@@ -13,6 +13,7 @@ import struct
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 from armsight.app.hub.cells import NUMBERS
@@ -22,6 +23,10 @@ from armsight.app.show.messages import require
 from armsight.errors import InputError
 
 _REBIRTH = "Node Control/Rebirth"
+#: In a command: the metric, its short fields, and its value, true; every writer of protobuf has fields in their order.
+_ASKED = re.compile(
+    rb"Node Control/Rebirth(?:[\x10\x18\x20\x28\x30\x38][\x80-\xff]*[\x00-\x7f])*(?:[\x42\x4a].*)?\x70\x01", re.DOTALL
+)
 _ADDRESS = re.compile(r"(mqtts?)://(?:([^@/]+)@)?(\[[0-9a-fA-F:]+\]|[\w.-]+)(?::(\d{1,5}))?")
 #: Where the password of the broker is: a command line is read by all of a computer.
 _PASSWORD = "ARMSIGHT_MQTT_PASSWORD"
@@ -78,7 +83,7 @@ def payload(t_s: float, values: Mapping[str, tuple[type, Value]], seq: int | Non
     out = _field(1, t)
     for name, (kind, value) in values.items():
         datatype, field = _KINDS[kind]
-        data = value.encode() if isinstance(value, str) else value
+        data = value.encode(errors="replace") if isinstance(value, str) else value
         last = _field(7, True) if data is None else _field(field, data if isinstance(data, bytes) else kind(data))
         out += _field(2, _field(1, name.encode()) + _field(3, t) + _field(4, datatype) + last)
     return out if seq is None else out + _field(3, seq)
@@ -149,7 +154,8 @@ class Node:
     def close(self) -> None:
         """Publish the death, and leave."""
         if self._connected.is_set():
-            self._client.publish(self._topic("NDEATH"), self._death_payload(), qos=1).wait_for_publish(1.0)
+            with suppress(RuntimeError, ValueError):  # of the library: the connection was lost, and it has not noticed
+                self._client.publish(self._topic("NDEATH"), self._death_payload(), qos=1).wait_for_publish(1.0)
         self._client.disconnect()
         self._client.loop_stop()
 
@@ -178,7 +184,7 @@ class Node:
         self._connected.set()
 
     def _asked(self, _: Any, __: Any, message: Any) -> None:  # noqa: ANN401 - of the library
-        if _REBIRTH.encode() in message.payload:
+        if _ASKED.search(message.payload):
             self._birth.set()
 
     def _went(self, client: Any, *_: Any) -> None:  # noqa: ANN401 - of the library

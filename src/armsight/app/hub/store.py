@@ -155,7 +155,7 @@ class Store:
                 path.parent.mkdir(parents=True, exist_ok=True)
                 with replacing(path, "wb") as file:
                     pq.write_table(pa.Table.from_pylist(states, schema), file)
-            except (OSError, InputError) as error:
+            except (OSError, InputError, ValueError) as error:  # ValueError: of pyarrow, too
                 self.problem = f"states are not stored: {error}"
         oldest = "SELECT arrived FROM events ORDER BY arrived DESC LIMIT 1 OFFSET ?"
         with suppress(sqlite3.Error), self._lock, self._db:
