@@ -81,6 +81,8 @@ LS = (
 )
 DTX = '<Database><Datas><Data name="p" access="public" xsi:type="array" type="pointRx" size="6">\n'
 
+TARGET = "[[1,2,3],[1,0,0,0],[0,0,0,0],[9E9,9E9,9E9,9E9,9E9,9E9]]"
+
 #: Program and its source -> file name, text, options. All give the poses A.
 FORMS = {
     "quaternions by their names": ("q.csv", csv("x_m,y_m,z_m,qw,qx,qy,qz", P, WXYZ), {}),
@@ -219,6 +221,23 @@ FORMS = {
             MM,
             np.radians(FIXED),
         ),
+        {},
+    ),
+    "xArm Python SDK in degrees beside calls in radians": (
+        "p.py",
+        "# relative=True and set_tool_position(..) aren't used here\n"
+        + rows("arm.set_position({}, {}, {}, {}, {}, {})", MM, FIXED)
+        + "print(arm.get_position(is_radian=True))  # arm.set_position(1, 2, 3, 4, 5, 6)\n",
+        {},
+    ),
+    "xArm Python SDK whose default is radians": (
+        "p.py",
+        "arm.default_is_radian = True\n" + rows("arm.set_position({}, {}, {}, {}, {}, {})", MM, np.radians(FIXED)),
+        {},
+    ),
+    "Universal Robots with the tool and the motion in one line": (
+        "p.script",
+        rows("set_tcp(pose_add(t, p[0,0,0.12,0,0,0])); movel(p[{},{},{},{},{},{}]) # p[0,0,0,0,0,0]", P, VECTOR),
         {},
     ),
     "xArm JSON of positions": (
@@ -535,7 +554,14 @@ def test_each_program_gives_the_same_joints(tmp_path, form):
                 ("p.src", "PTP {X 1,Y 2,Z 3,A 4,B 5,C 6}\nLIN_REL {X 0,Y 0,Z 9,A 0,B 0,C 0}", "LIN_REL"),
                 ("p.drl", "movel(posx(1,2,3,4,5,6))\nmovel(posx(0,0,9,0,0,0), mod=DR_MV_MOD_REL)", "DR_MV_MOD_REL"),
                 ("p.py", "a.set_position(1,2,3,4,5,6)\na.set_position(0,0,9,0,0,0, relative=True)", "relative=True"),
+                ("p.src", "PTP {X 1,Y 2,Z 3,A 4,B 5,C 6} ; no LIN_REL {Z 1}\nLIN_REL {Z 9}", "LIN_REL"),
+                ("p.drl", "movel(posx(1,2,3,4,5,6))\nmovel(posx(0,0,9,0,0,0), v=[9, 9], mod=1)", "mod=1"),
+                ("p.drl", "movel(posx(1,2,3,4,5,6))\namovel(posx(0,0,9,0,0,0), ref=DR_TOOL)", "DR_TOOL"),
+                ("p.drl", "movel(posx(1,2,3,4,5,6))\nmovel(trans(posx(1,2,3,4,5,6), [0,0,9,0,0,0]))", "trans"),
+                ("p.mod", f"MODULE P\nMoveL RelTool({TARGET},0,0,100), v100, fine, tool0;", "RelTool"),
+                ("p.py", "a.set_position(1,2,3,4,5,6)\na.set_tool_position(0,0,9,0,0,0)", "set_tool_position"),
                 ("p.script", "movel(p[1,2,3,0,0,0])\nmovel(pose_trans(p1, p[0,0,0.1,0,0,0]))", "pose_trans"),
+                ("p.script", "movel(p[1,2,3,0,0,0])\nmovel(pose_trans(get(),\n  p[0,0,0.1,0,0,0]))", "pose_trans"),
                 (
                     "p.LS",
                     "/MN\n 1:L P[1] 100mm/sec FINE INC ;\n/POS\n" + rows(LS, MM, FIXED),

@@ -137,16 +137,31 @@ _KRL = re.compile(r"\{\s*(?:\w+\s*:\s*)?([A-Z]\w*\s+[-+.\deE]+(?:\s*,\s*[A-Z]\w*
 _KRL_KEYS = (("X", "Y", "Z", "A", "B", "C"), ("A1", "A2", "A3", "A4", "A5", "A6"))
 #: What only points have; motions between them have other names ({VEL 100.0,ACC 100.0}).
 _OF_A_POINT = {"X", "Y", "Z", *_KRL_KEYS[1]}
-#: Lines of tools, frames, loads and speeds, whose numbers have the form of points.
+#: Comments. A # before a name and a number is Kawasaki's joint, // before capitals Yaskawa's section.
+_COMMENT = re.compile(
+    r"(?<![^\s;,)\]}])#(?![A-Za-z]\w*(?:\[\d+\])?[ \t]+[-+.\d]).*|^[ \t]*;.*|(?:^|;)[ \t]*(?:\d+:[ \t]*)?!(?!=).*|"
+    r"(?<![:/])//(?!/?[A-Z]{3,}\b).*",
+    re.MULTILINE,
+)
+#: A comment after the one ' of a line; strings have two.
+_APOSTROPHE = re.compile(r"^([^'\"\n]*)'[^'\n]*$", re.MULTILINE)
+#: Where a semicolon begins a comment, too: KUKA's and Kawasaki's.
+_SEMICOLON = re.compile(rf"{_KRL.pattern}|^\s*\.(?:PROGRAM|TRANS|JOINTS)\b", re.MULTILINE)
+#: What stands in the parentheses of a call, with two more within each other.
+_ARGUMENTS = r"(?:[^()]|\((?:[^()]|\([^()]*\))*\))*"
+_CALL = re.compile(rf"\w+\s*\({_ARGUMENTS}\)")
+#: Tools, frames, loads and speeds, whose numbers have the form of points.
 _BESIDE = re.compile(
-    r"^.*\b(?:(?:tool|wobj|load|speed|zone)data|Set[TW]rf|set_tcp|(?:BASE|TOOL)_DATA)\b.*$|"
-    r"^[ \t]*(?:DECL\s+)?(?:GLOBAL\s+)?(?:FRAME\b.*)?\$.*$",
+    rf"\b(?:Set[TW]rf|set_tcp)\s*\({_ARGUMENTS}\)|\b(?:tool|wobj|load|speed|zone)data\b[^;\n]*|"
+    r"^.*\b(?:BASE|TOOL)_DATA\b.*$|^[ \t]*(?:DECL\s+)?(?:GLOBAL\s+)?(?:FRAME\b.*)?\$.*$",
     re.MULTILINE | re.IGNORECASE,
 )
 #: What moves by numbers from where the arm is, or gives a pose in that of another one.
 _RELATIVE = re.compile(
-    r"\bMoveLinRel[TW]rf\s*\(|\b\w+_REL\s*\{|\bDR_MV_MOD_REL\b|\brelative\s*=\s*True\b|"
-    r"\bpose_(?:trans|add|sub)\s*\(.*\bp\[|\bP\[\d+.*\bINC\b",
+    r"\bMove(?:LinRel[TW]rf|JointsRel)\s*\(|\b\w+_REL\s*\{|\bDR_MV_MOD_REL\b|\brelative\s*=\s*True\b|"
+    rf"\bpose_(?:trans|add|sub)\s*\({_ARGUMENTS}?\bp\[|\b(?:trans|addto)\s*\({_ARGUMENTS}?\bpos[xj]\s*\(|"
+    rf"\ba?move[a-z]{{1,2}}\s*\({_ARGUMENTS}?,\s*(?:mod\s*=\s*1|ref\s*=\s*(?:1|DR_TOOL))\b|"
+    r"\b(?:RelTool|Offs)\s*\(\s*\[\s*\[|\bP\[\d+.*\bINC\b|\bset_tool_position\s*\(",
     re.IGNORECASE,
 )
 
@@ -166,24 +181,29 @@ def program_rows(path: Path, text: str) -> ProgramPoints | None:
     Raises:
         InputError: a point that lacks a number, poses and joints in one file, or pulses.
     """
-    kept = _BESIDE.sub("", text)
+    code = _APOSTROPHE.sub(r"\1", _COMMENT.sub("", text))
+    if _SEMICOLON.search(code):
+        code = re.sub(";.*", "", code)
+    kept = _BESIDE.sub(lambda beside: "\n" * beside[0].count("\n"), code)
+    if (relative := _RELATIVE.search(kept)) and _is_program(kept):
+        raise InputError(
+            f"{path}: line {_line(kept, relative)}: {' '.join(relative[0].split())!r} is a motion or pose relative to "
+            "another one, not to the base: write the pose it ends at, or delete the line if no image was taken there"
+        )
     found = _program_points(path, kept)
-    if found is None:
-        return None
-    for line, row in enumerate(kept.splitlines(), 1):
-        if relative := _RELATIVE.search(row):
-            raise InputError(
-                f"{path}: line {line}: {relative[0]!r} is a motion or pose relative to another one, not to the base: write "
-                "the pose it ends at, or delete the line if no image was taken there"
-            )
     passed = (f"{path}: tools, frames and loads are passed over",)
-    return found if kept == text else found._replace(notes=(*passed, *found.notes))
+    return found if found is None or kept == code else found._replace(notes=(*passed, *found.notes))
+
+
+def _is_program(text: str) -> bool:
+    """Return whether a text has what shows a robot's program."""
+    marks = (_UR.pattern, *(program.mark for program in PROGRAMS))
+    return bool(_points_in(text)) or any(re.search(mark, text, re.MULTILINE) for mark in marks)
 
 
 def _program_points(path: Path, text: str) -> ProgramPoints | None:
-    """Return the points of a program without its tools and frames."""
-    written = [(line, row.strip()) for line, row in enumerate(text.splitlines(), 1)]
-    written = [(line, row) for line, row in written if row and not row.startswith("#")]
+    """Return the points of a program without its comments, tools and frames."""
+    written = [(line, row.strip()) for line, row in enumerate(text.splitlines(), 1) if row.strip()]
     if any(_UR.search(row) for _, row in written):
         return ProgramPoints(["x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad"], _poses_of_ur(path, written), None, ())
     if any(_points_in(row) for _, row in written):
@@ -217,21 +237,21 @@ def _points(path: Path, text: str, program: Program) -> ProgramPoints | None:
         raise InputError(f"{path}: its points are of several frames or tools ({named}): keep those of one in a file")
     if not poses and not joints:
         return None
-    unit = _unit(path, text, len(joints) or len(poses))
+    unit = _unit(path, text, joints or poses)
     if joints:
         return _joint_points(text, joints, unit, notes)
     return _pose_points(path, text, program, poses, unit, notes)
 
 
-def _unit(path: Path, text: str, count: int) -> str:
-    """Return "deg", or "rad" where all of so many motions of an xArm, or the arm itself, say is_radian=True."""
-    said = re.findall(r"\bis_radian\s*=\s*(True|False)", text)
-    if "True" not in said:
-        return "deg"
-    whole = re.search(r"\bXArmAPI\s*\([^)]*\bis_radian\s*=\s*True", text) is not None
-    if "False" in said or not (whole or len(said) == count):
-        raise InputError(f"{path}: is_radian=True stands at some of its {count} points: write it at all or none")
-    return "rad"
+def _unit(path: Path, text: str, points: list[re.Match[str]]) -> str:
+    """Return "deg", or "rad" where all motions of an xArm say is_radian=True, or the arm itself and none of them False."""
+    arm = re.search(r"\bXArmAPI\s*\([^)]*\bis_radian\s*=\s*True|\bdefault_is_radian\s*=\s*True", text) is not None
+    calls = (_CALL.match(text, point.start()) for point in points)
+    said = (re.search(r"\bis_radian\s*=\s*(True|False)", call[0]) if call else None for call in calls)
+    radian = {one[1] == "True" if one else arm for one in said}
+    if len(radian) > 1:
+        raise InputError(f"{path}: is_radian=True stands at some of its {len(points)} points: write it at all or none")
+    return "rad" if True in radian else "deg"
 
 
 def _joint_points(text: str, joints: list[re.Match[str]], unit: str, notes: tuple[str, ...]) -> ProgramPoints:
