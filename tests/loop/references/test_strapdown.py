@@ -229,7 +229,35 @@ def test_samples_that_are_far_off_for_a_moment_are_an_outlier_and_are_not_used()
     assert moved @ np.linalg.solve(now.cov, moved) < 1.0
 
 
-@pytest.mark.parametrize(("axis", "largest"), [(4, 39.2), (1, 4.36)])
+#: What one of a chip's last digit is at 4 g and at 250 and 2000 deg/s; ST's of 250 deg/s, and 16.4 of MPU's per deg/s.
+LSB_4G, LSB_250, LSB_2000 = 4 * 9.80665 / 32768, np.radians(250 / 32768), np.radians(2000 / 32768)
+ST_250, MPU_2000 = np.radians(8.75e-3), np.radians(1 / 16.4)
+
+
+@pytest.mark.parametrize(("axis", "step"), [(2, LSB_2000), (2, 2 * LSB_250), (2, MPU_2000), (5, LSB_4G)])
+@pytest.mark.parametrize("steady", [(2.3, 22.0), (np.radians(125.0), 2 * 9.80665)])
+@pytest.mark.parametrize("rate_hz", [100.0, 1000.0])
+def test_steady_motion_and_push_are_not_clipped(axis, step, rate_hz, steady):
+    rng, t_s, strapdown = np.random.default_rng(0), np.arange(0.0, 2.0, 1 / rate_hz), Strapdown(unit())
+    z = rng.normal(size=(len(t_s), 6)) * DENSITY * np.sqrt(rate_hz / 2) + np.repeat(steady, 3)
+    z[:, axis] = np.round(z[:, axis] / step) * step
+    strapdown.add(Samples(t_s, z, DENSITY))
+    windows = [strapdown.window(begin, begin + 0.04) for begin in np.arange(0.1, 1.9, 0.04)]
+    assert np.isfinite(windows).all()
+
+
+@pytest.mark.parametrize(("axis", "step"), [(2, LSB_2000), (1, LSB_250), (0, ST_250), (1, MPU_2000), (4, LSB_4G)])
+@pytest.mark.parametrize("end", [-32768, 32767])
+def test_values_at_the_end_of_a_chips_range_are_clipped(axis, step, end):
+    t_s, strapdown = np.arange(0.0, 0.5, 1e-3), Strapdown(unit())
+    z = np.random.default_rng(0).normal(size=(len(t_s), 6)) * DENSITY * np.sqrt(500.0)
+    z[200:205, axis] = end * step
+    strapdown.add(Samples(t_s, z, DENSITY))
+    windows = [strapdown.window(begin, begin + 0.04) for begin in (0.1, 0.18, 0.3)]
+    assert [bool(np.isfinite(window).all()) for window in windows] == [True, False, True]
+
+
+@pytest.mark.parametrize(("axis", "largest"), [(4, 32767 * LSB_4G), (1, 32767 * LSB_250)])
 def test_clipped_samples_count_as_missing_links_open_and_the_unit_goes_on(axis, largest):
     q, Ts, looks, said, t_s, z = world(272, 1.8, 1.8)
     knocked = z.copy()
@@ -267,6 +295,14 @@ def test_smoothed_poses_use_what_came_after_and_their_covariance_knows():
     assert max(ratios) < 1.0
     assert np.mean(ratios) < 0.8
     assert 0.1 < np.mean(squares) < 2.0
+
+
+def test_long_after_vision_and_unit_the_newest_state_says_what_was():
+    q, _, looks, said, t_s, z = world(290, 3.4, 1.2)
+    estimator = go(q, looks, said, t_s[t_s < 1.3], z[t_s < 1.3])
+    track, alone = estimator.smoothed(np.array([3.0])), estimator.track(np.array([3.0]))
+    np.testing.assert_allclose(track.Ts_base_tool, alone.Ts_base_tool, atol=1e-9)
+    np.testing.assert_allclose(track.covs, alone.covs, rtol=1e-6, atol=1e-15)
 
 
 def test_after_an_impact_links_may_be_anywhere_in_their_gaps():
@@ -342,6 +378,24 @@ def test_a_unit_that_images_contradict_is_used_no_more(waits):
     now = estimator.estimate()
     # What is known of the arm is that of the first second and of what came after: near what is known without a unit.
     assert np.linalg.norm(off(now.T_base_tool, Ts[-1])[:3]) < 4 * np.sqrt(np.trace(alone.cov[:3, :3]))
+
+
+@pytest.mark.parametrize("seed", [297, 298])
+def test_a_cameras_clock_that_jumps_is_followed_with_a_unit(seed):
+    q, Ts, looks, *imu = world(seed, 6.5, 6.5)
+    jumped, heard = [replace(each, t_s=each.t_s + 2e-3 * (each.t_s > 2.0)) for each in looks], ([], [])
+    estimator = go(q, jumped, *imu, heard=heard)
+    assert all(each.outcome is Outcome.USED for each in heard[0])
+    assert estimator.unit_differs()  # it is used yet
+    now = estimator.estimate()
+    e = off(now.T_base_tool, Ts[-1])
+    assert e @ np.linalg.solve(now.cov, e) < chi2.ppf(1 - CHANCE, 6)
+    assert abs(estimator.clock_offset_s(6.5) - 2e-3) < 1e-3
+    # What was known of the delay before the unit is known again without it, and not while there is one.
+    d, before = estimator.delay_row, KalmanEstimator(ARM, delay=KNOWN, learns_delay=False).remembered()
+    estimator.restore(before)
+    assert estimator.remembered().P[d, d] == 0.0
+    assert np.isfinite(estimator.estimate().cov).all()
 
 
 def test_samples_that_are_none_are_rejected():

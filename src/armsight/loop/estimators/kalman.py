@@ -229,6 +229,7 @@ class KalmanEstimator:
         (x, P), newest = self.known_again(state), self._states[-1]
         if self.clock is not None:
             self.clock.restore(state.clock, self._forgets)
+        P = P if self._unit is None else self._delay_apart(P)
         self._states = [newest._replace(x=x, P=P, taken=None, considered=NONE_CONSIDERED, beside=None)]
         self._outliers, self._back, self._newest, self._here = [], [], None, None
         self._waiting, self._backlash_set = [], False
@@ -280,10 +281,7 @@ class KalmanEstimator:
                 return Outcome.WAITING
             if self._unit is None or self._unit.sensor is not reference:
                 self._unit, self._without = Strapdown(reference), self.remembered()
-                del self._states[:-1]
-                P = self._states[-1].P.copy()
-                P[self._at.delay] = P[:, self._at.delay] = 0.0
-                self._states[-1] = self._states[-1]._replace(P=P)
+                self._states = [self._states[-1]._replace(P=self._delay_apart(self._states[-1].P))]
             self._unit.add(reading)
             self._newest = self._here = None
             return self._go_on()
@@ -292,6 +290,12 @@ class KalmanEstimator:
                 f"{reference.name}: channel {reading.channel} of {len(reference.channels)}: {', '.join(reference.channels)}"
             )
         return self._hear(Taken(reference, reading))
+
+    def _delay_apart(self, P: Array) -> Array:
+        """Return a covariance (K, K) without the delay, whose sigma is each image's noise while a unit is used."""
+        apart = P.copy()
+        apart[self._at.delay] = apart[:, self._at.delay] = 0.0
+        return apart
 
     def _go_on(self) -> Outcome:
         """Use a window of the inertial unit as far as its samples and the joints have come; waiting where it is short."""
@@ -412,7 +416,8 @@ class KalmanEstimator:
         if self._states[-1].beside is None:
             return intervals(self._states, t_s)
         if not self._back or self._back[-1].t_s < t_s[-1] + AHEAD_S:
-            self._back = smoothed_back([state for state in self._states if state.t_s > t_s[0] - HISTORY_S])
+            near = [state for state in self._states[:-1] if state.t_s > t_s[0] - HISTORY_S]
+            self._back = smoothed_back([*near, self._states[-1]])
         return intervals(self._back, t_s)
 
     def blended(self, parts: list[Interval]) -> Track:
@@ -515,8 +520,9 @@ class KalmanEstimator:
             return None, Outcome.OUTLIER
         if report is not None:
             change = report(self._said(t_s, joints, pose_measurement, at, step, K, outcome))
-            if change is not None and self.clock is not None:
+            if change is not None:
                 x = x + change
+            if change is not None and self.clock is not None and self._unit is None:
                 by_delay = P[:, self._at.delay] / P[self._at.delay, self._at.delay]
                 P += (self.clock.sigma_s**2 - P[self._at.delay, self._at.delay]) * np.outer(by_delay, by_delay)
         considered = passed(_carried(before.considered, step), K, at.H) if before.considered else NONE_CONSIDERED

@@ -45,8 +45,13 @@ START_M_S = 0.1
 CORNER_S = 6.0
 #: The delay is known no better, s, as each run converts the clock anew; half: more units are dropped, double: found later.
 DELAY_S = 1e-3
-#: A value beyond the least range that chips have, rad/s and m/s2, that is the same twice is the end of its chip's range.
-LEAST_RANGE = np.repeat([2.1, 19.0], 3)
+#: Full scales of chips (6, 12), rad/s and m/s2: 125 to 4000 deg/s, 143 to 4588 by ST's rounded sensitivities, 2 to 64 g.
+_LEAST = np.array([np.radians([125.0, 143.36]), np.full(2, 2.0 * STANDARD_GRAVITY_M_S2)])
+FULL_SCALES = np.kron(np.repeat(_LEAST, 3, axis=0), 2.0 ** np.arange(6))
+#: A value that near to a full scale, relative, of so many of its axis's least steps (32768 of 16 bits; of a chip of twice
+#: the range half as many), that is the same twice is clipped. Drivers round sensitivities and gravity. Half of ROUNDED:
+#: those of 16.4 per deg/s are not found, double: nothing; half of STEPS: steady motion is lost, double: none are found.
+ROUNDED, STEPS = 1.5e-3, 2e4
 #: A window's noise is at most so many times its class's; half: hard motions claim too much, double: impacts are noise.
 SCATTER = 30.0
 #: Rows of what is estimated beside the arm: velocity, delay, and the unit's parameters.
@@ -418,7 +423,7 @@ class Strapdown:
     def __init__(self, sensor: Inertial) -> None:
         self.sensor, self._density = sensor, np.zeros(6)
         self._t, self._z = np.empty(_ROWS + 1), np.empty((_ROWS + 1, 6))  # and the one that is held
-        self._read = np.zeros((1, 6))  # the newest as read
+        self._read, self._step = np.zeros((1, 6)), np.full(6, np.inf)  # the newest as read, the least change so far
         self._first = self._count = 0
         self._lever, tilt = sensor.T_tool_sensor[:3, 3], np.append(sensor.values[-2:], 0.0)
         up = exp_so3(tilt)[:, 2]
@@ -443,7 +448,10 @@ class Strapdown:
                 f"{self.sensor.name}: expected samples (N, 6), numbers, at times that rise from {self.newest_s:.4f} s on; "
                 f"given are {z.shape} from {t[0] if len(t) else np.nan:.4f} s on"
             )
-        clipped = ((np.diff(z, axis=0, prepend=self._read) == 0.0) & (np.abs(z) > LEAST_RANGE)).any(axis=1)
+        changes, sizes = np.abs(np.diff(z, axis=0, prepend=self._read)), np.abs(z)
+        self._step = np.where(changes > 0.0, changes, np.inf).min(axis=0, initial=np.inf).clip(max=self._step)
+        full = (np.abs(sizes[..., None] / FULL_SCALES - 1.0) < ROUNDED).any(axis=2) & (sizes > STEPS * self._step)
+        clipped = ((changes == 0.0) & full).any(axis=1)
         self._read, clipped = z[-1:] if len(z) else self._read, np.append(clipped, False)
         z = np.where((clipped[:-1] | clipped[1:])[:, None], np.nan, self.sensor.felt(z))
         t, z, self._density = t[-_ROWS // 2 :], z[-_ROWS // 2 :], samples.density

@@ -54,7 +54,7 @@ class InertialErrors(Record):
     warming_s: float = 60.0
     scale: Array = field(default_factory=lambda: np.zeros((6, 3)))
     g_sensitivity: Array = field(default_factory=lambda: np.zeros((3, 3)))
-    largest: Array = field(default_factory=lambda: np.repeat([8.7, 39.0], 3))
+    largest: Array = field(default_factory=lambda: np.repeat([8.726, 39.22], 3))
     step: Array = field(default_factory=lambda: np.repeat([2.7e-4, 1.2e-3], 3))
     bandwidth_hz: float = 42.0
     rate_hz: float = 100.0
