@@ -231,10 +231,19 @@ def identified_table(path: str | Path, given: dict[str, Any]) -> tuple[Arm, Arra
         source=f"identified: {path}",
         **limits,
     )
-    weak = undetermined(*(float(given.get(key, np.nan)) for key in MOVED))
-    if weak:
+    if weak := undetermined(*tool_moved(path, given)):
         _LOG.warning("%s: %s", path, weak)
     return arm, at["beta"]
+
+
+def tool_moved(path: str | Path, given: dict[str, Any]) -> tuple[float, float]:
+    """Return what a corrected.toml says of MOVED, m; NaN where it says nothing.
+
+    Raises:
+        InputError: no number.
+    """
+    moved, sigma = (_number(str(path), key, given[key]) if key in given else np.nan for key in MOVED)
+    return moved, sigma
 
 
 def undetermined(moved_m: float, sigma_m: float) -> str:

@@ -327,3 +327,11 @@ def test_a_motor_that_moves_within_its_backlash_at_rest_teaches_no_resistance(wa
     window(0.0, ticks=256, current_a=0.15)
     window(0.0, 0.008, ticks=256, current_a=0.15)
     assert motor.resistance_scale - 1.0 < 0.035
+
+
+def test_windows_at_rest_in_backlash_do_not_add_up(watched):
+    """What a joint hides in its backlash goes with its current: each window has the same error."""
+    motor, window = watched
+    for side in 30 * (1.0, -1.0):
+        window(0.0, 0.008 * side, ticks=256, current_a=0.1 * side)
+    assert abs(motor.resistance_scale - 1.0) < 2.0 * np.sqrt(motor.variance_rr)  # three where they count as independent

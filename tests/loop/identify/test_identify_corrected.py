@@ -131,6 +131,7 @@ def test_a_file_of_version_1_is_read(arm, tmp_path):
         (('name = "wave2_cos2"', 'name = "wave7_cos2"'), "error source 'wave7_cos2' is unknown"),
         (("curve_fade_rad = ", "curve_fade_rad = -"), "curve_fade_rad"),
         (("seen_max_rad = ", "seen_most_rad = "), "seen_max_rad"),
+        (("\ntool_moved_m = ", '\ntool_moved_m = "x"  # '), "tool_moved_m is 'x', must be a number"),
     ],
 )
 def test_a_wrong_file_is_rejected_by_name(arm, tmp_path, change, said):

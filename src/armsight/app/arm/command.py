@@ -183,7 +183,7 @@ def calibrated(arm_name: str, file: str, output: Path | None, yes: bool, as_json
     """
     from armsight.app.arm import description
     from armsight.files import read_toml
-    from armsight.robot.arm_file import MOVED, open_arm
+    from armsight.robot.arm_file import open_arm, tool_moved
     from armsight.robot.calibration_file import difference, read_calibration, with_tool_of, write_calibration
     from armsight.robot.urdf.write import write_urdf
 
@@ -195,7 +195,8 @@ def calibrated(arm_name: str, file: str, output: Path | None, yes: bool, as_json
     arm = read_calibration(file, nominal) if file.lower().endswith((".yaml", ".yml", ".conf")) else open_arm(file)
     sigma_m = None
     if arm.source.startswith("identified:"):
-        sigma_m = read_toml(file).get(MOVED[1])
+        known = tool_moved(file, read_toml(file))[1]
+        sigma_m = known if math.isfinite(known) else None
         arm = replace(with_tool_of(arm, file, nominal), name=f"the corrected {arm.name}")
     if output is not None and output.exists():
         _keep(output, yes)

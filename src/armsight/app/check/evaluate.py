@@ -79,7 +79,7 @@ def evaluate(attained: Attained) -> CheckResult:
     often, said = _often(rows)
     counts = Counter(row.pose for row in rows)
     if rows and not often and len(counts) < _WIDE:
-        seldom = f"of {len(counts)} poses none was attained {few} times, the most {max(counts.values())}"
+        seldom = f"of {len(counts)} poses none was attained {few} times, the most {max(counts.values())}: no repeatability"
     elif rows and not often:
         p, p_ref, cov, common = _stacked(rows)
         workspace = WorkspaceResult(len(rows), *iso9283.anywhere(p - p_ref, cov, common))
@@ -88,7 +88,7 @@ def evaluate(attained: Attained) -> CheckResult:
     poses, notes = {name: _pose(group) for name, group in often.items()}, [*attained.notes, *said]
     circle = _circle(by_test["circle"], attained.reversals) if by_test["circle"] else None
     if not (poses or workspace or followed or circle):
-        reasons = [*([seldom] if seldom else []), *notes]
+        reasons = [*([seldom] if seldom else []), *notes] or ["no motion was attained"]
         more = f"; {len(reasons) - 2} more left out" if len(reasons) > 2 else ""
         reason = "; ".join(reasons[:2]) + more
         raise InputError(

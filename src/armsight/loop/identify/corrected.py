@@ -23,7 +23,16 @@ from armsight.geometry.rotation import nearest_rotation, quaternion_wxyz
 from armsight.loop.identify import model as chain
 from armsight.loop.identify.identify import Identified
 from armsight.loop.identify.model import FAST, RIPPLES, SENSOR, Feature, Model, all_features
-from armsight.robot.arm_file import LIMITS, MOVED, VERSION, file_transform, identified_table, joint_numbers, tilted_urdf
+from armsight.robot.arm_file import (
+    LIMITS,
+    MOVED,
+    VERSION,
+    file_transform,
+    identified_table,
+    joint_numbers,
+    tilted_urdf,
+    tool_moved,
+)
 from armsight.robot.kinematics.arm import Arm
 
 #: Newton steps to a reading, what counts as there, m and rad, and the step of differences, rad.
@@ -234,8 +243,7 @@ def open_corrected(path: str | Path) -> Corrected:
     numbers = [joint_numbers(path, rows, f"sigma_{key}_{unit}") for key, unit in _UNITS.items()]
     sigma[model.table_at : model.sources_at] = np.stack(numbers, axis=1).ravel()
     x[model.sources_at :], sigma[model.sources_at :] = coefficients
-    moved, sigma_moved = (_finite(path, key, given[key]) if key in given else np.nan for key in MOVED)
-    return Corrected(model, x, sigma, (moved, sigma_moved), tuple(notes))
+    return Corrected(model, x, sigma, tool_moved(path, given), tuple(notes))
 
 
 def _error_sources(path: str | Path, given: dict[str, Any]) -> tuple[tuple[Feature, ...], Array]:
