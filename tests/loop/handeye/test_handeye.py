@@ -90,3 +90,15 @@ def test_millimetres_and_what_is_no_rigid_motion_are_named():
     flange[:, :3, 3], body[2, 3, 3] = 0.4, 1000.0
     with pytest.raises(InputError, match="Ts_rig_body: pose 2 is no rigid motion: its last row is not 0 0 0 1"):
         calibrate_handeye(flange, body)
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(("eye", "given"), [("to_hand", "in_hand"), ("in_hand", "to_hand")])
+def test_poses_of_the_other_mounting_are_rejected(eye, given, seed):
+    A, B, cov, _, _ = recording(seed, eye)
+    with pytest.raises(
+        InputError, match=f'these poses fit eye="{eye}", not "{given}".*or one of the lists holds inverse'
+    ):
+        calibrate_handeye(A, B, cov, eye=given)
+    with pytest.raises(InputError, match="inverse transforms"):
+        calibrate_handeye(A, inverse(B), cov, eye=eye)

@@ -79,7 +79,9 @@ def evaluate(attained: Attained) -> CheckResult:
     often, said = _often(rows)
     counts = Counter(row.pose for row in rows)
     if rows and not often and len(counts) < _WIDE:
-        seldom = f"of {len(counts)} poses none was attained {few} times, the most {max(counts.values())}: no repeatability"
+        seldom = (
+            f"of {len(counts)} poses none was attained {few} times, the most {max(counts.values())}: no repeatability"
+        )
     elif rows and not often:
         p, p_ref, cov, common = _stacked(rows)
         workspace = WorkspaceResult(len(rows), *iso9283.anywhere(p - p_ref, cov, common))

@@ -390,9 +390,11 @@ def calibrate_handeye(
         progress: called with the name of each step as it begins.
 
     Raises:
-        InputError: wrong shapes, NaN, no rigid motions, fewer than 4 poses.
+        InputError: wrong shapes, NaN, no rigid motions, fewer than 4 poses, poses of the other ``eye``.
         CalibrationError: the motions leave a direction open.
     """
+    from armsight.loop.identify.misread import require_mounting
+
     for name, each in (("Ts_base_flange", Ts_base_flange), ("Ts_rig_body", Ts_rig_body)):
         fits = not isinstance(each, str | Path)
         require(
@@ -403,6 +405,7 @@ def calibrate_handeye(
         for each in (Ts_base_flange, Ts_rig_body)
     )
     poses = checked_poses(A, B, covs, eye, np.zeros(3) if centre is None else centre)
+    require_mounting(poses)
     return calibrate_poses(poses, quick=quick, progress=progress)
 
 

@@ -120,6 +120,22 @@ def require_plausible(
     return replace(recording, notes=(*recording.notes, *notes))
 
 
+def require_mounting(p: Poses) -> None:
+    """Reject poses that fit far better with the eye in the other place, as Python's callers give them.
+
+    Raises:
+        InputError: they do; or one of both lists holds inverse transforms.
+    """
+    given, (was, other) = misfit(p), ("in_hand", "to_hand") if p.in_hand else ("to_hand", "in_hand")
+    if len(p.A) < COMMON or (given[0] < FITS_M and given[1] < PLAUSIBLE_M):
+        return
+    if _better(off := misfit(replace(p, in_hand=not p.in_hand)), given):
+        raise InputError(
+            f'these poses fit eye="{other}", not "{was}": half of them within {1e3 * off[0]:.1f} mm, as given '
+            f"{1e3 * given[0]:.1f}; or one of the lists holds inverse transforms: invert them"
+        )
+
+
 def misfit(poses: Poses, *, scale: bool = False) -> Array:
     """Return the quantiles (2,) of the residuals, m, of the best closed form; with scale, of a target as large as fits."""
     _, e = _evaluated(_sized(poses, scale_between(poses)) if scale else poses)
