@@ -258,8 +258,8 @@ def undetermined(moved_m: float, sigma_m: float) -> str:
     if not 2 * sigma_m**2 > moved_m**2:
         return ""
     return (
-        f"not determined well enough away from its poses: it moves the tool by {1e3 * moved_m:.1f} mm there, sigma "
-        f"{1e3 * sigma_m:.1f} mm; armsight identify plan chooses more poses"
+        f"no better than the nominal arm away from its poses: it moves the tool by {1e3 * moved_m:.2f} mm there, sigma "
+        f"{1e3 * sigma_m:.2f} mm; armsight identify plan chooses more poses"
     )
 
 

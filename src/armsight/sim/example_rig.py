@@ -249,7 +249,7 @@ def demo_recording(
         rate_hz: of the end-effector's shots.
 
     Returns:
-        The truth of ``board`` and of ``arm``.
+        The truth of ``board`` and of ``arm``; ``rig`` of either is the true rig, which ``rig.save`` writes.
 
     Raises:
         InputError: a file cannot be written.

@@ -65,10 +65,10 @@ def test_what_few_poses_leave_open_elsewhere_is_in_the_sigma_and_is_said(scene, 
         squares.append(np.mean(off**2) / found.moved_all_over()[1] ** 2)
     assert 0.25 < np.mean(squares) < 4.0
     weak = replace(found, cov=found.cov * (found.moved_all_over()[0] / found.moved_all_over()[1]) ** 2)
-    assert "not determined well enough away from its poses" in repr(weak)
+    assert "no better than the nominal arm away from its poses" in repr(weak)
     Corrected.of(weak).save(tmp_path / "corrected.toml")
     open_arm(tmp_path / "corrected.toml")
-    assert "corrected.toml: not determined well enough" in caplog.text
+    assert "corrected.toml: no better than the nominal arm" in caplog.text
 
 
 def test_what_is_observable_alone_is_within_its_sigma(scene):

@@ -121,7 +121,7 @@ def require_plausible(
 
 
 def require_mounting(p: Poses) -> None:
-    """Reject poses that fit far better with the eye in the other place, as Python's callers give them.
+    """Reject poses that fit far better with the other mounting of the eye, as Python's callers give them.
 
     Raises:
         InputError: they do; or one of both lists holds inverse transforms.

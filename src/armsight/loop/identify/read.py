@@ -45,7 +45,10 @@ REST_RAD, REST_S = 3e-3, 0.2
 def read_poses(
     path: str | Path, *, rotation: str | None = None, columns: str | None = None, arm: ArmJoints | None = None
 ) -> Read:
-    """Read a file.
+    """Read joint angles and the poses measured at them: a table with names in line 1, a row a pose.
+
+    Joints are q1_rad .. or q1_deg .., positions x_m y_m z_m or x_mm .., rotations qw qx qy qz, or rx_deg .. with
+    ``rotation``. docs/reference/pose_tables.md lists all columns.
 
     Args:
         path: the file.

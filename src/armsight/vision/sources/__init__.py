@@ -89,7 +89,7 @@ def open_source(spec: str | Path) -> Source:
         spec: ``folder:DIR`` or the path of a folder, ``pairs:LEFT_GLOB,RIGHT_GLOB``, ``video:LEFT,RIGHT`` or
             ``video:SIDE_BY_SIDE``, ``bag:FILE``, ``lerobot:DIR``, ``url:URL_LEFT,URL_RIGHT``,
             ``usb:LEFT,RIGHT[@WIDTHxHEIGHT][@FPS][,exposure=5ms]``. Without cameras:
-            ``armsight.sim.example_rig.demo_recording`` writes a small recording with its rig and target.
+            ``armsight.sim.example_rig.demo_recording`` writes a small recording and its target; its rig is returned.
 
     Raises:
         InputError: an unknown kind, or what is named is not there or not usable.
