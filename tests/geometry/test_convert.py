@@ -1,5 +1,7 @@
 """Transforms of other libraries against the libraries themselves; messages of ROS by their fields."""
 
+import ctypes
+from array import array
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,6 +11,7 @@ from scipy.spatial.transform import RigidTransform, Rotation
 
 from armsight import as_transform, handeye, ros_fields
 from armsight.errors import InputError
+from armsight.geometry.check import checked
 from armsight.geometry.convert import as_transforms
 from armsight.geometry.pose import exp_se3
 
@@ -95,7 +98,10 @@ class ByColumns:
         (np.tile(np.eye(4), (3, 1, 1)), "holds 3 transforms; expected one"),
         ((Rotation.identity(), np.zeros(2)), r"expected \(3,\), m"),
         ("pose", "expected a 4x4 matrix"),
-        (ByColumns(np.kron([[1, 0], [0, 0]], [[0.0, -1], [1, 0]]) + np.diag([0, 0, 1.0, 1])), "the list of its rows"),
+        (
+            ByColumns(np.kron([[1, 0], [0, 0]], [[0.0, -1], [1, 0]]) + np.diag([0, 0, 1.0, 1])),
+            "transposed; give its rows as a list",
+        ),
         (np.diag([1.0, 1.0, -1.0, 1.0]), "no rigid transform"),
         (T.T, "no rigid transform"),
         ((Rotation.identity(), ["a", "b", "c"]), r"needs a translation of numbers: expected \(3,\), m"),
@@ -123,6 +129,7 @@ def test_what_is_none_is_rejected(given, words):
         ([T, 2 * T], "no rigid transform"),
         (np.array([T, 2 * T]), "no rigid transform"),
         ([T, "pose"], "expected a 4x4 matrix"),
+        ([ByColumns(T), ByColumns(T)], "transposed; give its rows as a list"),
     ],
 )
 def test_an_entry_that_is_none_is_rejected(given, words):
@@ -138,3 +145,15 @@ def test_matrices_of_five_decimals_are_read():
 def test_handeye_rejects_an_entry_that_holds_two():
     with pytest.raises(InputError, match="holds 2 transforms; expected one"):
         handeye([T, np.tile(T, (2, 1, 1))], [T, T])
+
+
+@pytest.mark.parametrize("given", [ByColumns(T), [ByColumns(T)] * 2, ([ByColumns(T)],)])
+def test_what_would_be_read_transposed_is_rejected_at_any_depth(given):
+    with pytest.raises(InputError, match="x must be numbers: a ByColumns may be read transposed"):
+        checked(given, (None, 4), "x")
+
+
+def test_arrays_of_c_and_of_the_standard_library_are_numbers():
+    rows = (ctypes.c_double * 4 * 4)(*map(tuple, T.tolist()))
+    np.testing.assert_array_equal(as_transform(rows), T)
+    np.testing.assert_array_equal(checked([array("d", row) for row in T], (4, 4), "x"), T)

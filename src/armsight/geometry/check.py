@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Sequence
 
 import numpy as np
@@ -14,12 +15,17 @@ def numbers(value: object) -> NDArray[np.float64]:
     """Return a value as an array of numbers.
 
     Raises:
-        TypeError: no numbers, or an object that is no sequence and does not say its array: numpy would iterate over it, and
-            robodk's Mat (6.0.2) and USD's Gf.Matrix4d (26.11) come out transposed then.
+        TypeError: no numbers.
+        ValueError: no numbers, or rows of different lengths.
+        InputError: an object, or a sequence that begins with one, that is no sequence and does not say its array: numpy
+            iterates over it, and robodk's Mat (6.0.2) and USD's Gf.Matrix4d (26.11) come out transposed then.
     """
-    if not hasattr(value, "__array__") and hasattr(value, "__len__") and not isinstance(value, Sequence):
-        raise TypeError(f"a {type(value).__name__} may be read transposed; give its rows as a list")
-    return np.asarray(value, dtype=np.float64)
+    array, inner = np.asarray(value, dtype=np.float64), value
+    while isinstance(inner, Sequence) and not isinstance(inner, str) and len(inner):
+        inner = inner[0]
+    if not hasattr(inner, "__array__") and hasattr(inner, "__len__") and not isinstance(inner, Sequence | ctypes.Array):
+        raise InputError(f"a {type(inner).__name__} may be read transposed; give its rows as a list")
+    return array
 
 
 def checked(value: ArrayLike, shape: tuple[int | None, ...], name: str) -> NDArray[np.float64]:
@@ -35,7 +41,7 @@ def checked(value: ArrayLike, shape: tuple[int | None, ...], name: str) -> NDArr
     """
     try:
         array = numbers(value)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, InputError) as error:
         raise InputError(f"{name} must be numbers: {error}") from None
     if array.ndim != len(shape) or any(s is not None and s != n for s, n in zip(shape, array.shape, strict=True)):
         want = "(" + ", ".join("any" if s is None else str(s) for s in shape) + ")"
