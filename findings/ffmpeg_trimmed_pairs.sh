@@ -2,7 +2,7 @@
 # imageio-ffmpeg 0.8.1 (FFmpeg 9.0): two videos trimmed at the same time without re-encoding stay in step in MP4, not in Matroska.
 #
 # ffmpeg -ss 0.5 -c copy can only begin at a keyframe. In MP4 it keeps the frames from there to 0.5 s, hidden by an edit list:
-# players, OpenCV and PyAV begin at 0.5 s. In Matroska they are shown: each file begins at its own keyframe, and
+# OpenCV and PyAV begin at 0.5 s. In Matroska they are shown: each file begins at its own keyframe, and
 # both begin at time 0. Cameras put keyframes where they like, so a pair that was in step is out of it by up to the
 # longest distance of keyframes, and no stamp says so. What the edit list hides still counts: OpenCV's CAP_PROP_FRAME_COUNT and
 # PyAV's stream.frames promise frames that reading does not give.
@@ -38,12 +38,18 @@ def record(path, keyframes):
 
 def read(path):
     """Return the first frame's number and time, ms, how many frames there are, and how many the file promises."""
-    capture, numbers = cv2.VideoCapture(path), []
+    capture, times = cv2.VideoCapture(path), []
     with av.open(path) as file:
-        grey = next(file.decode(video=0)).to_ndarray()[10, 10]
+        promised = file.streams.video[0].frames
+        numbers = [(int(frame.to_ndarray()[10, 10]) - 20) // 3 for frame in file.decode(video=0)]
     while capture.grab():
-        numbers.append(round(capture.get(cv2.CAP_PROP_POS_MSEC)))
-    return (int(grey) - 20) // 3, numbers[0], len(numbers), int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        if not times:  # OpenCV's grey is of the range 0 to 255, the file's of 16 to 235
+            first = round((int(capture.retrieve()[1][10, 10, 0]) * 219 / 255 - 4) / 3)
+        times.append(round(capture.get(cv2.CAP_PROP_POS_MSEC)))
+    assert (first, len(times)) == (numbers[0], len(numbers))  # both read the same
+    if path.endswith("mp4"):
+        assert promised == int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+    return first, times[0], len(times), promised
 
 
 record("left.mp4", 30)

@@ -4,8 +4,8 @@
 # Both start from the two cameras' own calibrateCamera and estimate everything (flags 0). With the default criteria (30
 # iterations) version 4's baseline is 0.13 % too long, and with it every distance that the pair measures; the right camera is
 # 0.34 mm off along the axis. The rms is 0.9 % above the least one: nothing warns. An epsilon of 1e-12 and a thousand iterations
-# still leave 0.07 mm. Version 5 is at the minimum, which SciPy's least_squares finds too, after ten. With
-# CALIB_FIX_INTRINSIC both agree, as they do in calibrateCamera.
+# still leave 0.07 mm. Version 5 is at the minimum, which SciPy's least_squares finds too. With
+# CALIB_FIX_INTRINSIC both agree.
 #
 # 20 views of a board of 54 corners, 0.1 px of noise; true T -200 2 1 mm, f 900 and 900 px.
 #

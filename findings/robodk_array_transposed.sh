@@ -1,11 +1,10 @@
 #!/bin/sh
-# robodk 6.0.2: numpy.array of a pose is its transpose, and SaveMat writes that; print, .rows, indices and SaveCSV do not.
+# robodk 6.0.2: numpy.array of a pose is its transpose, and SaveMat writes that; .rows, indices and SaveCSV do not.
 #
-# Mat has __getitem__ with a row first, and prints and multiplies so. It has no __array__: numpy iterates over it, and
-# iterating gives columns. numpy.array(pose)[:3, :3] is the inverse rotation, [:3, 3] is 0 and not the position, and no shape
-# says so; of a pose without a position (rotz, a tool that is only rotated) even the last row is 0 0 0 1. numpy.linalg, OpenCV
-# and SciPy take a Mat in the same way: @ with an array, Rotation.from_matrix(pose.Rot33()). USD's Gf.Matrix4d (usd-core 26.11)
-# comes out transposed too, as its documentation says: it is for row vectors.
+# Mat has __getitem__ with a row first. It has no __array__: numpy iterates over it, and iterating gives columns.
+# numpy.array(pose)[:3, :3] is the inverse rotation, [:3, 3] is 0 and not the position, and no shape says so; of a pose
+# without a position (rotz, a tool that is only rotated) even the last row is 0 0 0 1. SciPy takes a Mat in the same way:
+# Rotation.from_matrix(pose.Rot33()).
 #
 # Seen, transl(100, 200, 300) * rotz(30 deg): mat[0, 1] -0.5, numpy's [0, 1] +0.5; column 3: 100 200 300, numpy's 0 0 0.
 # SciPy of Rot33(): -30.0 deg about z. Files: SaveCSV's first row ends with 100, SaveMat's with 0.
@@ -27,7 +26,8 @@ from scipy.spatial.transform import Rotation
 pose = robomath.transl(100, 200, 300) * robomath.rotz(math.radians(30))
 array = np.array(pose)
 print("[0, 1]:", round(pose[0, 1], 3), "numpy's", round(array[0, 1], 3), "; position", pose.Pos(), "numpy's", array[:3, 3])
-assert array.shape == (4, 4)
+assert array.shape == (4, 4) and not hasattr(pose, "__array__")
+assert np.array(robomath.rotz(1.0))[3].tolist() == [0, 0, 0, 1]
 np.testing.assert_allclose(array, np.array(pose.rows).T, atol=1e-15)
 assert abs(pose[0, 1] + 0.5) < 1e-12 and pose.Pos() == [100, 200, 300]
 

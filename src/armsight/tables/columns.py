@@ -150,14 +150,15 @@ def degree_columns(path: str | Path, rows: list[list[str]]) -> list[list[str]]:
     if sorted(theirs) != sorted(known):
         raise InputError(
             f"{path}: line 1: LeRobot's columns {', '.join(theirs)}; read are those of one SO-100 or SO-101, "
-            f"{', '.join(known)}; name the columns q1_deg .. in the order of your arm's joints"
+            f"{', '.join(known)}; multiply degrees by 4095/4096 and name them q1_deg .. in your arm's order"
         )
     at = {head.index(name): k for k, name in enumerate(known, 1)}
     cells = (number(row[column]) for row in rows[1:] for column in at if column < len(row))
     if not any(cell is not None and _MOST_PERCENT < abs(cell) < np.inf for cell in cells):
         raise InputError(
             f"{path}: {known[0]} .. {known[-1]}: degrees, or percent of each joint's range? LeRobot's data do not say, and "
-            "no value is beyond 100; where use_degrees was on, name the columns q1_deg .. q5_deg, else record with it on"
+            "no value is beyond 100; where use_degrees was on, multiply them by 4095/4096 (LeRobot's scale) and name them "
+            "q1_deg .. q5_deg, else record with it on"
         )
     body = [[_degrees(cell) if k in at else cell for k, cell in enumerate(row)] for row in rows[1:]]
     return [[f"q{at[k]}_deg" if k in at else name for k, name in enumerate(head)], *body]

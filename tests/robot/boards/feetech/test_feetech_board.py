@@ -293,9 +293,11 @@ def test_columns_of_lerobot_are_degrees_where_no_percent_can_be():
     read = degree_columns("log.csv", log)
     assert (read[1][0], read[1][-1]) == ("0.0", "")
     np.testing.assert_allclose(np.array(read[1][1:-1], float), counts * 360 / 4096, rtol=1e-12)
-    with pytest.raises(InputError, match="degrees, or percent of each joint's range"):
+    with pytest.raises(
+        InputError, match=r"degrees, or percent of each joint's range.* by 4095/4096 .* name them q1_deg"
+    ):
         degree_columns("log.csv", [head, ["0.0", "90.5", "1", "2", "3", "-99.5", "300"]])
-    with pytest.raises(InputError, match="read are those of one SO-100 or SO-101"):
+    with pytest.raises(InputError, match=r"read are those of one SO-100 or SO-101.* by 4095/4096 and name them q1_deg"):
         degree_columns("log.csv", [["left_elbow_flex.pos", *head], ["1", *rows[1]]])
     for names in (
         ["q1_deg"],
