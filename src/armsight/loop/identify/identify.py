@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from armsight.data import Array, Record
 from armsight.errors import CalibrationError, InputError, require
+from armsight.geometry.pose import left_jacobian
 from armsight.loop.identify.fit import Mask, Solution, covariance, fit, joint_noise, prior_sigma, with_joint_noise
 from armsight.loop.identify.measured import Measured, Read, measured_of
 from armsight.loop.identify.misread import check_plausible, without_tool
@@ -94,13 +95,20 @@ class Identified(Record):
     def value(self, name: str) -> tuple[float, float]:
         """Return value and sigma of a parameter, m or rad; sigma is NaN where it was not fitted and stays nominal.
 
+        Rotations of base and tool are rotation vectors, of the base in the rig and of the body in the last frame.
+
         Raises:
             InputError: the arm has no such parameter.
         """
         if name not in self.model.names:
             raise InputError(f"{self.model.arm.name} has no parameter {name}; it has {', '.join(self.model.names)}")
         k = self.model.names.index(name)
-        return float(self.solution.x[k]), float(np.sqrt(self.cov[k, k])) if self.solution.free[k] else np.nan
+        value, variance = self.solution.x[k], self.cov[k, k]
+        for first, rotation, side in self.model.rotations(self.solution.x):
+            if first <= k < first + 3:
+                value, by = rotation[k - first], np.linalg.inv(left_jacobian(side * rotation))[k - first]
+                variance = by @ self.cov[first : first + 3, first : first + 3] @ by
+        return float(value), float(np.sqrt(variance)) if self.solution.free[k] else np.nan
 
     def moved_all_over(self) -> tuple[float, float]:
         """Return how far the tool is from the nominal arm's, m, RMS all over the joint limits, and its sigma."""

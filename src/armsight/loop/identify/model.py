@@ -336,6 +336,14 @@ class Model(Record):
             T[:3, :3] = self.R_tool @ exp_so3(x[self.table_at - 3 : self.table_at].copy())
         return T
 
+    def rotations(self, x: Array) -> list[tuple[int, Array, float]]:
+        """Return where the small rotations of base and body begin, their rotation vectors (3,), and on which side they act.
+
+        The side is 1 where a small rotation comes before the other (base), -1 where it comes after it (body).
+        """
+        found = [(3, log_so3(self.T_rig_base(x)[:3, :3]), 1.0)]
+        return [*found, (self.table_at - 3, log_so3(self.T_6_body(x)[:3, :3]), -1.0)] if self.full else found
+
     def with_seen(self, q: Array) -> Model:
         """Return the model whose sensors' curves fade beyond the readings (N, n), rad, of the poses fitted."""
         return replace(self, q_seen=np.stack([q.min(axis=0), q.max(axis=0)], axis=1))
