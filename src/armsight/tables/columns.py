@@ -11,7 +11,7 @@ import itertools
 import math
 import re
 import sys
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Container, Generator, Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
@@ -142,7 +142,7 @@ def degree_columns(path: str | Path, rows: list[list[str]]) -> list[list[str]]:
     Raises:
         InputError: other joints than these, or no value beyond 100: both are possible.
     """
-    head = [cell.strip() for cell in rows[0]] if rows else []
+    head = [cell.strip() for cell in next(iter(rows), [])]
     known, gripper = [f"{name}{_LEROBOT_POSITION}" for name in LEROBOT], _LEROBOT_GRIPPER + _LEROBOT_POSITION
     theirs = [name for name in head if name.endswith(_LEROBOT_POSITION) and name != gripper]
     if not set(known) & set(theirs) or {"q1_deg", "q1_rad"} & set(head):
@@ -153,21 +153,23 @@ def degree_columns(path: str | Path, rows: list[list[str]]) -> list[list[str]]:
             f"{', '.join(known)}; multiply degrees by 4095/4096 and name them q1_deg .. in your arm's order"
         )
     at = {head.index(name): k for k, name in enumerate(known, 1)}
-    cells = (number(row[column]) for row in rows[1:] for column in at if column < len(row))
-    if not any(cell is not None and _MOST_PERCENT < abs(cell) < np.inf for cell in cells):
+    cells = (row[column] for row in rows[1:] for column in at if column < len(row))
+    if not any(_MOST_PERCENT < abs(number(cell) or 0.0) < np.inf for cell in cells):
         raise InputError(
             f"{path}: {known[0]} .. {known[-1]}: degrees, or percent of each joint's range? LeRobot's data do not say, and "
             "no value is beyond 100; where use_degrees was on, multiply them by 4095/4096 (LeRobot's scale) and name them "
             "q1_deg .. q5_deg, else record with it on"
         )
-    body = [[_degrees(cell) if k in at else cell for k, cell in enumerate(row)] for row in rows[1:]]
-    return [[f"q{at[k]}_deg" if k in at else name for k, name in enumerate(head)], *body]
+    return [
+        [f"q{at[k]}_deg" if k in at else name for k, name in enumerate(head)],
+        *(_degrees(row, at) for row in rows[1:]),
+    ]
 
 
-def _degrees(cell: str) -> str:
-    """Return a cell in LeRobot's degrees in degrees."""
-    value = number(cell)
-    return cell if value is None else repr(value * 4095 / 4096)
+def _degrees(row: list[str], at: Container[int]) -> list[str]:
+    """Return a row whose cells at some columns are in LeRobot's degrees, with these in degrees."""
+    values = [number(cell) if k in at else None for k, cell in enumerate(row)]
+    return [cell if value is None else repr(value * 4095 / 4096) for cell, value in zip(row, values, strict=True)]
 
 
 def _padded(row: list[str], head: list[str]) -> list[str]:

@@ -38,6 +38,16 @@ def test_noise_is_what_the_detector_shows():
     assert marker_noise(CameraPipeline.load("cheap-webcam"), "disc", 16.0) > 5 * marker_noise(clean, "disc", 16.0)
 
 
+def test_between_a_chart_that_is_found_and_one_that_is_not_it_is_that_of_the_size_itself():
+    webcam = CameraPipeline.load("cheap-webcam")
+    assert marker_noise(webcam, "tag", 28.0) == pytest.approx(marker_noise(webcam, "tag", 32.0), rel=0.3)
+    assert marker_noise(webcam, "disc", 24.0, 16.0) < 2 * marker_noise(
+        webcam, "disc", 24.0
+    )  # one of 32 px is not found
+    with pytest.raises(InputError, match=r"a disc of 24\.0 px, blurred over 30\.0 px: \d+ of \d+ are found"):
+        marker_noise(webcam, "disc", 24.0, 30.0)
+
+
 @pytest.mark.parametrize(
     ("given", "message"),
     [

@@ -75,16 +75,8 @@ def evaluate(attained: Attained) -> CheckResult:
     """
     by_test = {test: [row for row in attained.rows if row.test == test] for test in TESTS}
     rows, few = by_test["pose"], iso9283.MIN_POSES
-    seldom, workspace = "", None
     often, said = _often(rows)
-    counts = Counter(row.pose for row in rows)
-    if rows and not often and len(counts) < _WIDE:
-        seldom = (
-            f"of {len(counts)} poses none was attained {few} times, the most {max(counts.values())}: no repeatability"
-        )
-    elif rows and not often:
-        p, p_ref, cov, common = _stacked(rows)
-        workspace = WorkspaceResult(len(rows), *iso9283.anywhere(p - p_ref, cov, common))
+    seldom, workspace = ("", None) if often or not rows else _seldom(rows)
     paths = _groups(by_test["path"], lambda row: row.approach or "path")
     followed = {name: _path(name, group) for name, group in paths.items()}
     poses, notes = {name: _pose(group) for name, group in often.items()}, [*attained.notes, *said]
@@ -99,6 +91,16 @@ def evaluate(attained: Attained) -> CheckResult:
     notes += [f"left out: all poses, as none was attained {few} times"] if seldom else []
     ways = _several_ways(often)
     return CheckResult(poses, ways, workspace, _distance(often), _drift(often), followed, circle, notes)
+
+
+def _seldom(rows: list[Row]) -> tuple[str, WorkspaceResult | None]:
+    """Return why rows of which none repeats are too few, or what many poses say of the workspace."""
+    counts = Counter(row.pose for row in rows)
+    if len(counts) < _WIDE:
+        most, few = max(counts.values()), iso9283.MIN_POSES
+        return f"of {len(counts)} poses none was attained {few} times, the most {most}: no repeatability", None
+    p, p_ref, cov, common = _stacked(rows)
+    return "", WorkspaceResult(len(rows), *iso9283.anywhere(p - p_ref, cov, common))
 
 
 def _often(rows: list[Row]) -> tuple[dict[str, list[Row]], list[str]]:

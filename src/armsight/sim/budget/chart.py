@@ -39,8 +39,8 @@ _SIZE_PX, _FOCAL_PX = (960, 540), 800.0
 _CAMERA = Camera(_SIZE_PX, "none", np.array([_FOCAL_PX, _FOCAL_PX, *((n - 1) / 2 for n in _SIZE_PX)]), np.zeros(0))
 #: Images of a still scene until what a camera mixes of earlier ones has settled.
 _SETTLED = 3
-#: Charts are of sizes of this ratio up to a largest, px, between which the noise is interpolated (larger markers are taken
-#: to be no better), and of these ways, shares of the size.
+#: Charts are of sizes of this ratio up to a largest, px (larger markers are taken to be no better), and of these ways,
+#: shares of the size; the noise is interpolated between two that are both found.
 _FIRST_PX, _LAST_PX, _RATIO, _WAYS = 8.0, 64.0, 2.0, (0.0, 0.125, 0.25, 0.5, 1.0)
 #: Share of a chart's markers that must be found.
 _LEAST_FOUND = 0.5
@@ -73,13 +73,20 @@ def marker_noise(pipeline: CameraPipeline, kind: str, size_px: float, moved_px: 
     at = math.log(min(size_px, _LAST_PX) / _FIRST_PX) / math.log(_RATIO)
     way = min(_WAYS, key=lambda each: abs(each - moved_px / size_px))
     sizes = (_FIRST_PX * _RATIO**step for step in (math.floor(at), math.ceil(at)))
-    first, second = (math.log(_noise(pipeline, kind, size, way * size)) for size in sizes)
-    return math.exp(first + (at - math.floor(at)) * (second - first))
+    first, second = (_noise(pipeline, kind, size, way * size)[0] for size in sizes)
+    if first and second:
+        return float(first * (second / first) ** (at - math.floor(at)))
+    shown_px = min(size_px, _LAST_PX)
+    sigma, found, asked = _noise(pipeline, kind, shown_px, moved_px * shown_px / size_px)
+    if not sigma:
+        blur = f", blurred over {moved_px:.1f} px" if moved_px else ""
+        raise InputError(f"a {kind} of {size_px:.1f} px{blur}: {found} of {asked} are found in a chart")
+    return sigma
 
 
 @lru_cache(maxsize=512)
-def _noise(pipeline: CameraPipeline, kind: str, size_px: float, moved_px: float) -> float:
-    """Render and detect charts until there are enough detections."""
+def _noise(pipeline: CameraPipeline, kind: str, size_px: float, moved_px: float) -> tuple[float, int, int]:
+    """Render and detect charts until there are enough; return sigma, 0 where most are not found, the found and all."""
     camera, imager = _CAMERA, SimulatedCamera(pipeline, _SIZE_PX, seed=0)
     rng, off, asked = np.random.default_rng(42), list[Array](), 0
     for number in range(_MOST_IMAGES):
@@ -103,12 +110,11 @@ def _noise(pipeline: CameraPipeline, kind: str, size_px: float, moved_px: float)
             break
     every = np.concatenate([np.zeros((0, 2)), *off])
     if len(every) < max(_LEAST_FOUND * asked, 8):
-        blur = f", blurred over {moved_px:.1f} px" if moved_px else ""
-        raise InputError(f"a {kind} of {size_px:.1f} px{blur}: {len(every)} of {asked} are found in a chart")
+        return 0.0, len(every), asked
     every = every - np.median(every, axis=0)  # what all share, the calibration takes up
     scale = float(np.median(np.abs(every)) / 0.6745)
-    every = every[(np.abs(every) < _BLUNDER * max(scale, 1e-4)).all(axis=1)]
-    return float(np.sqrt((every**2).mean()))
+    near = every[(np.abs(every) < _BLUNDER * max(scale, 1e-4)).all(axis=1)]
+    return float(np.sqrt((near**2).mean())), len(every), asked
 
 
 def _smeared(light: Radiance, way_px: float, direction: float) -> Radiance:
