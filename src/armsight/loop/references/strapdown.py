@@ -117,15 +117,31 @@ class Advanced(NamedTuple):
     velocity: Array
 
 
+@kernel
+def _raise_density(t: Array, z: Array, first: int, newest: int, end: float, out: Array) -> None:
+    """Raise a window's densities to what samples before ``end`` scatter about lines through those beside.
+
+    Motion and vibration that are too fast for the samples are integrated as wrongly as noise is.
+    """
+    bends, count = np.zeros(6), 0
+    for row in range(first, newest):
+        if t[row - 1] < end:
+            for i in range(6):
+                bends[i] += (z[row + 1, i] - 2.0 * z[row, i] + z[row - 1, i]) ** 2 * (t[row + 1] - t[row - 1]) / 12.0
+            count += 1
+    for i in range(6):
+        if bends[i] > count * out[28 + i] ** 2:
+            out[28 + i] = min(math.sqrt(bends[i] / count), SCATTER * out[28 + i])
+
+
 @kernel("f8[::1], f8[:, ::1], i8, i8, f8, f8, f8[::1]")
 def _preintegrate(t: Array, z: Array, first: int, last: int, begin: float, end: float, out: Array) -> bool:
     """Write a window, see :meth:`Strapdown.window`, of rows first to last of t (N,), z (N, 6), if complete.
 
-    The newest sample is held as row last + 1. The density is raised to what samples scatter about lines through those
-    beside: motion and vibration that are too fast for the samples are integrated as wrongly as noise is.
+    The newest sample is held as row last + 1.
     """
     R, a, b = np.eye(3), np.empty(6), np.empty(6)
-    v, p, rotated, bends, count = np.zeros(3), np.zeros(3), np.empty((3, 3)), np.zeros(6), 0
+    v, p, rotated = np.zeros(3), np.zeros(3), np.empty((3, 3))
     if last < first or begin < t[first] or end <= begin or end >= t[last] + HELD_S:
         return False
     newest = last
@@ -135,14 +151,7 @@ def _preintegrate(t: Array, z: Array, first: int, last: int, begin: float, end: 
     k = last
     while t[k - 1] > begin:
         k -= 1
-    for row in range(max(k - 1, first + 1), newest):
-        if t[row - 1] < end:
-            for i in range(6):
-                bends[i] += (z[row + 1, i] - 2.0 * z[row, i] + z[row - 1, i]) ** 2 * (t[row + 1] - t[row - 1]) / 12.0
-            count += 1
-    for i in range(6):
-        if bends[i] > count * out[28 + i] ** 2:
-            out[28 + i] = min(math.sqrt(bends[i] / count), SCATTER * out[28 + i])
+    _raise_density(t, z, max(k - 1, first + 1), newest, end, out)
     at = begin
     for i in range(6):
         a[i] = z[k - 1, i] + (z[k, i] - z[k - 1, i]) * (begin - t[k - 1]) / (t[k] - t[k - 1])
