@@ -564,7 +564,8 @@ def alone_in(folder: Path, command: str) -> Iterator[None]:
     """
     import fcntl  # POSIX
 
-    path, ours, used = folder / "in_use.lock", not folder.exists(), "uses it: give this one another folder, -o FOLDER"
+    path, used = folder / "in_use.lock", "uses it: give this one another folder, -o FOLDER"
+    made = [each for each in (folder, *folder.parents) if not each.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
         lock = path.open("a+", encoding="utf-8")
@@ -592,8 +593,8 @@ def alone_in(folder: Path, command: str) -> Iterator[None]:
         finally:
             with contextlib.suppress(OSError):
                 path.unlink()
-                if ours:
-                    folder.rmdir()  # where nothing came to be in it
+                for each in made:  # up to where something came to be in one
+                    each.rmdir()
 
 
 def check_folder(

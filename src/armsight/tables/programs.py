@@ -143,6 +143,8 @@ _COMMENT = re.compile(
     r"(?<![:/])//(?!/?[A-Z]{3,}\b).*",
     re.MULTILINE,
 )
+#: A comment that is the pose of the joints before it, in a file whose code has none.
+_NOTED = re.compile(r"#\s*p\[[^\]]*\]\s*$")
 #: A comment after the one ' of a line; strings have two.
 _APOSTROPHE = re.compile(r"^([^'\"\n]*)'[^'\n]*$", re.MULTILINE)
 #: Where a semicolon begins a comment, too: KUKA's and Kawasaki's.
@@ -181,7 +183,10 @@ def program_rows(path: Path, text: str) -> ProgramPoints | None:
     Raises:
         InputError: a point that lacks a number, poses and joints in one file, or pulses.
     """
-    code = _APOSTROPHE.sub(r"\1", _COMMENT.sub("", text))
+    code = _COMMENT.sub("", text)
+    if not _UR.search(code):
+        code = _COMMENT.sub(lambda found: found[0] if _NOTED.match(found[0]) else "", text)
+    code = _APOSTROPHE.sub(r"\1", code)
     if _SEMICOLON.search(code):
         code = re.sub(";.*", "", code)
     kept = _BESIDE.sub(lambda beside: "\n" * beside[0].count("\n"), code)
