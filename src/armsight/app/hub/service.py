@@ -145,16 +145,20 @@ class Hub:
         return n
 
     def _run(self) -> None:
-        tasks = [(LOOK_S, self._look), (FLUSH_S, self._store.flush), (STATE_S, self._publish)]
+        tasks = [
+            (LOOK_S, "drifts and names are not looked for", self._look),
+            (FLUSH_S, "history is not written", self._store.flush),
+            (STATE_S, "nothing is sent to MQTT", self._publish),
+        ]
         done = [time.monotonic()] * len(tasks)
         while not (self._ended.is_set() and self._heard.empty()):
             with suppress(queue.Empty):
                 heard = self._heard.get(timeout=0.2)
                 self._try(f"a message of {heard[0]}/{heard[1]} was not taken", self._take, heard)
-            for k, (every_s, task) in enumerate(tasks):
+            for k, (every_s, failed, task) in enumerate(tasks):
                 if time.monotonic() - done[k] > every_s:
                     done[k] = time.monotonic()
-                    self._try(f"the hub goes on without {task.__name__}", task)
+                    self._try(failed, task)
             if self._store.problem != self._problem:
                 self._problem = self._store.problem
                 if self._problem:
