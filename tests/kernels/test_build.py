@@ -122,7 +122,17 @@ def test_a_module_that_was_edited_since_is_rejected_with_the_command_to_run():
     decorator._check_not_stale(sources.items())
     for module in (chain, matrix, structure):
         with pytest.raises(ArmsightError, match=rf"{module.__name__.split('.')[-1]}\.py has changed .*kernels\.build"):
-            decorator._check_not_stale((sources | {module.__name__: "0" * 16}).items())
+            decorator._check_not_stale((sources | {module.__name__: "0:0"}).items())
+    _, code = sources[chain.__name__].split(":")
+    decorator._check_not_stale([(chain.__name__, f"0:{code}")])  # only comments or docstrings differ
+
+
+def test_comments_docstrings_and_layout_leave_a_files_code_as_it_is(tmp_path):
+    before, same, other = (tmp_path / name for name in ("before.py", "same.py", "other.py"))
+    before.write_text('"""A module."""\ndef double(x):\n    """Return 2 x."""\n    return 2 * x\n')
+    same.write_text("def double(x):  # twice\n    return (\n        2 * x)\n")
+    other.write_text("def double(x):\n    return 3 * x\n")
+    assert decorator.code_digest(before) == decorator.code_digest(same) != decorator.code_digest(other)
 
 
 @compiled

@@ -118,7 +118,7 @@ def _constants_from(path: Path) -> list[Path]:
 
 
 def compiled_sources() -> list[Path]:
-    """Return the files whose text the compiled code holds: an edit of one makes it stale."""
+    """Return the files whose code was compiled: an edit of one makes it stale."""
     modules = kernel_modules()
     return sorted({*modules, *(each for path in modules for each in _constants_from(path) if each.exists())})
 
@@ -129,7 +129,7 @@ def module_name(path: Path) -> str:
 
 
 def _key(path: Path) -> str:
-    """Return a digest of what a module's compiled code depends on: its text, what that imports, and the compilers."""
+    """Return a digest of what a module's compiled code depends on: its code, what that imports, and the compilers."""
     import llvmlite
     import numba
     import numpy as np
@@ -141,7 +141,7 @@ def _key(path: Path) -> str:
             seen.add(each)
             todo.extend(_imported(each))
     parts = [numba.__version__, llvmlite.__version__, np.__version__, sys.version]
-    parts += [kernels.source_digest(each) for each in (*sorted(seen), Path(__file__))]
+    parts += [kernels.code_digest(each) for each in (*sorted(seen), Path(__file__))]
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:20]
 
 
@@ -501,7 +501,8 @@ def _table(modules: list[Path], bitcodes: list[Path], target: Platform) -> str:
     text.append(f"const int armsight_signature_count = {len(rows)};")
     text.append("const Source armsight_sources[] = {")
     sources = compiled_sources()
-    text += [f'    {{"{module_name(path)}", "{kernels.source_digest(path)}"}},' for path in sources]
+    digests = [f"{kernels.text_digest(path)}:{kernels.code_digest(path)}" for path in sources]
+    text += [f'    {{"{module_name(path)}", "{both}"}},' for path, both in zip(sources, digests, strict=True)]
     text += ["};", f"const int armsight_source_count = {len(sources)};"]
     return "\n".join(text) + "\n"
 

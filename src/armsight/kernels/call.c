@@ -657,7 +657,7 @@ static PyObject *sources(PyObject *self, PyObject *arguments) {
     return list;
 }
 
-static PyMethodDef methods[] = {{"sources", sources, METH_VARARGS, "Return the modules that were compiled, with digests of their text."},
+static PyMethodDef methods[] = {{"sources", sources, METH_VARARGS, "Return the modules that were compiled, with digests of their text and code."},
                                 {"find", find, METH_VARARGS, "Return a kernel by module and name; None where there is none."},
                                 {NULL, NULL, 0, NULL}};
 static PyModuleDef definition = {.base = {.base = {.head = {1, NULL}}}, .name = "_compiled", .size = -1, .methods = methods};
