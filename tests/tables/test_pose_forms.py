@@ -421,6 +421,9 @@ FORMS = {
     ),
     "rotation before position": ("o.csv", csv("", VECTOR, P), {"columns": "rx,ry,rz,x,y,z", "rotation": "rotvec"}),
     "rotation before position, quaternion": ("o.csv", csv("", XYZW, P), {"columns": "qx,qy,qz,qw,x,y,z"}),
+    "Kawasaki's X Y Z O A T": ("k.csv", csv("X,Y,Z,O,A,T", MM, ZYZ), {}),
+    "Doosan's X Y Z A B C": ("d.csv", csv("X,Y,Z,A,B,C", MM, ZYZ), {"rotation": "ZYZ"}),
+    "three angles about z, y' and z'' without names": ("z.csv", csv("", P, ZYZ), {"rotation": "ZYZ"}),
     "Kawasaki-like OAT given on as a table, with a column not used": (
         "k.csv",
         csv("", np.arange(N), MM, FIXED),

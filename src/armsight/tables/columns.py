@@ -46,9 +46,14 @@ _LEROBOT_POSITION, _LEROBOT_GRIPPER, _MOST_PERCENT = ".pos", "gripper", 100.001
 _ROS = re.compile(r"(?:.*[./_])?(?:(position|translation)|orientation|rotation)[._]([xyzw])")
 #: Names of others for ours, in small letters; roll, pitch and yaw rotate about the fixed x, y and z.
 _THEIRS = {"tx": "x", "ty": "y", "tz": "z", "roll": "rx", "pitch": "ry", "yaw": "rz"}
-#: Angles of robots' makers: the columns beside X, Y and Z, mm, whose rotations about fixed x, y and z they are, degrees.
-_MAKERS = {"KUKA": ("c", "b", "a"), "Fanuc": ("w", "p", "r")}
-_OF_A_MAKER = re.compile(r"(?:([xyz])(?:_(m|mm))?|([abcwpr])(?:_(deg|rad))?)")  # a column of theirs, in small letters
+#: Angles of robots' makers: the columns beside X, Y and Z, mm, whose rotations they are, degrees, and about which axes.
+_MAKERS = {
+    "KUKA": ("c", "b", "a", "xyz"),
+    "Fanuc": ("w", "p", "r", "xyz"),
+    "Kawasaki": ("o", "a", "t", "ZYZ"),
+    "Doosan": ("a", "b", "c", "ZYZ"),
+}
+_OF_A_MAKER = re.compile(r"(?:([xyz])(?:_(m|mm))?|([abcoprtw])(?:_(deg|rad))?)")  # a column of theirs, in small letters
 _UNITLESS = re.compile(r"(?:q|j|joint)_?([1-7])")  # a joint without a unit
 _JOINT = re.compile(r"q(\d+)_(rad|deg)")
 #: Numbers that are read of one table; half: half an hour of a run at 1 kHz is rejected, double: 800 MB.
@@ -75,12 +80,12 @@ def understood(
     bare = [re.sub(r"\s*[\[(](mm|m|deg|rad|s)[\])]$", r"_\1", name) for name in bare]
     ours = zip(_of_ros(bare, joint_names, unit or "m"), head, strict=True)
     out = [one if one in COLUMNS else name.strip().strip('"').strip() for one, name in ours]
-    theirs, said = _of_a_maker(bare, out, unit or "mm")
+    theirs, about, said = _of_a_maker(bare, out, unit or "mm", rotation)
     out = [theirs.get(k, name) for k, name in enumerate(out)]
     if len(set(out)) < len(out):
         return head, rotation, ()
     if theirs:
-        return out, rotation or "xyz", (f"{path}: {said}; --columns says otherwise",)
+        return out, rotation or about, (f"{path}: {said}; --columns says otherwise",)
     if rotation is None and any(name.startswith("roll") for name in bare):
         note = (
             f"{path}: roll, pitch, yaw read as rotations about fixed x, y and z; --columns rotation=.. says otherwise"
@@ -109,24 +114,32 @@ def is_unitless(name: str) -> bool:
     return bool(_UNITLESS.fullmatch(name.lower()))
 
 
-def _of_a_maker(bare: list[str], ours: list[str], unit: str) -> tuple[dict[int, str], str]:
-    """Return our names for the six columns of KUKA or Fanuc, by their positions, and what they are read as.
+def _of_a_maker(bare: list[str], ours: list[str], unit: str, rotation: str | None) -> tuple[dict[int, str], str, str]:
+    """Return our names for the six columns of a maker, by their positions, the convention, and what they are read as.
 
-    Other columns may stand beside them, but for another rotation: which one counts would be a guess.
+    A, B and C are KUKA's, but Doosan's where the rotations are given as ZYZ. Other columns may stand beside them, but for
+    another rotation: which one counts would be a guess.
     """
     found = {
         one[1] or one[3]: (k, one[2] or one[4]) for k, name in enumerate(bare) if (one := _OF_A_MAKER.fullmatch(name))
     }
-    makers = [maker for maker, angles in _MAKERS.items() if {*"xyz", *angles} <= set(found)]
+    makers = [
+        (maker, angles, convention)
+        for maker, (*angles, convention) in _MAKERS.items()
+        if {*"xyz", *angles} <= set(found)
+        and (maker != "Doosan" or rotation == "ZYZ")
+        and (maker != "KUKA" or rotation != "ZYZ")
+    ]
     if len(makers) != 1 or {"qw", "r11", "rx", "rx_deg", "rx_rad"} & set(ours):
-        return {}, ""
-    angles = _MAKERS[makers[0]]
+        return {}, "", ""
+    ((maker, angles, convention),) = makers
     lengths, angle_unit = found["x"][1] or unit, found[angles[0]][1] or "deg"
     names = {found[axis][0]: f"{axis}_{found[axis][1] or unit}" for axis in "xyz"}
     names |= {found[name][0]: f"r{axis}_{found[name][1] or 'deg'}" for name, axis in zip(angles, "xyz", strict=True)}
-    about = ", ".join(f"{name.upper()} about {axis}" for name, axis in zip(angles, "xyz", strict=True))
+    axes = ("z", "y'", "z''") if convention == "ZYZ" else "xyz"
+    about = ", ".join(f"{name.upper()} about {axis}" for name, axis in zip(angles, axes, strict=True))
     degrees = "degrees" if angle_unit == "deg" else "radians"
-    return names, f"read as {makers[0]}'s: {lengths}; {degrees}, {about}"
+    return names, convention, f"read as {maker}'s: {lengths}; {degrees}, {about}"
 
 
 def degree_columns(path: str | Path, rows: list[list[str]]) -> list[list[str]]:

@@ -63,6 +63,9 @@ def misreadings(table: PoseTable, rows: NDArray[np.int64], Ts: Array, option: st
             "the rotations about x and z are exchanged: KUKA's A is about z, Fanuc's W about x: exchange the names of "
         )
         rotated.append(("x and z", numbers[:, ::-1], given, f"{said}the first and the last angle"))
+        if given != "ZYZ":  # Doosan's A, B, C read as KUKA's
+            said = f"the rotations are ZYZ, not {given}: --columns {option}rotation=ZYZ"
+            rotated.append(("ZYZ", numbers[:, ::-1], "ZYZ", said))
     for kind, read, convention, said in rotated:
         yield Misread(kind, pose(rotations_by(read, convention, table.path), p), said, table.path)
     said = "the rotations are inverse (matrices column by column, or quaternions conjugate), the positions are not"

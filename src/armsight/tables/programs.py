@@ -3,7 +3,7 @@
 In: the text of a program or of its data. Out: names of columns and rows, mm and degrees as the maker writes them. A table
 of patterns, one a maker; each says in which unit and convention its numbers are, by its maker's manual. Two have a reader
 of their own: Universal Robots ``p[x, y, z, rx, ry, rz]``, m and rad, a rotation vector; and KUKA ``{X 1,Y 2,Z 3,A 4,B 5,C
-6}`` (.dat, .src), mm, deg, about z, y' and x'', axes ``{A1 1,..,A6 6}``. Angles about z, y' and z'' become quaternions.
+6}`` (.dat, .src), mm, deg, about z, y' and x'', axes ``{A1 1,..,A6 6}``.
 """
 
 from __future__ import annotations
@@ -11,9 +11,6 @@ from __future__ import annotations
 import re
 from pathlib import Path
 from typing import NamedTuple
-
-import numpy as np
-from scipy.spatial.transform import Rotation
 
 from armsight.errors import InputError
 from armsight.tables.lengths import NUMBER
@@ -274,11 +271,6 @@ def _pose_points(
     angles_in = "degrees" if unit == "deg" else "radians"
     how = f"{angles_in}, {program.rotation}" if program.rotation else "quaternions"
     said = f"{path}: {len(rows)} points read as {program.maker}'s: mm, {how}"
-    if program.rotation == "ZYZ":  # not among the conventions of three axes
-        angles = np.array([row[3:] for _, row in rows], float)
-        quaternions = Rotation.from_euler("ZYZ", angles, degrees=True).as_quat()[:, [3, 0, 1, 2]].tolist()
-        rows = [(line, [*row[:3], *map(repr, q)]) for (line, row), q in zip(rows, quaternions, strict=True)]
-        return ProgramPoints([*_MM, *_QUATERNION], rows, None, (*notes, said))
     names = [name.replace("_deg", f"_{unit}") for name in program.names]
     return ProgramPoints(names, rows, program.rotation or None, (*notes, said))
 

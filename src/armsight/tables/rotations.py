@@ -11,8 +11,8 @@ if TYPE_CHECKING:
     from armsight.data import Array
 
 #: Conventions of three angles: a rotation vector; or rotations about x, y, z in the order given, about fixed axes (lower
-#: case) or about the axes of the rotated frame (capitals).
-ROTATIONS = ("rotvec", "xyz", "xzy", "yxz", "yzx", "zxy", "zyx", "XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX")
+#: case) or about the axes of the rotated frame (capitals). The angles stand by their axis, x first; of ZYZ in its order.
+ROTATIONS = ("rotvec", "xyz", "xzy", "yxz", "yzx", "zxy", "zyx", "XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX", "ZYZ")
 QUATERNION_OFF = 1e-2  # how far the length of a quaternion may be from 1: what two digits leave
 CONVENTIONS = ("wxyz", "xyzw", *ROTATIONS)  # what three or four numbers of a rotation may mean
 
@@ -34,5 +34,5 @@ def rotations_by(numbers: Array, convention: str, path: Path) -> Array:
         return np.asarray(Rotation.from_quat(numbers[:, [1, 2, 3, 0]] if convention == "wxyz" else numbers).as_matrix())
     if convention == "rotvec":
         return np.asarray(Rotation.from_rotvec(np.radians(numbers)).as_matrix())
-    order = ["xyz".index(axis) for axis in convention.lower()]
+    order = [0, 1, 2] if convention == "ZYZ" else ["xyz".index(axis) for axis in convention.lower()]
     return np.asarray(Rotation.from_euler(convention, np.radians(numbers[:, order])).as_matrix())

@@ -449,6 +449,10 @@ def test_readings_of_rotations_axes_and_units(armsight, tmp_path, seen):
     assert_right(columnwise)
     angles = Rotation.from_matrix(A[:, :3, :3]).as_euler("ZYX", degrees=True)
     rejected(named(path, "X,Y,Z,W,P,R", np.hstack([1e3 * A[:, :3, 3], angles])), "about x and z are exchanged")
+    doosan = Rotation.from_matrix(A[:, :3, :3]).as_euler("ZYZ", degrees=True)
+    rejected(
+        named(path, "X,Y,Z,A,B,C", np.hstack([1e3 * A[:, :3, 3], doosan])), "are ZYZ, not xyz: --columns rotation=ZYZ"
+    )
     rejected(named(path, "x_m,y_m,z_m,rx_rad,ry_rad,rz_rad", np.hstack([A[:, :3, 3], angles])), "are these degrees?")
     x = Rotation.from_matrix(B[:, :3, :3]).as_quat()
     bare = tmp_path / "bare.csv"
