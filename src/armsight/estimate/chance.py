@@ -47,12 +47,7 @@ def chi_square_chance(freedom: float, square: float) -> float:
 
 @functools.lru_cache(maxsize=1024)
 def chi_square_limit(freedom: float, chance: float) -> float:
-    """Return what a sum of squares of ``freedom`` standard normal numbers exceeds with a probability ``chance``.
-
-    Args:
-        freedom: degrees of freedom, above 0.
-        chance: between 0 and 1.
-    """
+    """Return what a sum of squares of ``freedom`` standard normal numbers exceeds with a probability ``chance``."""
     a, t = freedom / 2, math.sqrt(-2 * math.log(min(chance, 1 - chance)))
     z = math.copysign(t - (2.30753 + 0.27061 * t) / (1 + (0.99229 + 0.04481 * t) * t), 0.5 - chance)  # (26.2.22) there
     x = max(a * (1 - 1 / (9 * a) + z * math.sqrt(1 / (9 * a))) ** 3, 1e-3 * a)  # Wilson and Hilferty, PNAS 17, 1931

@@ -43,13 +43,7 @@ class Folds(NamedTuple):
 
     @staticmethod
     def of(linear: Linear, variances: Array, labels: NDArray[np.int64]) -> Folds:
-        """Sum up the normal equations fold by fold.
-
-        Args:
-            linear: residuals, without shared sources.
-            variances: of the sources.
-            labels: (N,) the fold of every measurement, from 0.
-        """
+        """Sum up the normal equations, of residuals without shared sources, by fold: labels (N,) from 0."""
         e, J = whitened(linear, variances)
         parts = [labels == k for k in range(int(labels.max()) + 1)]
         rows = [(e[part].ravel(), J[part].reshape(-1, J.shape[2])) for part in parts]
@@ -70,15 +64,10 @@ class Folds(NamedTuple):
         return np.asarray((np.maximum(self.c[:, None] + by_slope + by_bend, least) / self.numbers[:, None]).T)
 
     def fits(self, free: Mask, beyond: Mask | None = None) -> tuple[Array, Array, Array]:
-        """Fit ``free`` to all but each fold.
+        """Fit the S parameters ``free`` to all but each of F folds; the others are nominal.
 
-        Args:
-            free: (P,) the S parameters to fit; the others are nominal.
-            beyond: (P,) R others; None: none.
-
-        Returns:
-            The vectors (F, P), from the linearisation; the inverses (F, S, S) of the information about ``free``; and (F,
-            S, R) by how much the fit of each free parameter falls with one unit of each of the others.
+        Return the vectors (F, P), from the linearisation; the inverses (F, S, S) of the information about ``free``; and
+        (F, S, R) by how much the fit of each free parameter falls with one unit of each of those ``beyond``.
         """
         rows = np.flatnonzero(free)
         others = np.flatnonzero(beyond) if beyond is not None else rows[:0]

@@ -111,11 +111,7 @@ def left_out(s: Solved) -> tuple[Array, Array]:
 def by_chance(squares: Array, numbers: int, chance: float, least: float = 1e-300) -> NDArray[np.bool_]:
     """Return which squared distances (N,), of so many numbers each, chance explains, by the scale of their median.
 
-    Args:
-        squares: Mahalanobis, or of one unknown scale.
-        numbers: how many numbers a measurement has.
-        chance: of a larger one, below which a measurement is a mistake.
-        least: scale at least.
+    A larger one is a mistake where its chance is below ``chance``; the scale is ``least`` at least.
     """
     scale = max(float(np.median(squares)) / float(chdtri(numbers, 0.5)), least)
     return np.asarray(squares <= scale * chdtri(numbers, chance))
@@ -132,16 +128,11 @@ def log_density(left: Array, cov: Array) -> Array:
 
 
 def regression(A: Array, y: Array, groups: list[NDArray[np.int64]] | None) -> tuple[list[float], list[float]]:
-    """Return the coefficients of a fit and their sigmas, by the scatter of what is left.
+    """Return the coefficients of a fit of y (N,) by columns A (N, P) and their sigmas, by the scatter of what is left.
 
-    Without groups the rows are independent. What the columns lack is the same at every visit of a pose: visits do not
-    average it out. The sigma is the larger one of that of independent rests and that of independent poses (clustered:
-    Liang and Zeger, Biometrika 73, 1986, for G poses times G / (G - P)).
-
-    Args:
-        A: (N, P) columns.
-        y: (N,) what is explained.
-        groups: rows of each pose; None: rows have nothing in common.
+    Without groups, rows of each pose, the rows are independent. What the columns lack is the same at every visit of a
+    pose: visits do not average it out. The sigma is the larger one of that of independent rests and that of independent
+    poses (clustered: Liang and Zeger, Biometrika 73, 1986, for G poses times G / (G - P)).
     """
     x, *_ = np.linalg.lstsq(A, y, rcond=None)
     left = y - A @ x

@@ -44,14 +44,7 @@ def _prior(logs: Array, means: Array) -> float:
 def most_probable(
     linear: Linear, means: Mapping[str, float], start: Mapping[str, float] | None = None, steps: int = 60
 ) -> Array:
-    """Return the variances (K,) of the sources.
-
-    Args:
-        linear: residuals.
-        means: source -> mean of its sigma before any residual.
-        start: source -> variance to begin at.
-        steps: iterations at most.
-    """
+    """Return the variances (K,) of the sources, ``means`` being those of their sigmas before any residual."""
     from scipy.optimize import minimize
 
     of = np.array([means[name] for name in linear.sources])
@@ -70,15 +63,7 @@ def most_probable(
 
 
 def restricted(linear: Linear, start: Array, low: float, high: float, steps: int = 40) -> Array:
-    """Return the variances (K,) of the greatest restricted likelihood, without a prior.
-
-    Args:
-        linear: residuals.
-        start: (K,) variances to begin at.
-        low: the least sigma.
-        high: the greatest sigma.
-        steps: iterations at most.
-    """
+    """Return the variances (K,) of the greatest restricted likelihood, sigmas between low and high, without a prior."""
     from scipy.optimize import minimize
 
     numbers = [linear.e.size] * len(linear.own) + [F.shape[2] for F in linear.shared.values()]
@@ -109,13 +94,7 @@ def posterior(linear: Linear, variances: Array, means: Mapping[str, float]) -> f
 
 
 def scores(linear: Linear, s: Solved, names: Collection[str]) -> dict[str, float]:
-    """Return by how many sigmas of chance the residuals speak for shared sources, the variance of each at zero.
-
-    Args:
-        linear: has the columns of these sources.
-        s: the solution without them.
-        names: the sources.
-    """
+    """Return by how many sigmas of chance the residuals speak for shared sources, the variance of each at zero in s."""
     weighted = (s.W @ s.left[..., None])[..., 0]
     WR = s.W @ (s.A @ s.root)
     out = {}
@@ -131,16 +110,10 @@ def scores(linear: Linear, s: Solved, names: Collection[str]) -> dict[str, float
 def integrate(
     linear: Linear, variances: Array, means: Mapping[str, float], whole: Linear | None = None
 ) -> tuple[Array, Array, float]:
-    """Integrate over the variances.
+    """Integrate over the variances, (K,) the most probable ones, ``means`` as in :func:`most_probable`.
 
-    Args:
-        linear: the measurements that the variances come from.
-        variances: (K,) the most probable ones.
-        means: source -> mean of its sigma before any residual.
-        whole: the measurements that the unknowns come from; None: the same.
-
-    Returns:
-        Step (P,) of the unknowns and covariance (P, P), and the logarithm of the evidence of these sources.
+    ``linear`` are the measurements that the variances come from, ``whole`` those of the unknowns, by default the same.
+    Return the unknowns' step (P,) and covariance (P, P), and the logarithm of the evidence of these sources.
     """
     of = np.array([means[name] for name in linear.sources])
     logs, P, K = np.log(variances), linear.J.shape[2], len(variances)

@@ -42,13 +42,7 @@ _GCC_M4F = ("-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16
 
 @dataclass(frozen=True)
 class Compiler:
-    """A C compiler.
-
-    Attributes:
-        name: "zig" or "gcc".
-        arm: the command that compiles for a Cortex-M4F.
-        host: the command that compiles for this computer, any processor of its kind.
-    """
+    """A C compiler, "zig" or "gcc": the command that compiles for a Cortex-M4F, and for this computer's kind."""
 
     name: str
     arm: tuple[str, ...]
@@ -193,13 +187,7 @@ def fingerprint() -> str:
 
 
 def build_package(folder: Path, compiler: Compiler, host_library: str = HOST_LIBRARY) -> None:
-    """Build what the package carries into ``folder``; it is replaced whole, or left as it was.
-
-    Args:
-        folder: its ``built``.
-        compiler: makes code for the computers that the package is for.
-        host_library: the host library's file name on them.
-    """
+    """Build what the package carries into ``folder``, its ``built``; it is replaced whole, or left as it was."""
     folder.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=folder.parent) as made_in:
         made = Path(made_in) / "built"

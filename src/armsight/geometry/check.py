@@ -29,16 +29,7 @@ def numbers(value: object) -> NDArray[np.float64]:
 
 
 def checked(value: ArrayLike, shape: tuple[int | None, ...], name: str) -> NDArray[np.float64]:
-    """Return ``value`` as a finite float64 array of the given shape.
-
-    Args:
-        value: anything that numpy can convert into numbers.
-        shape: the required shape; ``None`` stands for any length.
-        name: what the array is called in the error.
-
-    Raises:
-        InputError: not numeric, another shape, or not finite.
-    """
+    """Return ``value`` as a finite float64 array of a shape, None for any length; InputError calls it ``name``."""
     try:
         array = numbers(value)
     except (TypeError, ValueError, InputError) as error:

@@ -45,10 +45,7 @@ def as_transform(given: object) -> Array:
 def as_transforms(given: Any) -> Array:  # noqa: ANN401 - any library's object
     """Return the (N, 4, 4) matrices, m, of a list of what :func:`as_transform` takes, or of one object that holds N.
 
-    Such are SciPy's RigidTransform, a table of ``measure_all`` and ROS' PoseArray.
-
-    Raises:
-        InputError: an entry is none of these; the message has its number.
+    Such are SciPy's RigidTransform, a table of ``measure_all`` and ROS' PoseArray. InputError has an entry's number.
     """
     given = getattr(given, "poses", given)
     many = given if isinstance(given, list | tuple) and not _is_pair(given) else _matrix(given).reshape(-1, 4, 4)

@@ -19,14 +19,7 @@ _SMALL = 1e-9
 
 
 def skew(v: Array) -> Array:
-    """Return the matrix of ``v x``.
-
-    Args:
-        v: (..., 3) vectors.
-
-    Returns:
-        (..., 3, 3) matrices with ``skew(v) @ w == cross(v, w)``.
-    """
+    """Return the matrices (..., 3, 3) of vectors v (..., 3): ``skew(v) @ w == cross(v, w)``."""
     out = np.zeros((*v.shape, 3))
     out[..., 0, 1], out[..., 0, 2] = -v[..., 2], v[..., 1]
     out[..., 1, 0], out[..., 1, 2] = v[..., 2], -v[..., 0]
@@ -50,11 +43,9 @@ def log_so3(R: Array) -> Array:
 
 
 def nearest_rotation(M: Array, *, mirrored: bool = False) -> Array:
-    """Project matrices (..., 3, 3) onto SO(3): the rotations nearest to them in the Frobenius norm.
+    """Project matrices (..., 3, 3) of rank two or more onto SO(3): the rotations nearest in the Frobenius norm.
 
-    Args:
-        M: (..., 3, 3) any matrices of rank two or more.
-        mirrored: return the nearest orthogonal matrices of determinant -1 instead, reflections.
+    ``mirrored``: the nearest orthogonal matrices of determinant -1 instead, reflections.
     """
     U, _, Vt = np.linalg.svd(M)
     U[..., 2] *= (-1.0 if mirrored else 1.0) * np.linalg.det(U @ Vt)[..., None]
@@ -99,16 +90,11 @@ def from_euler_zyx(roll: float, pitch: float, yaw: float) -> Array:
 
 
 def euler_zyx(R: Array) -> tuple[Array, bool]:
-    """Split a rotation into Euler angles about z, y, x (18.16 with atan2).
+    """Split a rotation R_z(roll) R_y(pitch) R_x(yaw) into (3,) Euler angles about z, y, x, rad (18.16 with atan2).
 
-    docs/concepts/method.md calls them roll, pitch, yaw; in ROS roll is the one about x.
-
-    Args:
-        R: (3, 3) rotation, R_z(roll) R_y(pitch) R_x(yaw).
-
-    Returns:
-        (3,) roll, pitch, yaw in rad, and whether the pitch is singular (+-90 degrees): then yaw is set to zero and roll
-        carries what is determined, roll - yaw at +90 degrees, roll + yaw at -90.
+    docs/concepts/method.md calls them roll, pitch, yaw; in ROS roll is the one about x. Also return whether the pitch
+    is singular (+-90 degrees): then yaw is zero and roll carries what is determined, roll - yaw at +90 degrees, roll +
+    yaw at -90.
     """
     cos_pitch = float(np.hypot(R[0, 0], R[1, 0]))
     pitch = np.arctan2(-R[2, 0], cos_pitch)
@@ -124,12 +110,8 @@ def euler_zyx(R: Array) -> tuple[Array, bool]:
 def euler_zyx_sigmas(R: Array, cov: Array) -> Array:
     """Return (3,) one sigma of the angles of :func:`euler_zyx`, rad; NaN at the singularity.
 
-    A rotation by the vector w along the outer axes changes the angles by J^-1 w; the columns of J are the axes of rotation
-    of the three angles.
-
-    Args:
-        R: (3, 3) the rotation.
-        cov: (3, 3) covariance of w along the outer axes, rad^2.
+    A rotation by the vector w along the outer axes, covariance (3, 3), rad^2, changes the angles by J^-1 w; the columns
+    of J are the axes of rotation of the three angles.
     """
     angles, singular = euler_zyx(R)
     if singular:

@@ -69,11 +69,7 @@ _KINDS = {"f": "float", "i": "int", "u": "uint"}
 
 
 def this_machine() -> str:
-    """Return the name of the target that this process runs on.
-
-    Raises:
-        InputError: none is known.
-    """
+    """Return the name of the target that this process runs on; InputError where none is known."""
     system = {"Linux": "linux", "Darwin": "macos", "Windows": "windows"}.get(platform.system(), platform.system())
     machine = {"AMD64": "x86_64", "arm64": "aarch64"}.get(platform.machine(), platform.machine())
     name = f"{system}-{'arm64' if system == 'macos' and machine == 'aarch64' else machine}"

@@ -70,11 +70,7 @@ def _library() -> Any:  # noqa: ANN401 - a compiled module has no types
 def _check_not_stale(sources: Iterable[tuple[str, str]]) -> None:
     """Check that files have the code that was compiled: all, as kernels contain those of other files that they call.
 
-    Args:
-        sources: names of modules, and the digests of their text and of their code, with a colon between.
-
-    Raises:
-        ArmsightError: one has other code, or is gone.
+    ``sources``: names of modules, and the digests of their text and of their code, with a colon between.
     """
     for module, digest in sources:
         path = _PACKAGE.parent.joinpath(*module.split(".")).with_suffix(".py")

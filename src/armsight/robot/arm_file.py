@@ -105,11 +105,7 @@ def split_arm(name_or_path: str) -> tuple[str, str | None]:
 
 
 def read_arm_toml(path: str | Path) -> Arm:
-    """Read an arm from a TOML file.
-
-    Raises:
-        InputError: unreadable, or a key or number that is not allowed; the message names it.
-    """
+    """Read an arm from a TOML file; InputError names a key or number that is not allowed."""
     given = read_toml(path)
     if "identified" in given:
         return _identified(path, given)
@@ -195,11 +191,7 @@ def _number(where: str, key: str, value: object) -> float:
 
 
 def _identified(path: str | Path, given: dict[str, Any]) -> Arm:
-    """Return the arm of a parsed corrected.toml; its tool is the body that the cameras measured.
-
-    Raises:
-        InputError: something is missing, or no number; the message names it.
-    """
+    """Return the arm of a parsed corrected.toml, its tool the body that the cameras measured; InputError names a key."""
     arm, beta = identified_table(path, given)
     if not beta.any():
         return arm
@@ -207,11 +199,7 @@ def _identified(path: str | Path, given: dict[str, Any]) -> Arm:
 
 
 def identified_table(path: str | Path, given: dict[str, Any]) -> tuple[Arm, Array]:
-    """Return the arm of a parsed corrected.toml without Hayati's angles, and these angles (n,), rad.
-
-    Raises:
-        InputError: something is missing, or no number; the message names it.
-    """
+    """Return the arm of a parsed corrected.toml without Hayati's angles, and these (n,), rad; InputError names a key."""
     require_version(path, "corrected arm", given.get("version"), VERSION)
     rows = joint_rows(path, given.get("joint"))
     at = {column: joint_numbers(path, rows, f"{column}_{unit}") for column, unit in _COLUMNS.items()}
@@ -237,23 +225,16 @@ def identified_table(path: str | Path, given: dict[str, Any]) -> tuple[Arm, Arra
 
 
 def tool_moved(path: str | Path, given: dict[str, Any]) -> tuple[float, float]:
-    """Return what a corrected.toml says of MOVED, m; NaN where it says nothing.
-
-    Raises:
-        InputError: no number.
-    """
+    """Return what a corrected.toml says of MOVED, m; NaN where it says nothing, InputError where that is no number."""
     moved, sigma = (_number(str(path), key, given[key]) if key in given else np.nan for key in MOVED)
     return moved, sigma
 
 
 def undetermined(moved_m: float, sigma_m: float) -> str:
-    """Return that poses do not determine an arm all over its joint limits, or "" where they do, or where it is not known.
+    """Return that poses do not determine an arm all over its joint limits, or "" where they do, or it is not known.
 
-    The nominal arm is off by moved^2 - sigma^2 on the mean, the corrected one by sigma^2: from here on it is no better.
-
-    Args:
-        moved_m: how far the identified arm puts its tool from the nominal one's, RMS over the joint limits, m.
-        sigma_m: sigma of that, m.
+    ``moved_m``, RMS over the limits, is how far the identified tool is from the nominal one's, sigma_m its sigma. The
+    nominal arm is off by moved^2 - sigma^2 on the mean, the corrected one by sigma^2: from here on it is no better.
     """
     if not 2 * sigma_m**2 > moved_m**2:
         return ""
@@ -264,20 +245,12 @@ def undetermined(moved_m: float, sigma_m: float) -> str:
 
 
 def joint_numbers(path: str | Path, rows: list[dict[str, Any]], key: str) -> Array:
-    """Return a number (n,) that every [[joint]] of a corrected.toml has.
-
-    Raises:
-        InputError: it is missing, or no number.
-    """
+    """Return a number (n,) that every [[joint]] of a corrected.toml has, or InputError."""
     return np.array([_number(f"{path}: joint {i + 1}", key, row.get(key)) for i, row in enumerate(rows)])
 
 
 def file_transform(path: str | Path, given: dict[str, Any], name: str) -> Array:
-    """Return a pose (4, 4) that a corrected.toml has as a position and a quaternion wxyz.
-
-    Raises:
-        InputError: it is missing, or no pose.
-    """
+    """Return a pose (4, 4) that a corrected.toml has as a position and a quaternion wxyz, or InputError."""
     try:
         p, q = (np.array(given[name][key], float) for key in ("position_m", "quaternion_wxyz"))
     except (KeyError, TypeError, ValueError):

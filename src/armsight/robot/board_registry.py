@@ -44,9 +44,7 @@ EMULATORS: Mapping[str, tuple[Callable[[Path], Emulator], Callable[[], Path]]] =
 def open_emulator(name: str, image: Path | None = None) -> Emulator:
     """Start an emulator with a fresh board, on the package's image (for host: library) or another one.
 
-    Raises:
-        InputError: there is no such emulator, or what it needs is not installed.
-        DeviceError: the firmware was not built.
+    InputError: there is none, or what it needs is not installed. DeviceError: the firmware was not built.
     """
     if name not in EMULATORS:
         raise InputError(f"no emulator {name!r}; there are {', '.join(EMULATORS)}")
@@ -71,16 +69,10 @@ def open_motion_board(
     *,
     config: Configuration | None = None,
 ) -> MotionBoard:
-    """Open any board that moves an arm: see :func:`open_board`, and the module for names.
+    """Open any board that moves an arm by its name; emulated, with the arm at its motors and the lab's configuration.
 
-    Args:
-        name: see the module.
-        plant: the arm at an emulated board's motors.
-        config: of an emulated board; the lab's without.
-
-    Raises:
-        InputError: there is no such kind of board, or something is behind its port that it does not take.
-        DeviceError: it does not answer, or is of another kind.
+    InputError: there is no such kind of board, or something is behind its port that it does not take. DeviceError: it
+    does not answer, or is of another kind.
     """
     if name.startswith(FEETECH):
         port, baud, file = serial_port(name, feetech_bus.BAUD)
@@ -95,9 +87,7 @@ def open_motion_board(
 def check_board(name: str) -> None:
     """Reject the name of a board that cannot be right, without opening it.
 
-    Raises:
-        InputError: there is no such kind of board, or something is behind its port that it does not take.
-        DeviceError: there is no such port.
+    InputError: as :func:`open_motion_board`. DeviceError: there is no such port.
     """
     if not is_real(name):
         emulator_name(name)
@@ -153,11 +143,7 @@ def open_board(name: str, plant: Plant | None = None, *, config: Configuration |
 
 
 def emulator_name(name: str) -> str:
-    """Return the emulator of an emulated board's name.
-
-    Raises:
-        InputError: there is no such board; the message names those there are.
-    """
+    """Return the emulator of an emulated board's name; InputError names those there are."""
     if name.startswith(tuple(OWN_CONTROLLERS)):
         raise InputError(
             f"{name} keeps its own controller: it has no gains, no configuration and no self-test of armsight's firmware"
@@ -171,11 +157,7 @@ def emulator_name(name: str) -> str:
 
 
 def configured(link: EmulatedLink, config: Configuration | None = None) -> Board:
-    """Store a configuration (the lab's without) on a fresh emulated board, restart it, and return it.
-
-    Raises:
-        InputError: a value of the configuration is outside its range.
-    """
+    """Store a configuration (the lab's without) on a fresh emulated board, restart it, and return it."""
     board = Board.connect(link, name="the emulated board")
     try:
         board.store(lab_configuration() if config is None else config)

@@ -55,14 +55,9 @@ class Difference(NamedTuple):
 
 
 def read_calibration(path: str | Path, nominal: Arm) -> Arm:
-    """Return a single arm as a calibration file has it.
+    """Return a single arm as a YAML or .conf file has it; ``nominal`` is the maker's table of this kind of arm.
 
-    Args:
-        path: the YAML or .conf file.
-        nominal: the maker's table of this kind of arm.
-
-    Raises:
-        InputError: unreadable, not of this form or not of this arm; the message names the joint.
+    InputError: unreadable, not of this form or not of this arm; the message names the joint.
     """
     if Path(path).suffix.lower() == ".conf":
         return _checked(path, nominal, _with_deltas(path, nominal))
@@ -158,18 +153,11 @@ def _names(arm: Arm) -> tuple[str, ...]:
 
 
 def calibration_text(arm: Arm, nominal: Arm) -> tuple[str, float, float]:
-    """Return an arm as a calibration file of its maker's, and what of its flange that cannot hold.
+    """Return an arm as a YAML file of its maker's, with the frames of the nominal one, and what that cannot hold.
 
-    Args:
-        arm: the arm, such as an identified one.
-        nominal: the maker's table of this kind of arm, whose frames the file follows.
-
-    Returns:
-        The YAML text, and how far the file's flange is off the arm's, m and rad: zero where axis n goes through the origin
-        of the flange along its z, as in the makers' tables.
-
-    Raises:
-        InputError: another number of joints, a joint that rotates the other way, or coupled motors.
+    That is by how much the file's flange is off the arm's, m and rad: zero where axis n goes through the origin of the
+    flange along its z, as in the makers' tables. InputError: another number of joints, a joint that rotates the other
+    way, or coupled motors.
     """
     if arm.joints != nominal.joints:
         raise InputError(f"{arm.name} has {arm.joints} joints, {nominal.name} {nominal.joints}")
@@ -229,11 +217,7 @@ def with_tool_of(arm: Arm, path: str | Path, nominal: Arm) -> Arm:
 
 
 def difference(first: Arm, second: Arm) -> Difference:
-    """Return how far apart two arms of the same joints put their tools.
-
-    Raises:
-        InputError: they have not the same number of joints.
-    """
+    """Return how far apart two arms of the same joints (else InputError) put their tools."""
     if first.joints != second.joints:
         raise InputError(f"{first.name} has {first.joints} joints, {second.name} {second.joints}")
     q = np.random.default_rng(0).uniform(first.q_min, first.q_max, (_POSES, first.joints))

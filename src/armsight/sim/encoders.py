@@ -58,15 +58,7 @@ def as5047_frame(data: int, *, error: bool = False) -> int:
 
 
 class EncodedPlant:
-    """Joints with encoders.
-
-    Args:
-        plant: the joints; those without an encoder keep their potentiometer.
-        encoders: what reads them.
-
-    Attributes:
-        fault: (6,) what is wrong with each encoder; may be changed at any time.
-    """
+    """Joints with encoders; those without keep their potentiometer. ``fault`` (6,): what is wrong with each encoder."""
 
     def __init__(self, plant: JointPlant, encoders: Encoders) -> None:
         self.plant, self._encoders = plant, encoders

@@ -42,15 +42,7 @@ def example_rig(
     convergence_deg: float = 8.0,
     model: str = "brown5",
 ) -> StereoRig:
-    """Return two slightly different cameras side by side that look at the same point.
-
-    Args:
-        image_size_px: (width, height) of both.
-        focal_px: about both focal lengths.
-        baseline_m: distance between the cameras.
-        convergence_deg: by how much the right camera is rotated towards the left one's axis.
-        model: distortion model: none, brown4, brown5 or fisheye.
-    """
+    """Return two slightly different cameras side by side that look at the same point."""
     coefficients = {
         "none": (),
         "brown4": (-0.12, 0.06, 0.0006, -0.0004),
@@ -108,19 +100,8 @@ def board_poses(
 ) -> Array:
     """Sample poses of a chessboard that calibrate a rig well: all over both images, near and far, tilted all ways.
 
-    Args:
-        rng: source of the samples.
-        rig: the cameras.
-        pattern: the board.
-        count: how many poses.
-        fill: smallest and largest share of the image's height that the board's diagonal takes when it faces the camera.
-        tilt_deg: largest tilt.
-
-    Returns:
-        (count, 4, 4) poses of the board's body in the left camera's frame, m, each in full view of both cameras.
-
-    Raises:
-        InputError: no such pose was found.
+    Return (count, 4, 4) in the left camera's frame, m, in full view of both. ``fill``: least and largest share of the
+    image's height that the board's diagonal takes when it faces the camera. InputError: no such pose was found.
     """
     cells = rng.permutation(count)
     poses = []
@@ -177,20 +158,10 @@ def _tried(
 def path(
     rig: StereoRig, patterns: Sequence[Pattern], times_s: Array, *, distance_m: float = 0.5, speed: float = 1.0
 ) -> tuple[Array, Array]:
-    """Return a smooth path of a target through the volume that both cameras see.
+    """Return a smooth path of a target, all of it in view of both cameras, about distance_m away.
 
-    Args:
-        rig: the cameras.
-        patterns: the target; all of it stays in view.
-        times_s: (N,) times, s.
-        distance_m: of the path's middle from the cameras.
-        speed: 1 for a path that comes back to its start after some ten seconds.
-
-    Returns:
-        (N, 4, 4) poses of the target in the left camera's frame, m, and (N, 6) its velocity in its own axes, m/s, rad/s.
-
-    Raises:
-        InputError: the target is not in view even at rest in the middle.
+    (N, 4, 4) poses in the left camera's frame, m, at times (N,), s, and (N, 6) velocities in the target's axes. Speed 1
+    comes back to its start after some ten seconds. InputError: not in view even at rest in the middle.
     """
     middle = _between(rig, np.array([distance_m]))[0]
     rates = speed * np.array([0.7, 1.1, 0.5, 0.9, 0.6, 0.8])

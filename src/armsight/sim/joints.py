@@ -170,13 +170,9 @@ def plain_transmission(**rows: float | Array) -> Transmission:
 
 
 def sprung(model: JointModel, resonance_hz: Array, damping: Array, link_share: Array) -> dict[str, Array]:
-    """Return stiffness, damping and link share of joints that resonate so while both masses are free.
+    """Return stiffness, damping and link share (6,) of joints that resonate so while both masses are free.
 
-    Args:
-        model: what the joints are made of.
-        resonance_hz: (6,) of the joint's inertia against the motor's.
-        damping: (6,) of that resonance, of critical, by the spring alone.
-        link_share: (6,) share of the joint's inertia behind the spring.
+    ``damping`` (6,): of the resonance, of critical, by the spring alone; ``link_share`` (6,): of the inertia behind it.
     """
     w = 2 * np.pi * resonance_hz
     reduced = model.inertia_kg_m2 * link_share * (1 - link_share)
@@ -393,12 +389,9 @@ class JointPlant:
         self.link[joint], self._linkd[joint] = angle_rad, 0.0
 
     def break_pot(self, joint: int, fault: PotFault, size: float | None = None) -> None:
-        """Break a potentiometer (0 to 5) from its next reading on; :attr:`PotFault.NONE` repairs it.
+        """Break a joint's (0 to 5) potentiometer from its next reading on; :attr:`PotFault.NONE` repairs it.
 
-        Args:
-            joint: whose.
-            fault: how.
-            size: how much, as :class:`PotFault` says; a usual one without.
+        ``size``: how much, as :class:`PotFault` says; a usual one without.
         """
         given = _USUAL_SIZE.get(fault, 0.0) if size is None else size
         unit = {PotFault.SCALED: 1.0, PotFault.LAG: 1 / TICK_S}.get(fault, COUNTS_PER_RAD)

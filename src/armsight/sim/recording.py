@@ -51,11 +51,7 @@ class Truth(Record):
     Ts_left_body: Array
 
     def save(self, folder: str | Path) -> None:
-        """Write ``truth_rig.json`` and ``truth.json`` into a folder.
-
-        Raises:
-            InputError: a file cannot be written.
-        """
+        """Write ``truth_rig.json`` and ``truth.json`` into a folder."""
         self.rig.save(Path(folder) / TRUTH_RIG)
         shots = [
             {"shot": shot, "t_s": t, "T_left_body_m": T}
@@ -66,11 +62,7 @@ class Truth(Record):
 
     @staticmethod
     def load(folder: str | Path) -> Truth:
-        """Read the truth of a recording.
-
-        Raises:
-            InputError: missing, or not such a file; the message names it.
-        """
+        """Read the truth of a recording; InputError names a file that is missing or is none."""
         path = Path(folder) / TRUTH
         try:
             document = read_json(path)
@@ -90,14 +82,7 @@ class Truth(Record):
 
 @dataclass(frozen=True)
 class Look:
-    """The appearance of a recording: lens, sensor, shutter, background.
-
-    Attributes:
-        optics: lenses and light.
-        sensor: both sensors.
-        shutter: both shutters.
-        background: a key of BACKGROUNDS.
-    """
+    """The appearance of a recording: lenses and light, sensors, shutters, and a key of BACKGROUNDS."""
 
     optics: Optics = field(default_factory=lambda: Optics(0.7, vignetting=0.25, light_gradient=(0.2, -0.1)))
     sensor: Sensor = field(default_factory=Sensor)
@@ -115,19 +100,10 @@ def record(
     seed: int = 0,
     threads: int = 2,
 ) -> None:
-    """Render a recording.
+    """Render a recording of patterns into a folder, with the truth beside the images.
 
-    Args:
-        folder: where to; it is made if it is not there.
-        truth: rig, poses and names of what is rendered; written beside the images.
-        patterns: what the target looks like, on its body.
-        twists: (N, 6) velocity of the target in its own axes at each shot, for its blur; still by default.
-        look: lenses, sensors and background.
-        seed: of noise and background.
-        threads: how many shots are rendered at once; the images do not depend on it.
-
-    Raises:
-        InputError: a file cannot be written.
+    ``twists`` (N, 6): velocity of the target in its own axes at each shot, for its blur; ``threads``: how many shots
+    are rendered at once, which the images do not depend on.
     """
     folder, look = Path(folder), look or Look()
     try:

@@ -35,13 +35,9 @@ _WEAKEST = 6.0
 
 @dataclass(frozen=True, eq=False)
 class Spot(Record):
-    """Something that blinks.
+    """Something that blinks at uv (2,), pixels: a window at ``corner`` (column, row) with weights (h, w) of sum 1.
 
-    Attributes:
-        uv: (2,) its centre, pixels.
-        corner: first column and row of the window about it.
-        weights: (h, w) of the window's pixels, sum 1.
-        around: (h, w) weights of what is around it, sum 1.
+    ``around``: weights of what is around it, sum 1.
     """
 
     uv: Array
@@ -64,11 +60,7 @@ def block_means(image: Image) -> Array:
 
 
 def candidates(means: Array) -> list[tuple[int, int]]:
-    """Return the windows about what blinks most, their first column and row; the most first.
-
-    Args:
-        means: (N, h, w) block means of N images.
-    """
+    """Return the first column and row of windows about what blinks most in block means (N, h, w); the most first."""
     # Lamps that flicker change all blocks alike, shadows change slowly: neither is what blinks.
     apart = [image - cv2.blur(image, (_NEAR, _NEAR)) for image in means.astype(np.float32)]
     changes = np.diff(apart, axis=0).std(axis=0)
@@ -105,15 +97,7 @@ def _part(image: Image, corner: tuple[int, int], shape: tuple[int, ...]) -> Arra
 
 
 def spot(pixels: Array, corner: tuple[int, int]) -> Spot | Missed:
-    """Weigh the pixels of a window by how much they blink together.
-
-    Args:
-        pixels: (N, h, w) of N images.
-        corner: first column and row of the window.
-
-    Returns:
-        The spot; or why its brightness cannot be measured: too weak, saturated.
-    """
+    """Weigh the pixels (N, h, w) of a window at ``corner`` by how much they blink together; Missed if weak or saturated."""
     stack = pixels.astype(np.float64)
     changes = stack - stack.mean(axis=0)
     together = changes[:, changes.std(axis=0) >= 0.5 * changes.std(axis=0).max()].mean(axis=1)

@@ -100,17 +100,10 @@ def is_camera(entry: object) -> bool:
 
 
 def camera_of(entry: Mapping[str, Any], given_px: tuple[int, int] | None = None) -> tuple[Camera, list[str]]:
-    """Build a camera from its entry in a file, by the names that are known.
+    """Build a camera from its entry in a file, by the names that are known, and notes on what was assumed or looks odd.
 
-    Args:
-        entry: the camera's names and numbers.
-        given_px: (width, height) that a person gives; it must agree with that of the entry.
-
-    Returns:
-        The camera, and notes on what was assumed or looks odd.
-
-    Raises:
-        InputError: what is missing or cannot be, with the names that are there.
+    ``given_px`` (width, height) of a person must agree with that of the entry. InputError: what is missing or cannot
+    be, with the names that are there.
     """
     if (lens := found(entry, ("cameramodel",))) is not None and isinstance(lens, str) and plain(lens) not in _PINHOLES:
         raise InputError(
@@ -288,8 +281,7 @@ def _principal_point(camera: Camera) -> list[str]:
 def read_cameras(path: str | Path) -> tuple[Camera, Camera]:
     """Read two cameras, left and right: ours, or the rig of another program, whose relative pose is not read.
 
-    Raises:
-        InputError: missing, or not two cameras; the message names the file and the entry.
+    InputError names the file and the entry.
     """
     from armsight.tables.document import read_document  # not above: YAML takes as long to import as a pair of images
     from armsight.vision.rigfiles.rigfile import naming
@@ -309,11 +301,7 @@ def read_cameras(path: str | Path) -> tuple[Camera, Camera]:
 
 
 def read_camera(path: str | Path) -> Camera:
-    """Read one camera: the file of any program whose names are known.
-
-    Raises:
-        InputError: missing, of two cameras, or none.
-    """
+    """Read one camera: the file of any program whose names are known; InputError of two cameras, or none."""
     from armsight.tables.document import read_document  # not above: YAML takes as long to import as a pair of images
     from armsight.vision.rigfiles.rigfile import naming
 
@@ -366,9 +354,7 @@ _STRANGERS: tuple[tuple[Callable[[set[str]], bool], str], ...] = (
 def stranger(document: Mapping[str, Any], camera: bool = True) -> str | None:
     """Return what a document is that holds no rig; None where it is not known.
 
-    Args:
-        document: its names and values.
-        camera: whether the calibration of a single camera is a stranger, too.
+    ``camera``: whether the calibration of a single camera is a stranger, too.
     """
     names = {plain(key) for key in document}
     if camera and is_camera(document):

@@ -45,14 +45,7 @@ class SeenShot(Record):
 
 
 def read_detections(path: str | Path, body: Body) -> list[SeenShot]:
-    """Read a file of detections.
-
-    Args:
-        path: the CSV file.
-        body: names the points.
-
-    Returns:
-        One record per shot, in the file's order.
+    """Read a CSV file of detections of a body: one record per shot, in the file's order.
 
     Raises:
         InputError: missing file or column, text or NaN where a number must be, an unknown camera or marker, no line at
@@ -98,12 +91,7 @@ def read_detections(path: str | Path, body: Body) -> list[SeenShot]:
 
 
 def detections_text(shots: Iterable[tuple[str, float | None, Correspondences]], body: Body) -> str:
-    """Return detections as the text of such a file.
-
-    Args:
-        shots: name, time, s, or None, and what both cameras saw, of each shot.
-        body: names the points.
-    """
+    """Return detections as the text of such a file: name, time, s, or None, and what both cameras saw, of each shot."""
     lines = [",".join((*COLUMNS, "t_s"))]
     for name, t_s, seen in shots:
         time = "" if t_s is None else f"{t_s:.6f}"
@@ -115,11 +103,7 @@ def detections_text(shots: Iterable[tuple[str, float | None, Correspondences]], 
 
 
 def detection_times(path: str | Path) -> dict[str, float]:
-    """Return the times of the shots of a file of detections that has the column ``t_s``, by their names; else nothing.
-
-    Raises:
-        InputError: a time is no number.
-    """
+    """Return the shots' times, s, by name, of a file of detections that has a column ``t_s``; else nothing."""
     rows = read_table(path)
     header = [name.strip() for name in rows[0]] if rows else []
     if "t_s" not in header or "shot" not in header:

@@ -180,17 +180,10 @@ def one_image(left: Image, right: Image) -> bool:
 
 
 def grey(image: Image) -> NDArray[np.uint8]:
-    """Convert an image to 8-bit grey.
+    """Convert an image, (H, W), (H, W, 1), (H, W, 3) BGR or (H, W, 4) BGRA, uint8 or uint16, to 8-bit grey (H, W).
 
-    Args:
-        image: (H, W), (H, W, 1), (H, W, 3) BGR or (H, W, 4) BGRA, uint8 or uint16; 16 bits are scaled by 1/257.
-
-    Returns:
-        (H, W) uint8, always read-only: for compiled functions read-only and writable arrays are two types, and each
-        type is compiled separately.
-
-    Raises:
-        InputError: another shape or type.
+    16 bits are scaled by 1/257. The result is always read-only: for compiled functions read-only and writable arrays
+    are two types, and each type is compiled separately. InputError: another shape or type.
     """
     if image.dtype not in (np.uint8, np.uint16) or image.ndim not in (2, 3) or 0 in image.shape:
         raise InputError(f"an image must be (H, W) or (H, W, 3), 8 or 16 bits; got {image.shape} of {image.dtype}")

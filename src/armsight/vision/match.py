@@ -35,15 +35,9 @@ def join(left: Detections, right: Detections) -> Correspondences:
 
 
 def epipolar_distances(rig: StereoRig, uv_left: Array, uv_right: Array) -> Array:
-    """Measure the distance of each point from the epipolar line of its partner.
+    """Return (N, 2) distances of points, raw pixels (N, 2), from the epipolar lines of their partners, undistorted px.
 
-    Args:
-        rig: the calibrated pair.
-        uv_left: (N, 2) raw pixels.
-        uv_right: (N, 2) raw pixels of the same points.
-
-    Returns:
-        (N, 2) distance in the left and in the right image, undistorted px; NaN where a pixel has no ray.
+    In the left and in the right image; NaN where a pixel has no ray.
     """
     out = np.empty((len(uv_left), 2))
     focal = np.array([camera.intrinsics[:2] for camera in rig.cameras])
@@ -74,16 +68,7 @@ def _gaps(rays_left: Array, rays_right: Array, T_left_right: Array, focal: Array
 
 
 def gate(rig: StereoRig, body: Body, seen: Correspondences) -> Correspondences:
-    """Drop, in both cameras, the pairs that the rig's epipolar geometry contradicts.
-
-    Args:
-        rig: the calibrated pair.
-        body: names the points.
-        seen: correspondences by identity.
-
-    Returns:
-        The correspondences that remain; every dropped point is named with its distance.
-    """
+    """Drop, in both cameras, the pairs that the rig's epipolar geometry contradicts, each by name with its distance."""
     rows = np.flatnonzero(seen.paired)
     uv, cov = seen.uv[rows], seen.cov_uv[rows]
     distance = epipolar_distances(rig, uv[:, 0], uv[:, 1]).max(axis=1)
@@ -104,18 +89,10 @@ def gate(rig: StereoRig, body: Body, seen: Correspondences) -> Correspondences:
 def match(
     rig: StereoRig, body: Body, left: Detections, right: Detections, *, symmetries: tuple[Ids, ...] = ()
 ) -> Correspondences:
-    """Match one shot's detections: identity, then the epipolar gate.
+    """Match one shot's detections: identity, then the epipolar gate; points seen by one camera are kept.
 
-    Args:
-        rig: the calibrated pair.
-        body: the body of both detections.
-        left: detections of the left camera.
-        right: detections of the right camera.
-        symmetries: permutations (M,) under which the body looks the same, so that its points may have been named by any
-            of them; the one with which most pairs agree with the rig is applied to the right camera.
-
-    Returns:
-        The correspondences; points seen by one camera only are kept, for they constrain the pose too.
+    ``symmetries``: permutations (M,) under which the body looks the same, so that its points may have been named by any
+    of them; the one with which most pairs agree with the rig is applied to the right camera.
     """
     best = join(left, right)
     if symmetries and best.paired.any():

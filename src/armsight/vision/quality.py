@@ -88,11 +88,7 @@ def same_camera(left: Grey, right: Grey) -> bool:
 
 
 class FlickerWatch:
-    """Looks for the flicker of lamps in the images of a camera that stands still.
-
-    Args:
-        rate_hz: of the camera.
-    """
+    """Looks for the flicker of lamps in the images, rate_hz a second, of a camera that stands still."""
 
     def __init__(self, rate_hz: float) -> None:
         self._rate_hz = rate_hz

@@ -57,11 +57,7 @@ class Rectification(Record):
     map_right: NDArray[np.float32]
 
     def images(self, left: Image, right: Image) -> tuple[Image, Image]:
-        """Rectify a pair of raw images; where a camera sees nothing they are black.
-
-        Raises:
-            InputError: an image is not of the size its camera was calibrated at.
-        """
+        """Rectify a pair of raw images of the calibrated sizes; where a camera sees nothing they are black."""
         out = []
         for side, camera, image in (("left", self.rig.left, left), ("right", self.rig.right, right)):
             if (image.shape[1], image.shape[0]) != tuple(camera.image_size_px):
@@ -122,13 +118,10 @@ def _rays(uv: Array, focal_px: float, principal: tuple[float, float]) -> Array:
 
 
 def rectify(rig: StereoRig) -> Rectification:
-    """Compute the rectification of a rig.
+    """Compute the rectification of a rig; InputError where its baseline lies along the optical axes.
 
     The new axes: x along the baseline, z as near to both optical axes as possible. The images keep the left one's size
     and the mean focal length; the mean of the two viewing directions is in the middle.
-
-    Raises:
-        InputError: the baseline lies along the optical axes: the images cannot be rectified.
     """
     baseline = rig.T_left_right[:3, 3] / rig.baseline_m
     ahead = np.array([0.0, 0.0, 1.0]) + rig.T_left_right[:3, 2]

@@ -26,15 +26,9 @@ _LOOKING = 0.99
 
 
 def midpoints(rig: StereoRig, uv_left: Array, uv_right: Array) -> Array:
-    """Return the points halfway between the two rays of each pair of raw pixels.
+    """Return the points (N, 3), m, left frame, halfway between the rays of raw pixels uv_left, uv_right (N, 2).
 
-    Args:
-        rig: the calibrated pair.
-        uv_left: (N, 2) raw pixels.
-        uv_right: (N, 2) raw pixels of the same points.
-
-    Returns:
-        (N, 3) points, m, left frame; NaN where the rays are parallel or come closest behind a camera.
+    NaN where the rays are parallel or come closest behind a camera.
     """
     p = np.empty((len(uv_left), 3))
     _between(rig.left.unproject(uv_left), rig.right.unproject(uv_right), np.array(rig.T_left_right), p)
@@ -63,12 +57,7 @@ def _between(rays_left: Array, rays_right: Array, T: Array, p: Array) -> None:
 
 
 def optimal_points(rig: StereoRig, uv: Array, cov_uv: Array) -> tuple[Array, Array, Array]:
-    """Triangulate pairs of raw pixels.
-
-    Args:
-        rig: the calibrated pair.
-        uv: (N, 2, 2) point, camera, raw pixel.
-        cov_uv: (N, 2, 2, 2) covariance of each pixel, px^2, positive definite.
+    """Triangulate pairs of raw pixels uv (N, 2, 2), point and camera, of positive definite cov_uv (N, 2, 2, 2), px^2.
 
     Returns:
         (N, 3) points, m, left frame, NaN where the rays do not meet before both cameras; (N, 3, 3) covariance from the
@@ -243,16 +232,9 @@ def _ahead(p: Array, ray_left: Array, q: Array, ray_right: Array) -> bool:
 
 
 def triangulate(rig: StereoRig, body: Body, seen: Correspondences) -> Points:
-    """Triangulate one shot's matched points.
+    """Triangulate one shot's gated correspondences; the rig's ``sigma_px`` adds to the detections' covariance.
 
-    Args:
-        rig: the calibrated pair; its ``sigma_px`` adds to the detections' covariance.
-        body: names the points.
-        seen: the correspondences of both cameras, gated.
-
-    Returns:
-        The points with their covariance; a point that does not lie before both cameras is dropped by name, and its
-        detections with it.
+    A point that does not lie before both cameras is dropped by name, and its detections with it.
     """
     rows = np.flatnonzero(seen.paired)
     cov_uv = seen.cov_uv[rows] + max(rig.sigma_px, 1e-6) ** 2 * np.eye(2)

@@ -67,12 +67,7 @@ _SLOW_ANGLES_US = 20000
 
 
 class Board:
-    """A board behind a link, connected by :meth:`connect`; the link is closed with it.
-
-    Args:
-        link: the wire to it.
-        name: what errors call it.
-    """
+    """A board behind a link, connected by :meth:`connect`; the link is closed with it."""
 
     welcome: Welcome  #: who it is
     status: BoardStatus  #: its newest status
@@ -92,14 +87,9 @@ class Board:
 
     @classmethod
     def connect(cls, link: Link, *, name: str = "the board") -> Self:
-        """Say hello to the board behind a link, and wait for the first telemetry.
+        """Say hello to the board behind a link, and wait for the first telemetry; the link is closed where this raises.
 
-        Args:
-            link: the wire to it; closed where this raises.
-            name: what errors call the board, such as its port.
-
-        Raises:
-            DeviceError: it does not answer, or is of another version.
+        DeviceError: it does not answer, or is of another version.
         """
         board = cls(link, name)
         try:
@@ -257,12 +247,7 @@ class Board:
         return self._wire.broken + self._wire.lost
 
     def send(self, command: JointCommand) -> int:
-        """Send a motion command and return its number; :attr:`status` says whether it was acknowledged.
-
-        Raises:
-            InputError: a shape, a number that is not finite, or a duration that is no whole number of ticks.
-            DeviceError: the board is gone.
-        """
+        """Send a motion command and return its number; :attr:`status` says whether it was acknowledged."""
         ticks = command.duration_s * self._ticks_per_s
         if not 0.5 <= ticks <= _LONGEST_TICKS or abs(ticks - round(ticks)) > 1e-6 * ticks:
             raise InputError(
@@ -284,24 +269,16 @@ class Board:
             self._say("stop", sequence)
 
     def set_gains(self, gains: Array, *, checked: bool = True) -> int:
-        """Send a gain set and return its number.
+        """Send a gain set (6, 8), a row per joint of kp, ki, kd, kv, ka, kf, filter, anti-windup; return its number.
 
-        Args:
-            gains: (6, 8) a row per joint of kp, ki, kd, kv, ka, kf, derivative filter, anti-windup.
-            checked: False leaves it to the board alone to reject what is out of range.
-
-        Raises:
-            InputError: a gain is outside its range; nothing was sent.
+        InputError: a gain is outside its range, and nothing was sent, unless ``checked`` is False, which leaves it to
+        the board.
         """
         values = check_gains(gains) if checked else np.asarray(gains, dtype=float)
         return self._send("gains", values.ravel().tolist())
 
     def confirm(self, sequence: int, wait_s: float = 0.5) -> None:
-        """Wait until the board acknowledged the command of this number.
-
-        Raises:
-            DeviceError: it was rejected (and why), or nothing was heard of it.
-        """
+        """Wait until the board acknowledged the command of this number; DeviceError where it was rejected, or is silent."""
         for _ in range(max(1, round(wait_s / STEP_S))):
             self._pump(STEP_S)
             status = self.status
@@ -314,18 +291,13 @@ class Board:
         )
 
     def enable(self, *, inward: bool = False) -> None:
-        """Switch the drives on and wait until they are; ``inward`` where a joint is outside its soft limits.
-
-        Raises:
-            DeviceError: it was rejected, and why.
-        """
+        """Switch the drives on, or raise DeviceError; ``inward`` where a joint is outside its soft limits."""
         self.confirm(self.command(Command.ENABLE_INWARD if inward else Command.ENABLE))
 
     def receive(self, wait_s: float = 0.0) -> JointStates:
         """Let ``wait_s`` pass and return all readings of the potentiometers since the last call.
 
-        Raises:
-            DeviceError: the board is gone or has restarted; the message says what its arm does.
+        DeviceError: the board is gone or has restarted; the message says what its arm does.
         """
         self._pump(wait_s)
         taken, self._angles = self._angles, []
@@ -333,33 +305,21 @@ class Board:
         return JointStates(t_s, np.array([q for _, q in taken], dtype=float).reshape(-1, JOINTS))
 
     def watch_sensors(self, every_s: float) -> None:
-        """Let the board report so often what its converters read; 0 ends it. :meth:`sensed` returns it.
-
-        Raises:
-            DeviceError: it does not answer.
-        """
+        """Let the board report so often what its converters read; 0 ends it. :meth:`sensed` returns it."""
         ask = self._command_long
         ask(_SET_MESSAGE_INTERVAL, dialect().MAVLINK_MSG_ID_SENSED, 1e6 * every_s)
         # Both at full rate would fill the wire.
         ask(_SET_MESSAGE_INTERVAL, dialect().MAVLINK_MSG_ID_ANGLES, _SLOW_ANGLES_US if every_s else 0)
 
     def sensed(self, wait_s: float = 0.0) -> SensorReadings:
-        """Let ``wait_s`` pass and return what the converters read since the last call.
-
-        Raises:
-            DeviceError: the board is gone or has restarted.
-        """
+        """Let ``wait_s`` pass and return what the converters read since the last call; errors as :meth:`receive`."""
         self._pump(wait_s)
         self._angles.clear()
         taken, self._sensed = self._sensed, []
         return readings_of([message for message, _ in taken], [t_s for _, t_s in taken])
 
     def restart(self) -> None:
-        """Start the board anew, with the drives off, and say hello again: what was stored is in use from now on.
-
-        Raises:
-            DeviceError: the drives are on, or it does not come back.
-        """
+        """Start the board anew, with the drives off or DeviceError, and say hello again: what was stored is in use."""
         self._command_long(_REBOOT, 1)
         anew = Board(self._link, self.name)
         anew._open()
@@ -380,9 +340,7 @@ class Board:
     def store(self, config: Configuration) -> None:
         """Store a configuration on the board, with the drives off; it is in use after the board's next start.
 
-        Raises:
-            InputError: a value is outside its range; nothing was changed.
-            DeviceError: the board rejected it.
+        InputError: a value is outside its range; nothing was changed. DeviceError: the board rejected it.
         """
         check_configuration(config)
         check_pin(config, self.welcome.board)

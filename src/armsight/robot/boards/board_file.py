@@ -113,11 +113,7 @@ def configuration_text(config: Configuration, board: str) -> str:
 
 
 def read_configuration(path: Path) -> tuple[Configuration, str]:
-    """Read a ``board.toml``; returns the configuration and the board's name.
-
-    Raises:
-        InputError: it cannot be read, or names the file and the value that is missing, unknown, or out of range.
-    """
+    """Read a ``board.toml``, configuration and name of the board; InputError names what is missing or out of range."""
     data = read_toml(path)
     if data.get("version") not in list(_NEW_SINCE) or not isinstance(data.get("board"), str):
         raise InputError(
@@ -173,11 +169,7 @@ def _unknown(path: str, config: Configuration) -> str:
 
 
 def put(config: Configuration, path: str, value: object) -> None:
-    """Put a value, a number or a potentiometer's table, into a configuration, in-place.
-
-    Raises:
-        InputError: there is no such path, or the value is of another kind.
-    """
+    """Put a value, a number or a potentiometer's table, into a configuration, in-place; InputError without such a path."""
     record, name = _record_of(config, path)
     if name == _PIN:
         record[name] = pin_number(value)

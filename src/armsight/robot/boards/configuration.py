@@ -82,11 +82,7 @@ def pin_number(name: object) -> int:
 
 
 def check_pin(config: Configuration, board: str) -> None:
-    """Check that the sync LED's pin has no other use on a board of this name.
-
-    Raises:
-        InputError: it has, or the board has no such pin.
-    """
+    """Check that the sync LED's pin exists and has no other use on a board of this name; else InputError."""
     name = pin_name(int(config["sync_led_pin"]))
     used = USED_PINS.get(board)
     if used is not None and name != NO_PIN and (name in used or name[1] > "C"):
@@ -139,11 +135,7 @@ def gains_array(config: Configuration) -> Array:
 
 
 def check_gains(gains: Array, count: int = JOINTS) -> Array:
-    """Return a gain set (6, 8), a row per joint; an error names the gain and the joint, of the first ``count`` joints.
-
-    Raises:
-        InputError: the shape, a number that is not finite, or one outside its range.
-    """
+    """Return a gain set (6, 8); InputError names the gain and the joint, of the first ``count``, that is out of range."""
     values = np.asarray(gains, dtype=float)
     if values.shape != (JOINTS, len(GAIN_RANGES)):
         raise InputError(
@@ -160,11 +152,7 @@ def check_gains(gains: Array, count: int = JOINTS) -> Array:
 
 
 def check_configuration(config: Configuration) -> None:
-    """Check a configuration that the board would reject as a whole, and say what is wrong with it.
-
-    Raises:
-        InputError: it is of another layout, or a value is outside its range.
-    """
+    """Check a configuration that the board would reject as a whole; InputError says what is wrong with it."""
     if config.dtype != CONFIG or config.shape != ():
         raise InputError("this is no configuration: begin with board.configuration() and change what is to change")
     for problem in _problems(config):

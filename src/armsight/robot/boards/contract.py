@@ -104,11 +104,7 @@ class MotionBoard(Protocol):
         ...
 
     def confirm(self, sequence: int, wait_s: float = 0.5) -> None:
-        """Wait until the board acknowledged the command of this number.
-
-        Raises:
-            DeviceError: it was rejected, or nothing was heard of it.
-        """
+        """Wait until the board acknowledged the command of this number; DeviceError where it was rejected, or is silent."""
         ...
 
     def enable(self, *, inward: bool = False) -> None:
@@ -140,12 +136,6 @@ class PolledBoard:
     """An arm's own controller that is asked for every reading: takes angles alone, and has no clock and no watchdog.
 
     A member says how it is read (``_read``, which sets ``_t_s``), how time passes (``_wait``) and where its joints are.
-
-    Args:
-        name: what errors call it, such as its port.
-        abilities: what it can do.
-        welcome: who it is.
-        now: the clock that passes while it is read, s.
     """
 
     def __init__(self, name: str, abilities: Abilities, welcome: Welcome, now: Callable[[], float]) -> None:
@@ -174,11 +164,7 @@ class PolledBoard:
     def _checked_goal(
         self, command: JointCommand, who: str, names: Sequence[str] | None = None, margin_rad: float = 1e-8
     ) -> tuple[Array, Array]:
-        """Return a command's angles (n,), rad, and speeds, rad/s: near, and within the limits but for a margin.
-
-        Raises:
-            InputError: another number of joints, one that is not finite, outside the limits, or far away.
-        """
+        """Return a command's angles and speeds (n,), rad: near, and within limits but for a margin; else InputError."""
         q_ref, here = np.asarray(command.q_ref, dtype=float), self._q()
         if q_ref.shape != here.shape:
             raise InputError(
@@ -213,19 +199,13 @@ class PolledBoard:
         """Do nothing: it answers as it is asked, or :meth:`command` raises."""
 
     def enable(self, *, inward: bool = False) -> None:
-        """Take the arm over where it is.
-
-        Raises:
-            InputError: its joints' angles are not known.
-            DeviceError: an alarm stands, or the emergency stop was pressed.
-        """
+        """Take the arm over where it is; InputError if its angles are not known, DeviceError while an alarm stands."""
         self.command(Command.ENABLE)
 
     def receive(self, wait_s: float = 0.0) -> JointStates:
         """Read the joints, as often as the rate allows and once at least, and let the rest of ``wait_s`` pass.
 
-        Raises:
-            DeviceError: it does not answer any more, has restarted, or reports an error.
+        DeviceError: it does not answer any more, has restarted, or reports an error.
         """
         begin, times, read = self._now(), [], []
         for k in range(1 + int(wait_s * self.abilities.rate_hz)):

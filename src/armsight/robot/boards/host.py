@@ -14,11 +14,7 @@ from armsight.robot.boards.frames import ANSWER, REQUEST
 
 
 class HostEmulator:
-    """The board's code in a shared library, behind :class:`~armsight.robot.boards.link.Emulator`; :meth:`open` loads it.
-
-    Args:
-        loaded: the library of the board ``host``, loaded for this board alone.
-    """
+    """The board's code in a shared library, loaded for this board alone by :meth:`open`."""
 
     def __init__(self, loaded: ctypes.CDLL) -> None:
         self._request = (ctypes.c_char * REQUEST.itemsize).in_dll(loaded, "pil_request_frame")

@@ -106,11 +106,7 @@ def _evenly(t_s: Array, *recorded: Array) -> tuple[float, Array, list[Array]]:
 def fit_spring(t_s: Array, voltage_v: Array, current_a: Array, angle_rad: Array) -> tuple[JointFit, Elasticity] | None:
     """Identify a joint that is read behind a spring, from a swing with duties at :data:`DITHER_HZ`; None if it is rigid.
 
-    Args:
-        t_s: (n,) times of the readings, rising, s; 1.5 s and more.
-        voltage_v: (n,) duty times supply, V, as in :func:`fit_swing`.
-        current_a: (n,) current of the motor, A, with its sign.
-        angle_rad: (n,) angles of the joint.
+    Times rise for 1.5 s and more; all (n,) as in :func:`fit_swing`, the current with its sign.
     """
     if (
         len(t_s) < _LEAST_READINGS
@@ -164,13 +160,7 @@ def fit_drum(
 ) -> tuple[float, float] | None:
     """Return amplitude, rad, and periods a revolution by which a joint leads its motor, as by an eccentric drum; or None.
 
-    Args:
-        t_s: (n,) times of the readings of a travel to and fro, rising, s.
-        voltage_v: (n,) duty times supply, V.
-        current_a: (n,) current of the motor, A, with its sign.
-        angle_rad: (n,) angles of the joint.
-        motor: its motor; the constant is fitted once more.
-        twist_rad_per_a: of its transmission.
+    Readings (n,) of a travel to and fro as in :func:`fit_spring`; the motor's constant is fitted once more.
     """
     if len(t_s) < _LEAST_READINGS or np.ptp(angle_rad) < _LEAST_SWING_RAD:
         return None
@@ -247,13 +237,9 @@ def _fit_load(
 
 
 def dead_spots(counts: Array, noise_counts: float, low: float, high: float) -> list[tuple[int, int]]:
-    """Return where a potentiometer that was moved by hand lost contact: first and last reading of each spot.
+    """Return where a potentiometer moved evenly by hand lost contact: first and last reading of each spot.
 
-    Args:
-        counts: (n,) readings of an even movement, a few milliseconds apart.
-        noise_counts: their noise at rest.
-        low: readings below are a short circuit.
-        high: readings above are an open wiper.
+    counts (n,) come a few milliseconds apart; below ``low`` is a short circuit, above ``high`` an open wiper.
     """
     width = 15
     padded = np.pad(counts, width // 2, mode="edge")

@@ -24,11 +24,7 @@ _END_S = 5.0
 
 
 class QemuEmulator:
-    """The board's image in QEMU, behind :class:`~armsight.robot.boards.link.Emulator`; :meth:`open` starts it.
-
-    Args:
-        process: QEMU, with pipes to its standard input, output and error.
-    """
+    """The board's image in QEMU, a process with pipes to its input, output and error; :meth:`open` starts it."""
 
     def __init__(self, process: subprocess.Popen[bytes]) -> None:
         self._process = process

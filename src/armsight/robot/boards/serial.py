@@ -19,28 +19,16 @@ _NAP_S = 0.002
 
 
 class SerialLink:
-    """A serial port behind the contract of :class:`~armsight.robot.boards.link.Link`; :meth:`open` opens it.
-
-    Args:
-        port: the device's name, for errors.
-        opened: pyserial's open port.
-        error: pyserial's class of errors.
-    """
+    """A serial port behind the contract of :class:`~armsight.robot.boards.link.Link`; :meth:`open` opens it."""
 
     def __init__(self, port: str, opened: Any, error: type[Exception]) -> None:  # noqa: ANN401 - pyserial has no types
         self._port, self._serial, self._error = port, opened, error
 
     @classmethod
     def open(cls, port: str, baud: int = BAUD) -> Self:
-        """Open a serial port.
+        """Open a serial port that nobody else has open; a board on native USB does not care for ``baud``, bits a second.
 
-        Args:
-            port: the device; nobody else may have it open.
-            baud: bits a second; a board on native USB does not care.
-
-        Raises:
-            DeviceError: it cannot be opened, and why.
-            InputError: pyserial is not installed.
+        DeviceError: it cannot be opened, and why. InputError: pyserial is not installed.
         """
         try:
             import serial

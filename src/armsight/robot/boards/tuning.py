@@ -75,20 +75,10 @@ class Elasticity:
 def tuned_gains(
     motor: MotorFigures, supply_v: float, bandwidth_rad_s: float, damping: float = 0.7, pairs: float = _PAIRS
 ) -> Array:
-    """Return the gains of a joint by the rule above.
+    """Return the gains (8,) of a joint by the rule above: kp, ki, kd, kv, ka, kf, derivative filter, anti-windup.
 
-    Args:
-        motor: its motor.
-        supply_v: nominal supply, V.
-        bandwidth_rad_s: natural frequency of the slower pair of poles, rad/s.
-        damping: of both pairs, of critical.
-        pairs: natural frequency of the slower pair over that of the faster one, 0 to 1.
-
-    Returns:
-        (8,) kp, ki, kd, kv, ka, kf, derivative filter, anti-windup.
-
-    Raises:
-        InputError: a number is not positive.
+    ``bandwidth_rad_s`` and ``damping``, of critical, are of the slower pair of poles, ``pairs`` its frequency over the
+    faster one's. InputError: a number is not positive.
     """
     needed = {"supply_v": supply_v, "bandwidth_rad_s": bandwidth_rad_s, "damping": damping}
     needed |= {name: getattr(motor, name) for name in ("resistance_ohm", "constant_v_s", "inertia_kg_m2")}
@@ -122,17 +112,10 @@ def elastic_gains(motor: MotorFigures, supply_v: float, elastic: Elasticity, noi
 
     Without the spring there would be three poles, ``(s^2 + 2 z w s + w^2) (s + r w)``; w is the greatest with which the
     loop gain, at the motor's duty and with the spring, stays away from -1 and every pole decays. Damping by its speed
-    takes energy from the resonance at any frequency; by the speed read behind the spring it feeds it from there on (Spong,
-    Hutchinson and Vidyasagar, "Robot Modeling and Control", 2006, section 6.5).
-
-    Args:
-        motor: its motor; the inertia is that of motor and joint together.
-        supply_v: nominal supply, V.
-        elastic: its spring.
-        noise_rad: standard deviation of a reading.
-
-    Returns:
-        (8,) as those of :func:`tuned_gains`; None where the joint is too soft: no bandwidth from 5 rad/s on is stable.
+    takes energy from the resonance at any frequency; by the speed read behind the spring it feeds it from there on
+    (Spong, Hutchinson and Vidyasagar, "Robot Modeling and Control", 2006, section 6.5).
+    The motor's inertia is that of motor and joint together, ``noise_rad`` the sigma of a reading. (8,) as
+    :func:`tuned_gains`; None where the joint is too soft: no bandwidth from 5 rad/s on is stable.
     """
     best: Array | None = None
     for third in _THIRD_POLES:
@@ -211,14 +194,7 @@ _GRAVITY_RAD, _SWING_RAD, _SWING_HZ = 0.001, 0.5, 0.4
 def quiet_gains(motor: MotorFigures, supply_v: float, noise_rad: float, gravity_n_m: float) -> Array:
     """Return the gains with the greatest ki, not too stiff, that a board takes, at which noise hardly moves the duty.
 
-    Args:
-        motor: its motor.
-        supply_v: nominal supply, V.
-        noise_rad: standard deviation of a reading.
-        gravity_n_m: greatest torque of gravity: where it is great, damping may be less, noise greater.
-
-    Returns:
-        (8,) as those of :func:`tuned_gains`.
+    Where gravity's greatest torque is great, damping may be less, noise greater. (8,) as :func:`tuned_gains`.
     """
     stall = motor.stall_n_m(supply_v)
     speed_rad_s, acceleration_rad_s2 = motion_limits(motor, supply_v, gravity_n_m)
@@ -254,13 +230,7 @@ def _is_quiet(gains: Array, noise_rad: float, duty_noise: float) -> bool:
 
 
 def motion_limits(motor: MotorFigures, supply_v: float, gravity_n_m: float) -> tuple[float, float]:
-    """Return the greatest speed, rad/s, and acceleration, rad/s^2, that a motor reaches with duty to spare.
-
-    Args:
-        motor: its motor.
-        supply_v: nominal supply, V.
-        gravity_n_m: greatest torque of gravity.
-    """
+    """Return the greatest speed, rad/s, and acceleration, rad/s^2, that a motor reaches with duty to spare."""
     stall = motor.stall_n_m(supply_v)
     free_rad_s = supply_v / motor.constant_v_s
     load = min((gravity_n_m + motor.dry_n_m) / stall, _MOVING)

@@ -35,17 +35,7 @@ def _fill(code: int, data: int, _uc: object, address: int, _access: int, entry: 
 
 
 class UnicornEmulator:
-    """The board's image in an emulated processor, behind :class:`~armsight.robot.boards.link.Emulator`.
-
-    Args:
-        elf: the image of the board ``pil``; :meth:`open` reads it from a file.
-
-    Attributes:
-        uc: the emulated processor, for those who count its instructions.
-
-    Raises:
-        InputError: unicorn is not installed.
-    """
+    """The board ``pil``'s image in an emulated processor ``uc``; :meth:`open` reads it from a file."""
 
     def __init__(self, elf: Elf) -> None:
         try:
@@ -82,11 +72,7 @@ class UnicornEmulator:
 
     @classmethod
     def open(cls, image: Path) -> Self:
-        """Read an ELF file of the board ``pil`` and boot it.
-
-        Raises:
-            InputError: unicorn is not installed, or the file is no image.
-        """
+        """Boot an ELF file of the board ``pil``; InputError where it is none, or unicorn is not installed."""
         return cls(read_elf(image))
 
     def tick(self, request: bytes) -> bytes:

@@ -165,8 +165,7 @@ def _share_state(start: Joints, guide: Walk, arm: Arm) -> Joints:
 def _check_whole(motion: PathMotion) -> Worst:
     """Return where a motion comes nearest to a limit of speed, acceleration or jerk at 1 kHz.
 
-    Raises:
-        MotionRejected: its joints leave their limits or jump from one configuration to another.
+    MotionRejected: its joints leave their limits or jump from one configuration to another.
     """
     return max(
         (_check_piece(motion, t_s) for t_s in pieces(check_times(motion.duration_s))), key=lambda w: w.time_scale

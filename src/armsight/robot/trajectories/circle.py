@@ -112,8 +112,7 @@ def arc(
 def through(a: Array, via: Array, b: Array) -> tuple[Array, Array]:
     """Return the centre (3,) and the sweep (3,), axis times angle, of the arc from ``a`` over ``via`` to ``b``.
 
-    Raises:
-        InputError: the points coincide or lie on one line.
+    InputError: the points coincide or lie on one line.
     """
     u, v = via - a, b - a
     normal = np.cross(u, v)

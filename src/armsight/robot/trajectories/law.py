@@ -119,14 +119,7 @@ def fit_law(arm: Arm, guide: Walk) -> SingleLaw:
 def moving_laws(arm: Arm, guide: Walk, start: Joints, duration_s: float | None) -> Iterator[SingleLaw]:
     """Yield shares over time from a moving start that keep the limits by the walk's derivatives, the shortest first.
 
-    Args:
-        arm: the arm, for its limits.
-        guide: the joints along the way.
-        start: (1,) the share to start from, its speed and acceleration.
-        duration_s: how long it is to take, s; None for as short as possible.
-
-    Raises:
-        InputError: none of those tried does.
+    ``start`` (1,): the share, its speed and acceleration. InputError: none of those tried does.
     """
     rest = Joints(start.q, np.zeros(1), np.zeros(1))
     found = []
@@ -195,8 +188,7 @@ def slower(limits: Array, k: float) -> Array:
 def single_law(start: Joints, limits: Array, duration_s: float | None = None) -> SingleLaw:
     """Return the share over time under limits (3,) of its speed, acceleration and jerk.
 
-    Raises:
-        InputError: a moving start cannot stop on the path, or the duration cannot be met.
+    InputError: a moving start cannot stop on the path, or the duration cannot be met.
     """
     profile = plan_profile(start, np.ones(1), limits[:1], limits[1:2], limits[2:], duration_s)
     low, high = profile.extrema(0)
@@ -275,16 +267,9 @@ class _Plan(NamedTuple):
 
 
 def fit_chain(arm: Arm, guide: Walk, start: Joints, cruises: Array) -> Law:
-    """Return the share over time that just keeps the limits by the walk's derivatives.
+    """Return the share over time that just keeps the limits by the walk's derivatives, bends between shares (C, 2).
 
-    Args:
-        arm: the arm, for its limits.
-        guide: the joints along the way.
-        start: (1,) the share to start from, its speed and acceleration.
-        cruises: (C, 2) shares between which the bends lie.
-
-    Raises:
-        InputError: a moving start cannot reach the pace of the first bend.
+    InputError: a moving start cannot reach the pace of the first bend.
     """
     moving = bool(start.qd.any() or start.qdd.any())
     within = 1 - (MARGIN if moving else CLOSE / 2)
@@ -309,11 +294,7 @@ def fit_chain(arm: Arm, guide: Walk, start: Joints, cruises: Array) -> Law:
 
 
 def _taken_up(arm: Arm, guide: Walk, start: Joints, plan: _Plan, most: Array) -> Profile:
-    """Return the shortest first part, of many tried, that leads from a moving start into the first bend.
-
-    Raises:
-        InputError: none of those tried keeps the limits.
-    """
+    """Return the shortest first part, of many tried, that leads from a moving start into the first bend; or InputError."""
     best = None
     for shape, scale in product(SHAPES, SCALES):
         part = _straight(start, plan.edges[:2], slower(most * shape, 1 / scale), plan.speeds[:1])

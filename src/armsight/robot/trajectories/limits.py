@@ -28,11 +28,7 @@ class Worst(NamedTuple):
 
 
 def start_state(arm: Arm, q: ArrayLike, qd: ArrayLike | None, qdd: ArrayLike | None) -> Joints:
-    """Return a start state that has been found within the arm's limits; at rest where no speeds are given.
-
-    Raises:
-        InputError: wrong shapes, NaN, or outside the limits, or bound to leave them whatever is done.
-    """
+    """Return a start state within the arm's limits, at rest where no speeds are given; or InputError."""
     zero, shape = np.zeros(arm.joints), (arm.joints,)
     start = Joints(
         inside(arm, q, "q_start"),
@@ -56,11 +52,7 @@ def start_state(arm: Arm, q: ArrayLike, qd: ArrayLike | None, qdd: ArrayLike | N
 
 
 def inside(arm: Arm, q: ArrayLike, name: str) -> Array:
-    """Return joint angles (n,), rad, that have been found within the arm's limits.
-
-    Raises:
-        InputError: wrong shape, NaN or outside.
-    """
+    """Return joint angles (n,), rad, that have been found within the arm's limits; or InputError."""
     angles = checked(q, (arm.joints,), name)
     arm.forward(angles)  # rejects degrees with a hint
     if (reason := outside(arm, angles)) is not None:
@@ -109,11 +101,7 @@ def _ratios(arm: Arm, t_s: Array, joints: Joints) -> list[tuple[str, str, Array,
 
 
 def check_limits(arm: Arm, trajectory: Trajectory) -> None:
-    """Check a motion in joints against every limit of the arm at 1 kHz.
-
-    Raises:
-        MotionRejected: at the first instant outside the joint limits, or where another limit is passed.
-    """
+    """Check a motion in joints against every limit of the arm at 1 kHz; MotionRejected at the first that is passed."""
     for t_s in pieces(check_times(trajectory.duration_s)):
         joints = trajectory.at(t_s)
         over = np.maximum(arm.q_min - joints.q, joints.q - arm.q_max).max(axis=1) > ROUNDING

@@ -38,13 +38,9 @@ NEWTON, REFINED = 3, 1e-10
 
 
 class Walk(NamedTuple):
-    """The joints along a path, as far as it can be travelled.
+    """The joints along a path, as far as it can be travelled: angles q (K, n), rad, at shares (K,) of the way, from 0 on.
 
-    Attributes:
-        share: (K,) shares of the way, rising from 0.
-        q: (K, n) joint angles, rad.
-        q1: (K, 6) their derivative by the share, and ``q2`` the second.
-        q2: see ``q1``.
+    ``q1`` and ``q2``, (K, n), are their derivatives by the share.
     """
 
     share: Array
@@ -79,11 +75,7 @@ def columns(x: Array, at: Array, values: Array) -> Array:
 
 
 def refined(arm: Arm, T_base_tool: Array, q_near: Array) -> Array:
-    """Return the joint angles (N, n) of poses (N, 4, 4) from ones close by, by Newton's method.
-
-    Raises:
-        InputError: they were not close, or the poses are singular.
-    """
+    """Return joint angles (N, n) of poses (N, 4, 4) from ones close by, by Newton's method; InputError if not close."""
     q = q_near
     off = behind(T_base_tool, arm.forward(q))
     for _ in range(NEWTON):
@@ -146,16 +138,9 @@ def singular_values(arm: Arm, q: Array) -> tuple[Array, Array]:
 
 
 def walk(arm: Arm, path: Path, q_start: Array, bends: Array) -> tuple[Walk, Obstacle | None]:
-    """Walk along a path as far as it can be travelled.
+    """Walk along a path as far as it can be travelled, with smaller steps between shares ``bends`` (C, 2).
 
-    Args:
-        arm: the arm.
-        path: the path.
-        q_start: (n,) joint angles at its start, rad.
-        bends: (C, 2) shares between which steps are to be smaller.
-
-    Returns:
-        The walk up to the first obstacle, and that; None where there is none.
+    Return the walk up to the first obstacle, and that; None where there is none.
     """
     if arm.joints < 6:
         raise InputError(

@@ -44,11 +44,7 @@ class Path(Protocol):
 
 
 def checked_pose(T: object, name: str) -> Array:
-    """Return a pose (4, 4) that has been found to be one.
-
-    Raises:
-        InputError: wrong shape, NaN, or no rotation in it.
-    """
+    """Return a pose (4, 4) that has been found to be one; or InputError."""
     pose = checked(T, (4, 4), name)  # type: ignore[arg-type]
     R = pose[:3, :3]
     if (

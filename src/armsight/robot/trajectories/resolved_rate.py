@@ -143,8 +143,7 @@ def _slower(tried: list[tuple[float, float]], most: Worst) -> float:
 def _law(start: Joints, reference_s: float, duration_s: float | None) -> Profile:
     """Return the share of the way over time: in ``reference_s``, or from a moving start in about that.
 
-    Raises:
-        InputError: a moving start cannot stop at the end of the path so gently.
+    InputError: a moving start cannot stop at the end of the path so gently.
     """
     speed, acceleration, jerk = (np.array([limit / reference_s**order]) for order, limit in enumerate(SHAPE, start=1))
     exact_s = duration_s if start.qd.any() else reference_s
@@ -156,11 +155,7 @@ def _law(start: Joints, reference_s: float, duration_s: float | None) -> Profile
 
 
 def _share_state(arm: Arm, start: Joints, path: Path) -> Joints:
-    """Return the start as share of the way, its speed and its acceleration (1,).
-
-    Raises:
-        InputError: it does not move along the path.
-    """
+    """Return the start as share of the way, its speed and acceleration (1,); InputError where it is not along the path."""
     _, twist, bend = (part[0] for part in path.at(np.zeros(1)))
     scale = _scale(arm)
     J, along = arm.jacobian(start.q), twist / scale
@@ -182,18 +177,12 @@ def _first_guess_s(arm: Arm, q: Array, path: Path) -> float:
 
 
 def position_first(J: Array, V: Array, inverted: Callable[[Array], Array]) -> tuple[Array, float]:
-    """Return the joints' speeds for a velocity of the tool: its position first, then its orientation as far as possible.
+    """Return the joints' speeds (n,) for a velocity V (6,): the position first, then the orientation as far as possible.
 
     For arms of fewer than six joints, which cannot have both: the second level is solved in the null space of the first
-    (Nakamura, Hanafusa and Yoshikawa, 1987).
-
-    Args:
-        J: (6, n) Jacobian, linear rows first, over the arm's size.
-        V: (6,) velocity of the tool, its linear part over the arm's size.
-        inverted: returns what stands for the inverses of singular values (k,), 0 where a direction is not to be used.
-
-    Returns:
-        (n,) the speeds, and the smallest singular value of the position's rows.
+    (Nakamura, Hanafusa and Yoshikawa, 1987). J (6, n) and V: linear rows first, over the arm's size; ``inverted``
+    returns what stands for the inverses of singular values (k,), 0 where a direction is not to be used. Also return the
+    smallest singular value of the position's rows.
     """
     U, s, Vt = np.linalg.svd(J[:3], full_matrices=False)
     qd = (inverted(s) * (V[:3] @ U)) @ Vt

@@ -13,18 +13,10 @@ STEP_S = 0.004
 
 
 class Tabled:
-    """Another trajectory, looked up. A trajectory.
-
-    Attributes:
-        duration_s: how long the motion takes, s.
-    """
+    """Another trajectory, looked up in a table."""
 
     def __init__(self, motion: Trajectory) -> None:
-        """Fill the table.
-
-        Args:
-            motion: the trajectory.
-        """
+        """Fill the table."""
         self.duration_s = motion.duration_s
         last = max(self.duration_s, STEP_S)  # a motion that takes no time stands
         self._t_s = np.append(np.arange(0.0, last - 1e-9, STEP_S), last)

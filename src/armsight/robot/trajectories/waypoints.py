@@ -106,15 +106,7 @@ def waypoints(
 
 
 def blended(Ts_base_tool: Array, blend_m: float) -> BlendedPath:
-    """Return the path from the first pose past others to the last.
-
-    Args:
-        Ts_base_tool: (M, 4, 4) poses, M >= 3.
-        blend_m: see :func:`waypoints`.
-
-    Raises:
-        InputError: a pose repeats the one before.
-    """
+    """Return the path from the first of poses (M, 4, 4), M >= 3, past others to the last; InputError: one repeats."""
     ways = [way(a, b) for a, b in pairwise(Ts_base_tool)]
     for i, (_, _, length) in enumerate(ways):
         if length == 0:

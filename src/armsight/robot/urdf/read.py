@@ -47,17 +47,9 @@ _MOST_RPY = 4 * np.pi
 
 
 def read_urdf(path: str | Path, *, tool_link: str | None = None) -> Arm:
-    """Read an arm from a URDF file.
+    """Read an arm from a URDF file, with a standard table; ``tool_link`` is needed where several end the chain.
 
-    Args:
-        path: the file.
-        tool_link: the link that is the tool; needed where several end the chain.
-
-    Returns:
-        The arm, with a standard table.
-
-    Raises:
-        InputError: unreadable, malformed, no chain of four to seven revolute joints, or one that no table holds exactly.
+    InputError: unreadable, malformed, no chain of four to seven revolute joints, or one that no table holds exactly.
     """
     return parse_urdf(read_text(path), path, tool_link=tool_link)
 
@@ -279,16 +271,10 @@ class Decomposition(NamedTuple):
 
 
 def arm_rows(where: str, names: list[str], links: list[ChainLink], first_fixed: Array) -> TableRows:
-    """Find the table of a chain.
+    """Find the table of a chain of n joints and its end, n + 1 links; ``where`` is for errors.
 
-    Args:
-        where: what to name in an error.
-        names: n names of the joints.
-        links: n + 1: the joints and the end.
-        first_fixed: (4, 4) the first fixed joint after the last revolute one: the flange, where it can be row 6.
-
-    Raises:
-        InputError: two axes are so nearly parallel that no sensible table holds them.
+    ``first_fixed`` (4, 4): the first fixed joint after the last revolute one: the flange, where it can be row 6.
+    InputError: two axes are so nearly parallel that no sensible table holds them.
     """
     size_m = float(sum(np.linalg.norm(link.T_before[:3, 3]) for link in links)) + EXACT
     upright = [_upright(link.axis) for link in links]

@@ -66,16 +66,7 @@ class Joint(NamedTuple):
 
 
 class Tree:
-    """Links and joints of one file.
-
-    Args:
-        path: the file, named in errors.
-        links: names of its links; None where one has none.
-        joints: its joints.
-
-    Raises:
-        InputError: a name twice, a link that is not there, or one that hangs on two joints or on itself.
-    """
+    """Links and joints of one file; InputError where a name repeats, or a link is missing or hangs on two or itself."""
 
     def __init__(self, path: str | Path, links: list[str | None], joints: list[Joint]) -> None:
         """Hold a tree."""
@@ -125,11 +116,7 @@ class Tree:
         return found[::-1]
 
     def _tool(self) -> str:
-        """Return the link that is the tool where none is named: the end of the one arm of the tree.
-
-        Raises:
-            InputError: there is no arm, or several, or several links end it; the message names them.
-        """
+        """Return the link that is the tool where none is named: the end of the one arm of the tree; else InputError."""
         arms = self._arms()
         ends = [tip for arm in arms for tip in self._tips(arm)]
         links = ", or ".join(ends[:_SHOWN])

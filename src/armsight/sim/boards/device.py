@@ -56,11 +56,7 @@ class Wired:
 
 
 class SteppedLink:
-    """A wire to a device whose time passes in :meth:`read` only; fulfils ``robot.boards.link.Link``.
-
-    Args:
-        device: the controller.
-    """
+    """A wire to a device whose time passes in :meth:`read` only; fulfils ``robot.boards.link.Link``."""
 
     def __init__(self, device: Device) -> None:
         self._device = device
@@ -96,14 +92,9 @@ class SteppedLink:
 
 @contextlib.contextmanager
 def serve(device: Device, baud: int) -> Iterator[PtyPort]:
-    """Serve a device at a pseudo-terminal, in real time, within the block.
+    """Serve a device at a pseudo-terminal, in real time, within the block; InputError where the system has none.
 
-    Args:
-        device: the controller.
-        baud: its baud rate: bytes of a host that set another one arrive as noise.
-
-    Raises:
-        InputError: this system has no pseudo-terminals.
+    Bytes of a host that sets another baud rate arrive as noise.
     """
     if sys.platform == "win32":
         raise InputError("Windows has no pseudo-terminals: emulated controllers need Linux or macOS")
@@ -115,16 +106,7 @@ def serve(device: Device, baud: int) -> Iterator[PtyPort]:
 
 
 class PtyPort:
-    """A device at a pseudo-terminal; a thread lets its time pass, not faster than real time.
-
-    Args:
-        device: the controller.
-        baud: its baud rate.
-
-    Attributes:
-        name: the port's, such as /dev/pts/5.
-        lock: held while the device runs.
-    """
+    """A device at a pseudo-terminal, held by ``lock`` while it runs; a thread lets its time pass in real time at most."""
 
     def __init__(self, device: Device, baud: int) -> None:
         import pty

@@ -164,14 +164,7 @@ def drawn_wiring(seed: int) -> Wiring:
 def drawn_workshop(
     seed: int, *, load: float = 0.6, encoders: Encoders | None = None, transmission: Transmission | None = None
 ) -> tuple[WorkshopPlant, JointModel]:
-    """Return an arm as it hangs on its evening, and what it is made of.
-
-    Args:
-        seed: of all that is drawn.
-        load: greatest gravity load of the stall torque.
-        encoders: what reads joints in place of potentiometers.
-        transmission: what lies between motors and joints; rigid and even without.
-    """
+    """Return an arm as it hangs on its evening, and what it is made of."""
     rng = np.random.default_rng([seed, 22])
     model = drawn_model(seed, load=load)
     plant = JointPlant(-np.sign(model.gravity_n_m) * np.pi / 2, seed=seed, model=model, transmission=transmission)
@@ -190,16 +183,10 @@ def drawn_encoders(seed: int, kinds: Mapping[int, SensorKind]) -> Encoders | Non
 
 
 class WorkshopPerson:
-    """Answers the questions of a bring-up at a :class:`WorkshopPlant`.
+    """Answers the questions of a bring-up at a :class:`WorkshopPlant`, with readings of a protractor drawn by a seed.
 
-    Args:
-        workshop: the arm.
-        seed: of the readings of the protractor.
-        mends: whether plugs are pushed in rightly when a problem is named; a step is skipped otherwise.
-        say: called with every line that is said.
-
-    Attributes:
-        problems: all that were named.
+    ``mends``: plugs are pushed in rightly when a problem is named, else a step is skipped; ``say`` is called with every
+    line, ``problems`` are all that were named.
     """
 
     def __init__(

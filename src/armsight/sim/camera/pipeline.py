@@ -50,20 +50,10 @@ _HYSTERESIS = 0.75  # of a step: an error below it changes nothing
 
 
 class SimulatedCamera:
-    """One camera: its stages, its fixed pattern, and what it remembers from image to image.
-
-    Attributes:
-        pipeline: its stages.
-    """
+    """One camera: its stages, its fixed pattern, and what it remembers from image to image."""
 
     def __init__(self, pipeline: CameraPipeline, image_size_px: tuple[int, int], seed: int = 0) -> None:
-        """Make a camera; the same seed gives the same fixed pattern and noise.
-
-        Args:
-            pipeline: its stages.
-            image_size_px: (width, height) of its images.
-            seed: of this camera.
-        """
+        """Make a camera; the same seed gives the same fixed pattern and noise."""
         self.pipeline, self._seed = pipeline, seed
         self._width, self._height = image_size_px
         self._native = image_size_px
@@ -85,18 +75,10 @@ class SimulatedCamera:
         self._gain_step: int | None = None
 
     def expose(self, radiance: Radiance, time_s: float = 0.0, number: int | None = None) -> Image:
-        """Return the image of a scene.
+        """Return the image (H, W) of a scene, linear radiance (H, W), 1 for a white reflector, with blur and motion.
 
-        Args:
-            radiance: (H, W) linear light of each pixel, 1 for a white reflector, with the renderer's blur and motion.
-            time_s: middle of the exposure of the middle row, s; flicker follows it.
-            number: of the image; its noise follows from it and the camera's seed. By default images are counted.
-
-        Returns:
-            (H, W) uint8, grey.
-
-        Raises:
-            InputError: the radiance is of another size.
+        ``time_s``: middle of the exposure of the middle row, for flicker; ``number``: of the image, from which and the
+        seed its noise follows; by default images are counted.
         """
         if radiance.shape != (self._height, self._width):
             raise InputError(f"the radiance is {radiance.shape}, must be ({self._height}, {self._width})")
@@ -253,11 +235,7 @@ def _mosaic(rgb: tuple[float, float, float], shape: tuple[int, ...]) -> Radiance
 def converted(electrons: Radiance, noise: Radiance, sensor: Photosensor, gain: float) -> Radiance:
     """Return the converter's numbers, the dark level subtracted, as shares of their range.
 
-    Args:
-        electrons: (h, w) expected electrons of each pixel; overwritten.
-        noise: (h, w) standard normal.
-        sensor: its full well, readout and converter.
-        gain: before the converter.
+    electrons (h, w) expected in each pixel, overwritten; noise (h, w) standard normal; ``gain``: before the converter.
     """
     most = 2**sensor.bits - 1
     dark = round(sensor.dark_level * most)
@@ -299,12 +277,7 @@ def flicker_gain(
 ) -> NDArray[np.float32]:
     """Return the light (height, 1) of lamps on mains power in each row, 1 on average.
 
-    Args:
-        flicker: the lamps.
-        time_s: middle of the exposure of the middle row, s.
-        height: rows.
-        exposure_ms: of a row; the cosine's mean over it is its middle's times sinc.
-        readout_ms: from the first row's beginning to the last row's.
+    ``time_s``: middle of the exposure of the middle row. The cosine's mean over an exposure is its middle's times sinc.
     """
     times = time_s + 1e-3 * readout_ms * (np.arange(height) / max(height - 1, 1) - 0.5)
     depth = flicker.depth * np.sinc(flicker.frequency_hz * 1e-3 * exposure_ms)

@@ -51,11 +51,7 @@ def _rule_text(rule: dict[str, Any]) -> str:
 
 @dataclass(frozen=True)
 class Stage:
-    """What all stages share: their values are within their ranges.
-
-    Raises:
-        InputError: a value is not; the message names the parameter and the range.
-    """
+    """What all stages share: InputError names a value that is not within its range."""
 
     def __post_init__(self) -> None:
         """Check every value against its field's range."""
@@ -91,11 +87,7 @@ class ExposureTiming(Stage):
 
 @dataclass(frozen=True)
 class Lens(Stage):
-    """A lens in focus; the renderer applies its blur, exactly in area, see :attr:`CameraPipeline.psf_sigma_px`.
-
-    Attributes:
-        psf_sigma_px: standard deviation of the Gaussian blur, pixels of the output.
-    """
+    """A lens in focus; the renderer applies its blur, exactly in area, see :attr:`CameraPipeline.psf_sigma_px`."""
 
     psf_sigma_px: float = _number(0.1, 5)
 
@@ -132,22 +124,14 @@ class Glint(Stage):
 
 @dataclass(frozen=True)
 class Defocus(Stage):
-    """The blur of a lens that is out of focus, beside that in focus: an even disc.
-
-    Attributes:
-        radius_px: of the disc, pixels of the output.
-    """
+    """The blur of a lens that is out of focus, beside that in focus: an even disc of a radius, pixels of the output."""
 
     radius_px: float = _number(0, 5)
 
 
 @dataclass(frozen=True)
 class Vignetting(Stage):
-    """Darker corners, falling with the square of the radius.
-
-    Attributes:
-        corner: share of the light that the corners lose.
-    """
+    """Darker corners, which lose this share of the light, falling with the square of the radius."""
 
     corner: float = _number(0, 0.9)
 
@@ -167,11 +151,9 @@ class Resizing(Stage):
 
 @dataclass(frozen=True)
 class Flicker(Stage):
-    """Lamps on mains power: the light varies with a cosine, averaged over the exposure; by rows in a rolling shutter.
+    """Lamps on mains power, at twice its frequency: the light varies with a cosine of ``depth`` times the mean.
 
-    Attributes:
-        frequency_hz: twice the mains frequency.
-        depth: amplitude over the mean.
+    It is averaged over the exposure, by rows in a rolling shutter.
     """
 
     frequency_hz: float = _number(10, 1000)
@@ -293,12 +275,7 @@ class Sharpening(Stage):
 
 @dataclass(frozen=True)
 class Jpeg(Stage):
-    """Compression of each image, as in MJPEG.
-
-    Attributes:
-        quality: as libjpeg counts.
-        chroma: subsampling of the colour differences.
-    """
+    """Compression of each image, as in MJPEG: quality as libjpeg counts, subsampling of the colour differences."""
 
     quality: int = _number(1, 100, whole=True)
     chroma: str = _one_of("4:4:4", "4:2:2", "4:2:0")
@@ -306,11 +283,7 @@ class Jpeg(Stage):
 
 @dataclass(frozen=True)
 class WhiteNoise(Stage):
-    """In lieu of a sensor: Gaussian noise of one size everywhere.
-
-    Attributes:
-        sigma_grey: standard deviation, grey levels.
-    """
+    """In lieu of a sensor: Gaussian noise of one sigma everywhere, grey levels."""
 
     sigma_grey: float = _number(0, 50)
 
@@ -347,14 +320,9 @@ class CameraPipeline:
 
     @classmethod
     def load(cls, name: str | os.PathLike[str]) -> Self:
-        """Return a preset, or what a TOML file says.
+        """Return a preset, or what a TOML file says; InputError names a stage, key or value that is not allowed.
 
-        Args:
-            name: one of :func:`preset_names`, or the path of a file that ends in ``.toml``. Its key ``preset`` names the
-                preset that it changes; ``stage = false`` leaves one of its stages out.
-
-        Raises:
-            InputError: neither, or a stage, key or value of the file that is not allowed; the message names it.
+        A file's key ``preset`` names the preset that it changes; ``stage = false`` leaves one of its stages out.
         """
         path = os.fspath(name)
         if path in preset_names():

@@ -78,14 +78,8 @@ class InertialErrors(Record):
     ) -> InertialErrors:
         """Return those of a unit of a class, drawn.
 
-        Args:
-            density: of the noise of gyro and accelerometer, per sqrt(Hz).
-            bias: one sigma of both.
-            scale: one sigma, relative.
-            g_sensitivity: one sigma, rad/s per m/s2.
-            rng: random numbers.
-            good: whether the gyro is of the better sort: warms up less, is rounded less.
-            rate_hz: readings a second.
+        One sigma of what is given for gyro and accelerometer; noise density per sqrt(Hz), g_sensitivity in rad/s per
+        m/s2. ``good``: the gyro is of the better sort: warms up less, is rounded less.
         """
         noise = np.repeat(density, 3)
         return InertialErrors(
@@ -106,12 +100,7 @@ class InertialErrors(Record):
 
 
 class InertialUnit:
-    """A unit that is read as time passes.
-
-    Args:
-        errors: of the unit; its mount is not loose here.
-        rng: random numbers.
-    """
+    """A unit that is read as time passes; its mount is not loose here."""
 
     def __init__(self, errors: InertialErrors, rng: np.random.Generator) -> None:
         self._errors, self._rng = errors, rng
@@ -123,9 +112,7 @@ class InertialUnit:
     def read(self, t_s: Array, Ts_base_sensor: Array) -> tuple[Array, Array]:
         """Return stamps (N,), s, and readings (N, 6) that came since the last call, but for the newest tick.
 
-        Args:
-            t_s: (M,) times since then, evenly spaced by a millisecond or less, s.
-            Ts_base_sensor: (M, 4, 4) true poses of the sensor's mount; z of the base is up.
+        Times (M,) since then are evenly spaced by a millisecond or less; poses (M, 4, 4) are true, z of the base is up.
         """
         t_s, Ts = np.append(self._t_s, t_s), np.concatenate([self._Ts, Ts_base_sensor])
         self._t_s, self._Ts = t_s[-2:], Ts[-2:]

@@ -21,14 +21,7 @@ def plain(image_size_px: tuple[int, int], rng: np.random.Generator) -> Reflectan
 def textured(
     image_size_px: tuple[int, int], rng: np.random.Generator, mean: float = 0.4, spread: float = 0.1
 ) -> Reflectance:
-    """Return noise of all scales, each octave a little weaker than the one above: plaster, cloth, concrete.
-
-    Args:
-        image_size_px: (width, height).
-        rng: source of the noise.
-        mean: mean reflectance.
-        spread: standard deviation of the reflectance.
-    """
+    """Return noise of all scales, each octave a little weaker than the one above: plaster, cloth, concrete."""
     width, height = image_size_px
     total = np.zeros((height, width), np.float32)
     scale, amplitude = _COARSEST_PX, 1.0
@@ -45,13 +38,7 @@ def textured(
 
 
 def cluttered(image_size_px: tuple[int, int], rng: np.random.Generator, items: int = 60) -> Reflectance:
-    """Return a texture full of things that are not the target: boxes, rods, polygons, ellipses, print.
-
-    Args:
-        image_size_px: (width, height).
-        rng: decides what lies where.
-        items: how many things.
-    """
+    """Return a texture full of things that are not the target: boxes, rods, polygons, ellipses, print."""
     width, height = image_size_px
     # Rendered at twice the size and averaged, for edges as smooth as a lens would make them.
     canvas = np.full((2 * height, 2 * width), 110, np.uint8)

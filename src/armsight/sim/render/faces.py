@@ -137,17 +137,12 @@ def paint_faces(
     total: Radiance,
     edges: Radiance,
 ) -> None:
-    """Paint an exposure of flat patterns over an image (H, W), a crop of the camera's.
+    """Paint an exposure of flat patterns over an image (H, W), a crop of the camera's that begins at ``corner``.
 
-    Args:
-        corners: rays through the corners of all pixels of the camera, its frame.
-        rays: (3, ...) unit rays of its pixels.
-        exposure: what is painted.
-        corner: column and row at which the crop begins.
-        behind: light, distance, m, and ids of what is there, each (H, W); what has no id is behind all patterns.
-        taps: see :func:`~armsight.sim.render.optics.part_taps`.
-        total: (H, W) is written: the light on each pixel before the lens.
-        edges: (H, W) is added to: what the lens adds to the blur of that, for edges lie within pixels.
+    ``corners``: rays through the corners of all pixels, camera's frame; ``rays`` (3, ...): unit rays of the pixels;
+    ``behind``: light, distance, m, and ids of what is there, each (H, W), which is behind all patterns where it has no
+    id. Written are ``total`` (H, W), the light on each pixel before the lens, and added to ``edges`` (H, W) what the
+    lens adds to the blur of that, for edges lie within pixels.
     """
     palette, weights, order, every_M, boxes = exposure
     light, depth, ids = behind

@@ -114,15 +114,10 @@ def _sample_rays(camera: Camera) -> Array:
 
 
 def see(camera: Camera, solids: Sequence[tuple[Solid, Array]]) -> tuple[Image, Array, NDArray[np.int32]]:
-    """Render what a camera sees.
+    """Render what a camera sees of solids with their poses (4, 4) in its frame: (H, W) uint8.
 
-    Args:
-        camera: the camera.
-        solids: meshes with their poses (4, 4) in the camera's frame.
-
-    Returns:
-        (H, W) uint8; (H, W) depth along the camera's axis at pixel centres, m, NaN where there is nothing; (H, W) which
-        of the solids is seen there, -1 for none.
+    Also (H, W) depth along the camera's axis at pixel centres, m, NaN where there is nothing, and which solid, -1 for
+    none.
     """
     rays = _sample_rays(camera)
     height, width = rays.shape[:2]

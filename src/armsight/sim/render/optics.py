@@ -71,14 +71,9 @@ def _integral_of_step(x: Array, sigma: float) -> Array:
 
 @lru_cache(maxsize=16)
 def psf_taps(sigma: float, parts: int) -> Array:
-    """Return how much light goes from each part of a pixel to its neighbours, in one direction.
+    """Return how much light of a Gaussian blur, px, goes from each part of a pixel to its neighbours, in one direction.
 
-    Args:
-        sigma: of the Gaussian, px.
-        parts: how many parts a pixel has.
-
-    Returns:
-        (parts, 2 radius + 1) shares; a row belongs to one part (sums to one), a column to a receiving pixel.
+    (parts, 2 radius + 1) shares; a row belongs to one part (sums to one), a column to a receiving pixel.
     """
     radius = math.ceil(4.5 * sigma + 0.5)
     pixel: Array = np.arange(-radius, radius + 1.0)
@@ -96,14 +91,8 @@ def psf_taps(sigma: float, parts: int) -> Array:
 def gather_parts(slot: Slots, fine: Array, taps: Radiance, weight: float, coarse: Array, across: Radiance) -> None:
     """Give every edge pixel the mean of its parts, and spread across each line of parts what these send beyond it.
 
-    Args:
-        slot: (H, W) row of ``fine`` that holds an edge pixel's parts, -1 where there are none.
-        fine: (n, SUB, SUB) the parts.
-        taps: see :func:`part_taps`.
-        weight: of what is spread.
-        coarse: (H, W) the means are written here.
-        across: (SUB H, W + columns of taps - 1) ``weight`` times the rest is added here; its columns begin half of that
-            before the image's.
+    fine (n, SUB, SUB): the parts, their rows in slot (H, W), -1 where there are none; ``weight`` times what is spread
+    is added to across (SUB H, W + columns of taps - 1), whose columns begin half of that before the image's.
     """
     t0, t1, t2, t3 = taps[0], taps[1], taps[2], taps[3]
     for v in range(slot.shape[0]):
@@ -138,16 +127,9 @@ def spread_down(across: Radiance, taps: Radiance, out: Radiance) -> None:
 
 
 def blurred(coarse: Array, slot: Slots, fine: Array, sigma: float) -> Radiance:
-    """Lay the lens's blur over a painted image.
+    """Lay the lens's blur, px, over a painted image (H, W); beyond its border the world goes on as at the border.
 
-    Args:
-        coarse: (H, W) values of pixels; those of edge pixels are overwritten with the mean of their parts.
-        slot: (H, W) row of ``fine`` that holds an edge pixel's parts, -1 where there are none.
-        fine: (n, SUB, SUB) the parts.
-        sigma: of the blur, px; 0 for none.
-
-    Returns:
-        (H, W) light on each pixel; beyond the image's border the world is taken to go on as at the border.
+    ``coarse`` of edge pixels is overwritten with the mean of their parts, fine (n, SUB, SUB), at rows of slot (H, W).
     """
     taps = part_taps(sigma)
     across = np.zeros((SUB * slot.shape[0], slot.shape[1] + taps.shape[1] - 1), np.float32)
@@ -191,18 +173,9 @@ def shaded(radiance: Radiance, optics: Optics) -> Radiance:
 
 
 def exposed(radiance: Radiance, sensor: Sensor, rng: np.random.Generator | None) -> Image:
-    """Convert light into grey levels: gain, noise, saturation, rounding, JPEG.
+    """Convert light (H, W) into grey levels, uint8: gain, noise unless ``rng`` is None, saturation, rounding, JPEG.
 
-    Args:
-        radiance: (H, W) light on each pixel.
-        sensor: what it falls on.
-        rng: source of the noise; None for a sensor without noise.
-
-    Returns:
-        (H, W) uint8.
-
-    Raises:
-        InputError: JPEG does not know the requested quality.
+    InputError: JPEG does not know the requested quality.
     """
     grey = radiance * np.float32(sensor.gain)
     if rng is not None and (sensor.read_noise > 0 or sensor.shot_noise > 0):

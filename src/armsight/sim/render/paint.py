@@ -257,10 +257,8 @@ def _chord(c: float, u: float, v: float) -> tuple[float, float, float, float]:
 def _inside_rim(x: Line, y: Line, w: Line) -> float:
     """Return in which share of an area a disc is whose rim is nearly straight there.
 
-    Args:
-        x: offset from the disc's centre, homogeneous: in the area's middle, and its slopes across and down.
-        y: the same down.
-        w: the same of the radius.
+    x, y: offset from the disc's centre, homogeneous, in the area's middle, and its slopes across and down; w: of the
+    radius.
     """
     away = max(np.sqrt(x[0] * x[0] + y[0] * y[0]), 1e-3 * w[0])
     per = 1.0 / away
@@ -345,22 +343,7 @@ def paint_disc(
     fine: Array,
     count: int,
 ) -> tuple[Array, int]:
-    """Paint a disc.
-
-    Args:
-        rays: see :func:`paint`.
-        Ms: see there.
-        box: see there.
-        corner: see there.
-        disc: (4,) centre x, y, radius and value.
-        coarse: see there.
-        slot: see there.
-        fine: see there.
-        count: see there.
-
-    Returns:
-        As there.
-    """
+    """Paint a disc (4,): centre x, y, radius and value; all else as in :func:`paint`."""
     u0, v0, u1, v1 = box
     n = u1 - u0
     if n <= 0:
@@ -575,21 +558,12 @@ def paint(
     fine: Array,
     count: int,
 ) -> tuple[Array, int]:
-    """Paint a grid of cells.
+    """Paint a grid of cells: borders (nx + 1,), (ny + 1,) and values (ny + 2, nx + 2), with a clear rim.
 
-    Args:
-        rays: (H' + 1, W' + 1, 3) rays through the corners of the camera's pixels, its frame.
-        Ms: (1 or H, 3, 3) from rays to homogeneous plane coordinates, for all rows or for each.
-        box: first column, first row, end column, end row of what may be covered, px.
-        corner: column and row of the camera's image that ``box``, ``coarse`` and ``slot`` begin at.
-        grid: borders (nx + 1,), (ny + 1,) and values (ny + 2, nx + 2) of the cells; values have a clear rim.
-        coarse: (H, W) pixel values, painted in-place; a cell's value below zero is clear and leaves them.
-        slot: (H, W) which row of ``fine`` holds a pixel's parts, -1 where it has one value.
-        fine: (capacity, SUB, SUB) the parts.
-        count: rows of ``fine`` in use.
-
-    Returns:
-        ``fine`` (a larger one where it was full) and the new count.
+    rays (H' + 1, W' + 1, 3): through the corners of the camera's pixels, its frame; Ms (1 or H, 3, 3): from rays to
+    homogeneous plane coordinates, for all rows or for each; ``box``: what may be covered; ``corner``: where in the
+    camera's image ``box``, coarse (H, W) and slot (H, W) begin. A value below zero is clear. ``count`` rows of fine
+    (capacity, SUB, SUB) are in use; return ``fine``, a larger one where it was full, and the new count.
     """
     xe, ye, values = grid
     scratch = (

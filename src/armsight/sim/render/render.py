@@ -199,22 +199,10 @@ def render(
     shutter: Shutter | None = None,
     rng: np.random.Generator | None = None,
 ) -> Image:
-    """Render what a camera sees.
+    """Render what a camera sees of bodies posed in its frame, the nearer covering the farther: (H, W) uint8.
 
-    Args:
-        camera: the camera; the bodies are posed in its frame.
-        bodies: rigid bodies with patterns; the nearer cover the farther.
-        background: reflectance of what is behind them: one value or an image (H, W).
-        optics: the lens and the light; sharp but for a blur of 0.7 px by default.
-        sensor: noise of 2 grey levels by default.
-        shutter: no motion blur by default.
-        rng: source of the noise; None for a sensor without noise.
-
-    Returns:
-        (H, W) uint8; pixel (0, 0) is the centre of the top-left one.
-
-    Raises:
-        InputError: the background is of another size than the camera's image.
+    By default lens blur is 0.7 px, noise 2 grey levels from ``rng`` (None: none), without motion blur. ``background``:
+    one reflectance, or an image (H, W) of the camera's size, else InputError.
     """
     optics = optics or Optics()
     light = radiance(camera, bodies, background, psf_sigma_px=optics.psf_sigma_px, shutter=shutter)

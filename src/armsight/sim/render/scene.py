@@ -95,15 +95,9 @@ def plate(
 def chessboard(
     columns: int, rows: int, square_m: float, *, border: float = 1.0, black: float = BLACK, white: float = WHITE
 ) -> Pattern:
-    """Return a chessboard; its origin is inner corner 0, whose square towards (-x, -y) is black.
+    """Return a chessboard of columns x rows inner corners; its origin is corner 0, whose square towards (-x, -y) is black.
 
-    Args:
-        columns: inner corners along x.
-        rows: inner corners along y.
-        square_m: side of a square, m.
-        border: width of the white margin, squares.
-        black: reflectance of the black squares.
-        white: reflectance of the white squares and the margin.
+    ``border``: width of the white margin, squares.
     """
     black_squares = np.add.outer(np.arange(rows + 1), np.arange(columns + 1)) % 2 == 0
     return Pattern(
@@ -126,16 +120,9 @@ def circle_grid(
 ) -> Pattern:
     """Return a grid of dark discs on a white plate; its origin is the centre of disc 0.
 
-    Args:
-        columns: discs in a row.
-        rows: rows of discs.
-        pitch_m: step of the grid, m. In an asymmetric grid rows are this far apart, discs in a row twice as far, and
-            odd rows are shifted by it, as OpenCV has it.
-        asymmetric: whether odd rows are shifted.
-        radius_m: radius of a disc, a quarter of the distance to its nearest neighbour by default (m).
-        rings: (column, row) of the discs with a hole of RING_HOLE of their radius.
-        black: reflectance of the discs.
-        white: reflectance of the plate.
+    In an asymmetric grid rows are a pitch apart, discs in a row two, and odd rows are shifted by one, as OpenCV has it.
+    The radius is a quarter of the distance to the nearest neighbour by default; ``rings``: (column, row) of discs with
+    a hole of RING_HOLE of their radius.
     """
     row, column = (index.ravel() for index in np.mgrid[:rows, :columns])
     x = (2.0 * column + row % 2 if asymmetric else column) * pitch_m
@@ -158,16 +145,10 @@ def circle_grid(
 
 
 def marker_bits(family: str, marker: int, border: int = 1) -> NDArray[np.bool_]:
-    """Return the cells (n, n) of a marker with its dark border, upright; True is bright.
+    """Return the cells (n, n) of a marker with its dark border, upright; True is bright. InputError: there is none.
 
-    Args:
-        family: OpenCV's name of a dictionary, with or without DICT_ in front ("4X4_50", "APRILTAG_36h11"), or
-            AprilTag's own ("tag36h11"), whose upright is OpenCV's upside down.
-        marker: its number in the family.
-        border: width of the dark border, cells.
-
-    Raises:
-        InputError: no such family, or no such marker in it.
+    ``family``: OpenCV's name of a dictionary, with or without DICT_, or AprilTag's own, whose upright is OpenCV's
+    upside down; ``border``: of the dark border, cells.
     """
     name = family.removeprefix("DICT_")
     name = f"DICT_APRILTAG_{name.removeprefix('tag')}" if name.startswith("tag") else f"DICT_{name}"
@@ -186,14 +167,9 @@ def marker_bits(family: str, marker: int, border: int = 1) -> NDArray[np.bool_]:
 def tag(
     bits: NDArray[np.bool_], size_m: float, *, quiet: float = 1.0, black: float = BLACK, white: float = WHITE
 ) -> Pattern:
-    """Return a tag; its origin is its centre.
+    """Return a tag of bits (n, n), the black rim included, True is white; its origin is its centre.
 
-    Args:
-        bits: (n, n) cells, the black rim included; True is white.
-        size_m: side of the black rim's outer edge, m.
-        quiet: width of the white margin around it, cells.
-        black: reflectance of black cells.
-        white: reflectance of white cells and the margin.
+    ``size_m``: side of the black rim's outer edge; ``quiet``: width of the white margin around it, cells.
     """
     edges = _with_margin(np.arange(len(bits) + 1.0) - len(bits) / 2, quiet) * (size_m / len(bits))
     return Pattern(edges, edges, np.pad(np.where(bits, white, black), 1, constant_values=white))
@@ -211,17 +187,7 @@ def charuco(
 ) -> Pattern:
     """Return a ChArUco board as OpenCV (4.6 and later) draws it, with a white margin of one square.
 
-    Args:
-        columns: squares along x.
-        rows: squares along y.
-        square_m: side of a square, m.
-        marker_m: side of a marker, m.
-        family: of the markers, as in :func:`marker_bits`.
-        black: reflectance of black squares and cells.
-        white: reflectance of white squares and cells, and of the margin.
-
-    Returns:
-        The board; its origin is the inner corner of the square at the upper left, which is black.
+    Its origin is the inner corner of the square at the upper left, which is black.
     """
     bits = [marker_bits(family, k) for k in range(columns * rows // 2)]
     cells = len(bits[0])
@@ -251,17 +217,8 @@ def aprilgrid(
 ) -> Pattern:
     """Return a grid of AprilTags as Kalibr prints it: tag36h11, dark border of two cells, a dark square between tags.
 
-    Args:
-        columns: tags along x.
-        rows: tags along y.
-        tag_m: side of a tag, m.
-        spacing: gap between tags as a share of their side.
-        black: reflectance of dark cells.
-        white: reflectance of bright cells and the margin.
-
-    Returns:
-        The grid on a body whose origin is the lower left corner of tag 0, at the lower left; the body's x runs to the
-        right, y up and z out of the board.
+    ``spacing``: gap as a share of a tag's side. The body's origin is the lower left corner of tag 0, at the lower left;
+    x runs to the right, y up and z out of the board.
     """
     cells, gap = marker_bits("tag36h11", 0, 2).shape[0], spacing * tag_m
     inside = gap + np.arange(cells + 1) * (tag_m / cells)

@@ -101,14 +101,7 @@ _OLD_KEYS = {"sag_deg": "compliance_deg"}
 
 
 def imperfections(arm: str) -> Imperfections:
-    """Return a preset by name, or what a TOML file says.
-
-    Args:
-        arm: a key of PRESETS, or the path of a file that ends in ``.toml``.
-
-    Raises:
-        InputError: neither, or a key or number of the file that is not allowed; the message names it.
-    """
+    """Return a preset, a key of PRESETS, or what a TOML file says; InputError names what is not allowed."""
     if arm in PRESETS:
         return PRESETS[arm]
     if not arm.endswith(".toml"):
@@ -166,13 +159,7 @@ class TrueArm(Record):
 
 
 def sample_arm(model: Arm, given: Imperfections, seed: int) -> TrueArm:
-    """Sample a true arm.
-
-    Args:
-        model: the nominal table.
-        given: how far from it the arm is.
-        seed: the same gives the same arm.
-    """
+    """Sample a true arm, as far from the nominal table as given; a seed gives the same arm."""
     rng, n = np.random.default_rng([seed, 1]), model.joints
 
     def about(amount: float, rows: slice) -> Array:

@@ -30,14 +30,7 @@ _SPEED_SPARE = 1.2  # of the reference's limit over the arm's own
 
 
 def configuration(model: Arm, parts: Solids, motors: Motors, *, sync_led: bool = False) -> Configuration:
-    """Return the board's configuration for an arm.
-
-    Args:
-        model: the nominal table.
-        parts: its solids.
-        motors: what drives it.
-        sync_led: whether an LED blinks its clock.
-    """
+    """Return the board's configuration for a nominal arm and its motors; ``sync_led``: an LED blinks its clock."""
     config = np.zeros((), CONFIG)
     joint, travel = config["joint"], pot_travel(model)
     inertia_kg_m2 = motors.rotor_inertia + inertia(model, parts, model.home)

@@ -83,13 +83,7 @@ WEBCAMS = CameraTiming((1280, 720), 30.0, 0.008, 0.040, 1e-3, 5e-4, 4e-3, 2e-5)
 
 @dataclass(frozen=True)
 class ShotTimes:
-    """When a shot was exposed and when it arrived.
-
-    Attributes:
-        left_s: middle of the left exposure (of the middle row), s.
-        right_s: of the right one.
-        stamp_s: when the driver says that it came; it is handed out from then on.
-    """
+    """When a shot was exposed, middle row of both cameras, and when the driver says that it came, s, and hands it out."""
 
     left_s: float
     right_s: float
@@ -98,13 +92,7 @@ class ShotTimes:
 
 @lru_cache(maxsize=256)
 def shot_times(timing: CameraTiming, seed: int, shot: int) -> ShotTimes:
-    """Return the times of a shot.
-
-    Args:
-        timing: of the cameras.
-        seed: of the workcell.
-        shot: its number, from 0.
-    """
+    """Return the times of a shot, counted from 0."""
     phase = np.random.default_rng([seed, 6]).uniform(0.0, 1.0)
     rng = np.random.default_rng([seed, 7, shot])
     left = (phase + shot) / timing.rate_hz + timing.exposure_s / 2
@@ -114,17 +102,10 @@ def shot_times(timing: CameraTiming, seed: int, shot: int) -> ShotTimes:
 
 
 def open_cameras(spec: str) -> tuple[CameraTiming, CameraPipeline | None]:
-    """Return the timing that a user asks for, and what lies between light and file.
+    """Return the timing of a user's ``[NAME:]WIDTHxHEIGHT@HZ``, and what lies between light and file, None for white noise.
 
-    Args:
-        spec: ``WIDTHxHEIGHT@HZ``, ``NAME`` or ``NAME:WIDTHxHEIGHT@HZ``; a name is ``webcams``, a preset of
-            :class:`~armsight.sim.camera.stages.CameraPipeline`, or a TOML file of its stages.
-
-    Returns:
-        The timing, and the pipeline; None where nothing but white noise is between light and file.
-
-    Raises:
-        InputError: of another form, an unknown name, a bad file, or out of range.
+    A name is ``webcams``, a preset of :class:`~armsight.sim.camera.stages.CameraPipeline`, or a TOML file of its
+    stages. InputError: of another form, an unknown name, a bad file, or out of range.
     """
     name, size_rate = camera_name(spec)
     pipeline, base = None, WEBCAMS if name == "webcams" else CameraTiming()
@@ -173,16 +154,7 @@ RIGS = {"parallel": 0.02, "verging": 1.0}
 
 
 def open_rig(name: str, size: tuple[int, int], baseline_m: float = BASELINE_M) -> StereoRig:
-    """Return the true cameras of a preset.
-
-    Args:
-        name: a key of RIGS.
-        size: (width, height) of their images, px.
-        baseline_m: distance between them.
-
-    Raises:
-        InputError: unknown, or a distance that is none.
-    """
+    """Return the true cameras of a preset, a key of RIGS, with images of a size, px; else InputError."""
     if name not in RIGS:
         raise InputError(f"rig {name!r} is unknown; known are {', '.join(RIGS)}")
     if not 0.02 <= baseline_m <= 1.0:
@@ -194,15 +166,7 @@ def open_rig(name: str, size: tuple[int, int], baseline_m: float = BASELINE_M) -
 def rig_pose(model: Arm, rig: StereoRig, T_tool_body: Array, seed: int, distance_m: float = DISTANCE_M) -> Array:
     """Return where the rig's left camera stands, T_base_rig (4, 4), m: it looks at the body of an arm at home.
 
-    Args:
-        model: the nominal arm.
-        rig: the cameras.
-        T_tool_body: (4, 4) where the body is on the tool, m.
-        seed: nobody mounts cameras to the millimetre.
-        distance_m: from the cameras to the body of an arm at home.
-
-    Raises:
-        InputError: the distance is no use.
+    ``seed``: nobody mounts cameras to the millimetre. InputError: the distance is no use.
     """
     if not 0.3 <= distance_m <= 3.0:
         raise InputError(f"distance_m is {distance_m}; the cameras must be 0.3 to 3 m from the body")
@@ -263,17 +227,7 @@ class _Exposed(NamedTuple):
 
 
 class _OneCamera:
-    """One of the two cameras: what is before it becomes an image.
-
-    Args:
-        side: 0 left, 1 right.
-        cameras: left and right.
-        arm: the true table.
-        parts: the arm's solids.
-        body: the patterns on the tool, and T_tool_body (4, 4), m.
-        seed: of the noise.
-        pipeline: what lies between light and file; None for white noise.
-    """
+    """One of the two cameras (side 0 left, 1 right): what is before it becomes an image."""
 
     def __init__(
         self,
@@ -460,12 +414,9 @@ class WorkcellSource(Source):
                 side.close()
 
     def clear(self, pattern: Pattern, T_left_body: Array, *, body_seen: bool = False) -> bool:
-        """Return whether nothing of the arm is before a pattern that is held somewhere, or in it, for both cameras.
+        """Return whether nothing of the arm is before, or in, a pattern held at T_left_body (4, 4), m, for both cameras.
 
-        Args:
-            pattern: what is held.
-            T_left_body: (4, 4) where, m, left camera's frame.
-            body_seen: whether the pattern must not be before the arm's body either.
+        ``body_seen``: the pattern must not be before the arm's body either.
         """
         q = self._plant.path[-1, self._plant.arm.joints :]
         p_body = (self._plant.arm.forward(q) @ self._T_tool_body)[:3, 3]
@@ -483,13 +434,7 @@ class WorkcellSource(Source):
         return True
 
     def still(self, patterns: tuple[Pattern, ...], T_left_body: Array, number: int) -> Shot:
-        """Return a shot of flat patterns that are held still before the cameras while the arm stands.
-
-        Args:
-            patterns: what is held.
-            T_left_body: (4, 4) where, m, left camera's frame.
-            number: of the shot; its noise follows from it.
-        """
+        """Return a shot of flat patterns held at T_left_body (4, 4), m, while the arm stands; noise by ``number``."""
         now = ShotTimes(self._now(), self._now(), self._now())
         left, right = self._rendering(now, Shutter(), -1 - number, PosedBody(patterns, T_left_body))
         return Shot(f"{number:03d}", left.result(), right.result(), now.stamp_s)

@@ -46,17 +46,9 @@ class ControlledDevice(Device, Protocol):
 
 
 class ControlledArm:
-    """An arm with a controller of its own: what the cameras see, and a ``Device`` at the wire.
+    """An arm of a true table with a controller of its own: what the cameras see, and a ``Device`` at the wire.
 
-    Args:
-        arm: the true table.
-        device: the controller.
-
-    Attributes:
-        arm: the true table.
-        parts: the solids it is made of.
-        device: the controller.
-        stepped: called after every step; may be set.
+    ``stepped`` is called after every step; may be set.
     """
 
     def __init__(self, arm: Arm, device: ControlledDevice) -> None:

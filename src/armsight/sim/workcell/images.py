@@ -166,15 +166,9 @@ def moving(
 ) -> None:
     """Draw capsules over an image that knows its depths; all is in the camera's frame.
 
-    Args:
-        rays: (3, H, W) unit rays of all pixels.
-        window: first column, first row, end column, end row of the image that ``light``, ``depth`` and ``ids`` are of.
-        boxes_px: (K, 4) the same of what each capsule can cover.
-        capsules: ends (K, 2, 3), m; radii (K,), m; albedos (K,).
-        lamp: (3,) unit vector to the lamp.
-        light: rendered over.
-        depth: distance of what is there, m; brought up to date.
-        ids: the number of the capsule that is rendered, counted from 1, is written here.
+    rays (3, H, W): of all pixels; ``window``: first column and row, end column and row of light, depth, m, and ids,
+    which are brought up to date; boxes_px (K, 4): what each capsule can cover; ``capsules``: ends (K, 2, 3), m, radii
+    (K,), m, albedos (K,); ids count them from 1.
     """
     ends, radius, albedo = capsules
     u_first, v_first, u_end, v_end = window
@@ -212,12 +206,7 @@ _STILL_PX = 0.05  # what moves less is painted once
 
 @dataclass(frozen=True, eq=False)
 class ArmSeen(Record):
-    """The arm at the moment of an exposure.
-
-    Attributes:
-        parts: what it is made of.
-        Ts_base_link: (n + 1, 4, 4) row frames.
-    """
+    """The arm at the moment of an exposure, with its row frames Ts_base_link (n + 1, 4, 4)."""
 
     parts: Solids
     Ts_base_link: Array
@@ -288,12 +277,7 @@ class _Room(NamedTuple):
 
 
 class WorkcellCamera:
-    """A camera that stands in the workcell.
-
-    Attributes:
-        camera: its lens.
-        T_base_camera: (4, 4) where it is, m.
-    """
+    """A camera that stands in the workcell at T_base_camera (4, 4), m."""
 
     def __init__(
         self,
@@ -306,16 +290,9 @@ class WorkcellCamera:
         psf_sigma_px: float = LENS.psf_sigma_px,
         more: Array | None = None,
     ) -> None:
-        """Stand there; the first image takes a second longer.
+        """Stand there, among clutter of a seed, by default with noise of 2 grey levels; the first image takes a second.
 
-        Args:
-            camera: its lens.
-            T_base_camera: (4, 4) where it is, m.
-            foot: the arm's solids, whose base stands still.
-            seed: of the clutter.
-            sensor: noise of 2 grey levels by default.
-            psf_sigma_px: blur of its lens, px.
-            more: boxes that stand there besides, see ``raycast``.
+        ``foot``: the arm's solids, whose base stands still; ``more``: boxes that stand there besides, see ``raycast``.
         """
         self.camera, self.T_base_camera = camera, T_base_camera
         self._foot, self._seed, self._more = foot, seed, more
@@ -359,13 +336,7 @@ class WorkcellCamera:
         return self._room.still
 
     def led(self, p_base: Array, radius_m: float, light: float) -> LedSeen:
-        """Return an LED as it looks while it is on.
-
-        Args:
-            p_base: (3,) where it is, m.
-            radius_m: its radius.
-            light: as of a reflectance.
-        """
+        """Return an LED at p_base (3,), m, as it looks while it is on, its light as of a reflectance."""
         p = transform(inverse(self.T_base_camera), p_base)
         uv, radius_px = self.camera.project(p[None])[0], radius_m * self.camera.matrix[0, 0] / p[2]
         margin = math.ceil(radius_px) + _reach(self._psf_sigma_px) + 1
@@ -388,18 +359,11 @@ class WorkcellCamera:
         start: int,
         led: LedSeen | None = None,
     ) -> Image:
-        """Return what the camera hands out.
+        """Return what the camera hands out, (H, W) uint8.
 
-        Args:
-            arm: where the arm is; None leaves it out.
-            bodies: flat patterns, posed in the camera's frame in the middle of the exposure of its middle row.
-            shutter: how long it looks.
-            strip: standard normal noise, from :func:`~armsight.sim.render.optics.noise_strip`.
-            start: where in it this image's noise begins.
-            led: the sync LED as it is lit; None without.
-
-        Returns:
-            (H, W) uint8.
+        ``arm`` None leaves it out; ``bodies`` are flat patterns, posed in the camera's frame in the middle of the
+        exposure of its middle row; noise is that of ``strip`` from ``start`` on
+        (:func:`~armsight.sim.render.optics.noise_strip`).
         """
         seen, window, core = self._seen(arm, bodies, shutter, led)
         still = self._room.grey
@@ -565,17 +529,9 @@ def picture(
     rig: tuple[Array, StereoRig],
     seed: int,
 ) -> Image:
-    """Return the workcell as it is now.
+    """Return the workcell as it is now, (H, W, 3) BGR, uint8.
 
-    Args:
-        size_px: (width, height).
-        plant: the arm.
-        body: the patterns on the tool, and T_tool_body (4, 4), m.
-        rig: T_base_rig (4, 4), m, and the cameras.
-        seed: of the clutter.
-
-    Returns:
-        (H, W, 3) BGR, uint8.
+    ``body``: the patterns on the tool, and T_tool_body; ``rig``: T_base_rig, (4, 4), m, and the cameras.
     """
     width, height = size_px
     focal = _FOCAL * width

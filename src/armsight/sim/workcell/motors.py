@@ -201,13 +201,7 @@ class Motors(Record):
 
 
 def chosen(model: Arm, parts: Solids, friction: float = 1.0) -> Motors:
-    """Choose motors and gears for an arm.
-
-    Args:
-        model: the nominal arm.
-        parts: its solids.
-        friction: dry and viscous friction, of what is usual.
-    """
+    """Choose motors and gears for a nominal arm; ``friction``: dry and viscous, of what is usual."""
     rng = np.random.default_rng(0)
     poses = rng.uniform(model.q_min, model.q_max, (_POSES, 6))
     gravity = np.max([np.abs(gravity_torque(model, parts, q)) for q in poses], axis=0)

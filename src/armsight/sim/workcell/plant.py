@@ -51,18 +51,9 @@ def _mujoco() -> Any:  # noqa: ANN401 - a module without types
 
 
 def mjcf(arm: Arm, parts: Solids, motors: Motors, backlash_rad: Array, stiffness: Array, damping: Array) -> str:
-    """Write the model.
+    """Write the model as MJCF: shafts are joints 0 to 5 (``shaft1``...), links 6 to 11 (``link1``...), a site ``tool``.
 
-    Args:
-        arm: the table to build.
-        parts: what its links are made of.
-        motors: what drives it.
-        backlash_rad: (6,) backlash from stop to stop, rad.
-        stiffness: (6,) of each joint's twist, N m/rad.
-        damping: (6,) between shaft and link, N m s/rad.
-
-    Returns:
-        MJCF; shafts are joints 0 to 5 (``shaft1``...), links 6 to 11 (``link1``...), and the site ``tool`` is the tool.
+    backlash_rad (6,) from stop to stop; stiffness (6,), N m/rad, and damping (6,), N m s/rad, between shaft and link.
     """
     shafts = "".join(
         f'<body><inertial mass="1" pos="0 0 0" diaginertia="1 1 1e-9"/><joint name="shaft{i + 1}" axis="0 0 1" '
@@ -173,13 +164,7 @@ class Potentiometers:
     """Six potentiometers on one converter."""
 
     def __init__(self, true: TrueArm, travel: Array, seed: int) -> None:
-        """Make ready to read.
-
-        Args:
-            true: their errors.
-            travel: (6, 2) joint angles at the ends of their travel, rad.
-            seed: of the noise.
-        """
+        """Make ready to read, with joint angles travel (6, 2) at the ends of their travel, rad."""
         self._given = true.imperfections
         self._low, self._span = travel[:, 0].copy(), np.ptp(travel, axis=1)
         self._offset, self._sines = true.pot_offset_rad.copy(), true.pot_sines.copy()
@@ -195,14 +180,7 @@ class Potentiometers:
         return out
 
     def read(self, shaft: Array) -> Counts:
-        """Read them once.
-
-        Args:
-            shaft: (6,) shaft angles, rad.
-
-        Returns:
-            (6,) counts, uint32, 0 to 65535.
-        """
+        """Read them once at shaft angles (6,), rad: (6,) counts, uint32, 0 to 65535."""
         if self._next == len(self._noise):
             block = self._rng.standard_normal((_BLOCK, 6, self._given.oversampling), dtype=np.float32)
             self._noise, self._next = block * np.float32(self._given.pot_noise_lsb), 0
@@ -222,12 +200,7 @@ _SETTLE_S = 0.5
 class Travelled:
     """What an arm's angles were, at each millisecond of the last minutes; longer ago at fewer times, so that hours fit.
 
-    Args:
-        first: (K,) the first angles, rad.
-
-    Attributes:
-        begin: the tick of the first row of ``recent``.
-        ticks: how many ticks have passed since the first.
+    ``begin``: the tick of the first row of ``recent``; ``ticks``: how many have passed since the first.
     """
 
     def __init__(self, first: Array) -> None:
@@ -276,10 +249,7 @@ class ArmPlant:
     def __init__(self, model: Arm, true: TrueArm, seed: int = 0) -> None:
         """Build the arm, at rest at the model's home, held by its brakes.
 
-        Args:
-            model: the nominal table: motors and potentiometers are chosen for it.
-            true: how the arm really is.
-            seed: of the potentiometers' noise.
+        The nominal table ``model`` is what motors and potentiometers are chosen for; ``true`` how the arm really is.
         """
         self.arm, self.parts = true.arm, solids(true.arm)
         self.motors: Motors = chosen(model, solids(model), true.imperfections.friction)

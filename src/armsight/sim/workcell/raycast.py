@@ -236,20 +236,11 @@ def still(
     depth: Light,
     ids: NDArray[np.int16],
 ) -> None:
-    """Cast one ray a pixel at things that stand still, with the lamp's shadows.
+    """Cast one ray a pixel at things that stand still, with the lamp's shadows: light, depth, m, and ids (N,).
 
-    Rays are cast in bunches: what lies outside the cone around a bunch, from the camera or from the lamp, none of it meets.
-
-    Args:
-        rays: (N, 3) unit rays of the pixels, camera frame; those that follow each other had best be close together.
-        R_base_camera: (3, 3) the camera's axes.
-        p_base: (3,) where it is, m.
-        boxes: (M, BOX).
-        capsules: ends (K, 2, 3), m; radii (K,), m; albedos (K,).
-        lamp_base: (3,) where the lamp is, m.
-        light: (N,) the light that comes from each pixel.
-        depth: (N,) distance of the surface, m.
-        ids: (N,) which surface it is: boxes, then capsules; -1 where there is none.
+    Rays are cast in bunches: what lies outside the cone around a bunch, from the camera or from the lamp, none of it
+    meets. rays (N, 3): unit, camera frame; those that follow each other had best be close together. boxes (M, BOX);
+    ``capsules``: ends (K, 2, 3), m, radii (K,), m, albedos (K,). ids: boxes, then capsules; -1 where there is none.
     """
     ends, radius, albedo = capsules
     balls, n = _balls(boxes, ends, radius), np.empty(3)
@@ -303,13 +294,7 @@ _SAMPLES = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))
 
 @dataclass(frozen=True, eq=False)
 class StillView(Record):
-    """What stands still before a camera.
-
-    Attributes:
-        light: (H, W) light on each pixel before the lens.
-        depth: (H, W) distance of the surface, m.
-        ids: (H, W) which surface it is.
-    """
+    """What stands still before a camera, (H, W): light before the lens, depth, m, and which surface, -1 for none."""
 
     light: NDArray[np.float32]
     depth: NDArray[np.float32]
@@ -334,11 +319,7 @@ def _standing(x: float, y: float, height: float, radius: float) -> tuple[Array, 
 
 
 def furniture(seed: int) -> tuple[Array, tuple[Array, Array, Array]]:
-    """Return what stands still: boxes (N, BOX), and capsules as the rays take them.
-
-    Args:
-        seed: of where the clutter stands.
-    """
+    """Return what stands still: boxes (N, BOX), and capsules as the rays take them; a seed says where clutter stands."""
     rng = np.random.default_rng([seed, 5])
     boxes = [
         block((0.25, 0.0, -0.02), (1.5, 1.7, 0.04), albedo=0.55, texture=GRAIN),
@@ -382,15 +363,9 @@ def pixel_rays(corners: Array) -> Array:
 def view(
     camera: Camera, rays: Array, T_base_camera: Array, seed: int, foot: Solids, more: Array | None = None
 ) -> StillView:
-    """Return what stands still before a camera: a ray a pixel, four more where light changes.
+    """Return what stands still before a camera at T_base_camera: a ray a pixel (H, W, 3), four more where light changes.
 
-    Args:
-        camera: the camera.
-        rays: (H, W, 3) its pixels'.
-        T_base_camera: (4, 4) where it is, m.
-        seed: of the clutter.
-        foot: the arm's solids; its base stands still.
-        more: boxes (N, BOX) that stand there besides.
+    ``foot``: the arm's solids, whose base stands still; ``more``: boxes (N, BOX) that stand there besides.
     """
     boxes, (ends, radius, albedo) = furniture(seed)
     if more is not None:
@@ -426,13 +401,7 @@ def _tiled(height: int, width: int) -> Ids:
 
 
 def arm_capsules(parts: Solids, Ts_base_link: Array, T_base_camera: Array) -> tuple[Array, Array, Array]:
-    """Return the arm's moving solids, but its load, as the rays take them, in a camera's frame.
-
-    Args:
-        parts: what the arm is made of.
-        Ts_base_link: (n + 1, 4, 4) row frames.
-        T_base_camera: (4, 4) where the camera is, m.
-    """
+    """Return the arm's moving solids, but its load, as the rays take them, in a camera's frame; Ts (n + 1, 4, 4)."""
     shown = np.flatnonzero(parts.link > 0)[:-1]
     Ts = inverse(T_base_camera) @ Ts_base_link[parts.link[shown]]
     ends = transform(Ts[:, None], parts.ends[shown])
@@ -443,13 +412,7 @@ _CUBE = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (
 
 
 def capsule_boxes(camera: Camera, ends: Array, radius: Array) -> Ids:
-    """Return (K, 4) the pixels that capsules can cover: first column, first row, end column, end row.
-
-    Args:
-        camera: the camera.
-        ends: (K, 2, 3), m, its frame.
-        radius: (K,) m.
-    """
+    """Return (K, 4) the pixels that capsules can cover: first column, first row, end column, end row."""
     corners = ends[:, :, None] + radius[:, None, None, None] * _CUBE
     size = np.array(camera.image_size_px)
     uv = camera.project(corners.reshape(-1, 3)).reshape(len(radius), 2 * len(_CUBE), 2)

@@ -164,14 +164,10 @@ def _ahead(T_base_tool: Array) -> Array:
 
 
 def workcell_poses(model: Arm, *, default: bool) -> Array:
-    """Return the joint angles (5, n) of five poses before the cameras, rad.
+    """Return the joint angles (5, n) of five poses before the cameras, rad; at home the tool looks at them.
 
-    Args:
-        model: the arm, at whose home the tool looks at the cameras.
-        default: whether it is the arm that the workcell was drawn for; another's shifts follow its size and its reach.
-
-    Raises:
-        InputError: the arm does not reach one.
+    ``default``: the arm that the workcell was drawn for; another's shifts follow its size and its reach. InputError:
+    the arm does not reach one.
     """
     T_home = model.forward(model.home)
     if default:
@@ -348,11 +344,7 @@ class Workcell:
 
     @cached_property
     def poses(self) -> Array:
-        """(5, n) the joint angles of the workcell's five poses, rad, as the nominal table has them; body in view.
-
-        Raises:
-            InputError: the arm does not reach one.
-        """
+        """(5, n) the joint angles of the workcell's five poses, rad, as the nominal table has them; body in view."""
         return workcell_poses(self.model, default=self._default)
 
     def carry(self, unit: InertialUnit) -> Callable[[float], tuple[Array, Array]]:
@@ -370,11 +362,7 @@ class Workcell:
         return read
 
     def chessboard_shots(self, count: int) -> Iterator[Shot]:
-        """Show a chessboard in many poses, as a person would who calibrates, past the arm; no time passes.
-
-        Args:
-            count: how many shots.
-        """
+        """Show a chessboard in ``count`` poses, as a person would who calibrates, past the arm; no time passes."""
         pattern, shown = chessboard(9, 6, 0.030), 0
         rng = np.random.default_rng([self._seed, 10])
         while shown < count:

@@ -112,17 +112,10 @@ def printed_board(points: Array) -> BundleModel:
 def with_second_print(
     model: BundleModel, observations: Observations, pair_count: int
 ) -> tuple[BundleModel, Observations]:
-    """Let the images of one camera alone show another print of the drawing than the pairs do.
+    """Let the images of one camera alone show another print of the drawing than the pairs do: points of both, one body.
 
-    A sheet on a desk and the plate that the arm carries bow differently; one shape for both would bend the cameras.
-
-    Args:
-        model: the printed board, M points, K modes.
-        observations: the detections, those of one camera alone last.
-        pair_count: shots that are pairs.
-
-    Returns:
-        Both prints as one body, (2 M) points and (2 K) modes, and the detections with the points of their own print.
+    A sheet on a desk and the plate that the arm carries bow differently; one shape for both would bend the cameras. The
+    detections of one camera alone come last, after those of ``pair_count`` shots.
     """
     none = np.zeros_like(model.modes)
     modes = np.block([[[model.modes], [none]], [[none], [model.modes]]])
@@ -134,14 +127,8 @@ def with_second_print(
 def motion_of(model: BundleModel, screened: Screened, count: int) -> tuple[ExposureMotion, dict[int, str]] | None:
     """Test whether the board moved between the exposures: each camera agrees with itself better than with the other.
 
-    Args:
-        model: the board.
-        screened: the screened detections, under the assumption that it stood still.
-        count: number of pairs before screening.
-
-    Returns:
-        A first motion for all ``count`` pairs, and the pair that moved furthest, with the reason to reject it should it be
-        the only one; None where no motion is significant.
+    Return a first motion for all ``count`` pairs before screening, and the pair that moved furthest, with the reason to
+    reject it should it be the only one; None where no motion is significant.
     """
     guess = ExposureMotion.guessed(model.points, len(screened.kept))
     still, observations = screened.solution, screened.observations
@@ -194,14 +181,9 @@ def _silent(message: str) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Trial(Record):
-    """One way to model cameras and board, adjusted to all pairs and evaluated on held-out ones.
+    """One way to model cameras and board, adjusted to all pairs, with its held-out ``errors`` and their summary.
 
-    Attributes:
-        model: the board, its tolerance and its motion as learned.
-        motion: how far the board moved between the exposures; None where it stood still.
-        solution: the adjustment to all pairs.
-        errors: held-out errors of every pair.
-        heldout: their summary.
+    ``model`` has its tolerance and its motion as learned; ``motion`` is None where the board stood still.
     """
 
     model: BundleModel
@@ -213,16 +195,7 @@ class Trial(Record):
 
 @dataclass(frozen=True, eq=False)
 class LensModelSearch(Record):
-    """The choice of the distortion model by held-out error.
-
-    Attributes:
-        model: the board.
-        motion: first motion of the board between the exposures; None where it stands still.
-        screened: the detections to fit, and those to evaluate on.
-        folds: how many parts the pairs are split into.
-        sizes: image size of the left and of the right camera, px.
-        progress: called with a line about what is being done.
-    """
+    """The choice of the distortion model by held-out error."""
 
     model: BundleModel
     motion: ExposureMotion | None
@@ -330,13 +303,7 @@ LEAST_PAIRS = 3
 
 @dataclass(frozen=True, eq=False)
 class Pair(Record):
-    """One pair of images after detection.
-
-    Attributes:
-        name: what the pair is called.
-        left: detections in the left image.
-        right: detections in the right image.
-    """
+    """One pair of images after detection, by its name."""
 
     name: str
     left: Detections
@@ -445,9 +412,7 @@ def _disc_radius(
     """Return the radius of a board's discs, m, None where it has none, and an adjustment with their perspective bias.
 
     The images show a radius: the areas of the ellipses against the spacing of the discs, at the poses found.
-
-    Raises:
-        CalibrationError: it is not the one that the board is said to have.
+    CalibrationError: it is not the one that the board is said to have.
     """
     seen = [
         (side, j, d) for j, pair in enumerate(usable) for side, d in enumerate((pair.left, pair.right)) if len(d.shape)
@@ -640,30 +605,14 @@ def calibrate_recording(
     singles: Sequence[Pair] = (),
     progress: Progress = lambda message: None,
 ) -> Calibration:
-    """Calibrate two cameras that may expose at different times, from a recording of a board that moves.
+    """Calibrate two cameras that may expose at different times, from a recording of a board that moves, shots at t_s.
 
     Skew and cameras are estimated alternately (:mod:`armsight.vision.pose.shutter`), then every detection is moved to
-    the time of its left image, and the pairs are calibrated as simultaneous ones. Alternating leaves the sigma of the skew
-    at given cameras; with rho its correlation with them an error shrinks by rho^2 each round, so the sigma of both is that
-    over sqrt(1 - shrinkage).
-
-    Args:
-        board: the board's drawing and its symmetries.
-        pairs: detections of every shot, in the order of their time.
-        t_s: (N,) times of the shots, s, rising.
-        sizes: image size of the left and of the right camera, px.
-        models: distortion models to choose from by held-out error.
-        flat: hold the board to its drawing.
-        folds: how many parts the pairs are split into for the held-out errors.
-        singles: detections of further images by one camera alone.
-        progress: called with a line about what is being done.
-
-    Returns:
-        As :func:`calibrate_boards`, with the skew in the rig where there is one; a note says so, or why it was not found.
-
-    Raises:
-        CalibrationError: fewer than three usable pairs, or views that do not determine the cameras.
-        InputError: the times do not rise.
+    the time of its left image, and the pairs are calibrated as simultaneous ones. Alternating leaves the sigma of the
+    skew at given cameras; with rho its correlation with them an error shrinks by rho^2 each round, so the sigma of both
+    is that over sqrt(1 - shrinkage).
+    Arguments, result and errors are those of :func:`calibrate_boards`, with the skew in the rig where there is one; a
+    note says so, or why it was not found. InputError: the times (N,), s, do not rise.
     """
     seen = [pair for pair in pairs if min(len(pair.left.ids), len(pair.right.ids)) >= LEAST_CORNERS]
     if len(seen) < LEAST_PAIRS:

@@ -119,14 +119,10 @@ class Budget(Record):
     shared: tuple[str, ...] = ("skew", "readout")
 
     def cov(self, *, moving: bool = True, loop: bool = False, of: str = "", scaled: str = "", by: float = 1.0) -> Array:
-        """Return covariances (G, 6, 6).
+        """Return covariances (G, 6, 6), with what motion costs, and for ``loop`` hand-eye and arm.
 
-        Args:
-            moving: with what motion costs.
-            loop: with hand-eye and arm.
-            of: one cause alone; or "precision" or "trueness".
-            scaled: a cause whose standard deviation is multiplied ``by`` so much.
-            by: how much.
+        ``of``: one cause alone, or "precision" or "trueness"; ``scaled``: a cause whose standard deviation is
+        multiplied ``by``.
         """
         total, together = np.zeros((len(self.p_left), 6, 6)), np.zeros((len(self.p_left), 6, 6))
         for name, F in self.factors.items():
@@ -190,17 +186,10 @@ def volume_views(
 
 
 def pose_budget(rig: StereoRig, points: Array, normals: Array, views: list[PredictedView], given: Conditions) -> Budget:
-    """Return what each cause costs a body's pose.
+    """Return what each cause costs a body's pose, points and normals (M, 3), at views of the volume.
 
-    Args:
-        rig: the cameras; their own covariance is not used, ``given.cov_calibration`` is.
-        points: (M, 3) points of the body, m.
-        normals: (M, 3) out of their faces; NaN where unknown.
-        views: where the body is.
-        given: what is not known.
-
-    Raises:
-        InputError: at none of the positions do both cameras see enough of the body.
+    The rig's own covariance is not used, ``given.cov_calibration`` is. InputError: at none of the positions do both
+    cameras see enough of the body.
     """
     found: list[dict[str, Array]] = []
     at, forward = [], np.zeros(3)
@@ -301,12 +290,8 @@ def calibration_covariance(
 ) -> Array:
     """Return the covariance (P, P) of a calibration before it is made: the inverse of the bundle's own information.
 
-    Args:
-        rig: the cameras.
-        board: (M, 3) corners of the board, m.
-        Ts_left_board: (S, 4, 4) where it is to be shown, all of it in both images.
-        sigma_px: standard deviation of a corner, px.
-        bent_m: of a corner of the board from its drawing along each axis, m, smoothly; it is estimated, too.
+    ``board`` (M, 3), m, is shown at Ts_left_board, all of it in both images; ``bent_m``: of its corners from the
+    drawing along each axis, m, smoothly; it is estimated, too.
     """
     model, (S, M) = rigid_board(board), (len(Ts_left_board), len(board))
     if bent_m > 0:

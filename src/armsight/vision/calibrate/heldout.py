@@ -59,19 +59,11 @@ def pair_errors(
     motion: ExposureMotion | None = None,
     disc_radius_m: float = 0.0,
 ) -> PairErrors:
-    """Measure every pair of ``observations`` with a rig and compare with the perfect body.
+    """Measure every pair of ``observations`` with a rig and compare with the perfect body, ``drawing`` (M, 3), m.
 
-    Args:
-        rig: the calibrated pair.
-        drawing: (M, 3) points of the perfect body, m.
-        observations: detections of S shots.
-        estimated: (M, 3) points of the body as the calibration found it, against which the uncertainty is evaluated:
-            the deviation of a print from its drawing is not an error of the cameras; the drawing by default.
-        motion: how far the body is expected to move between the two exposures; it stands still by default.
-        disc_radius_m: radius of a board's discs, as in :class:`~armsight.vision.pose.projection.BundleModel`.
-
-    Returns:
-        One row for each shot that has three or more matched points.
+    The uncertainty is evaluated against ``estimated`` (M, 3), the body as the calibration found it: the deviation of a
+    print from its drawing is not an error of the cameras. ``motion``: expected between the two exposures. One row for
+    each shot that has three or more matched points.
     """
     rows = []
     found = drawing if estimated is None else estimated
@@ -83,14 +75,7 @@ def pair_errors(
 
 
 def middles(rig: StereoRig, body: Array, seen: Correspondences, disc_radius_m: float) -> Correspondences:
-    """Convert centres of the ellipses of a board's discs to images of their middles, at the pose that both cameras show.
-
-    Args:
-        rig: the calibrated pair.
-        body: (M, 3) the discs' middles, m.
-        seen: correspondences that both cameras have.
-        disc_radius_m: radius of the discs, m.
-    """
+    """Convert centres of the ellipses of a board's discs to images of their middles, at the pose that both cameras show."""
     centres = seen
     for _ in range(_BIAS_ROUNDS):
         p, _, _ = optimal_points(rig, centres.uv, centres.cov_uv + max(rig.sigma_px, LEAST_SIGMA_PX) ** 2 * np.eye(2))
@@ -197,18 +182,10 @@ def cross_validate(
     folds: int,
     disc_radius_m: float = 0.0,
 ) -> PairErrors:
-    """Fit on all folds but one and measure that one, for every fold.
+    """Fit on all folds but one and measure that one, for every fold: the held-out errors of every shot.
 
-    Args:
-        fit: rows of the shots to use -> the rig they give, the body as they show it (M, 3), m, and how far it moved
-            between the exposures.
-        drawing: (M, 3) points of the perfect body, m.
-        observations: all detections, bad ones included: a measurement meets them too.
-        folds: number of folds, at most the number of shots.
-        disc_radius_m: as in :func:`pair_errors`.
-
-    Returns:
-        The held-out errors of every shot.
+    ``fit``: rows of the shots to use -> the rig they give, the body as they show it (M, 3), m, and how far it moved
+    between the exposures. ``observations`` are all, bad ones included: a measurement meets them too.
     """
     parts = []
     for held in folds_of(observations.shot_count, folds):
@@ -226,13 +203,7 @@ _FIELDS = ("epipolar_px", "rigid_m", "scale", "weight", "normalised", "over_nois
 
 
 def summary(errors: PairErrors, folds: int, motion: ExposureMotion | None = None) -> HeldOutErrors:
-    """Reduce errors per pair to RMS over all points; the scale error is the mean over pairs.
-
-    Args:
-        errors: of pairs that were left out.
-        folds: into how many parts the pairs were split.
-        motion: how far the board was expected to move between the exposures.
-    """
+    """Reduce errors per pair that was left out to RMS over all points; the scale error is the mean over pairs."""
     if not len(errors.pair):
         raise CalibrationError(
             "no left-out shot has three points on which the cameras agree, so the rig cannot be evaluated: do the left and "
@@ -276,8 +247,7 @@ def unfinished(solution: BundleSolution) -> tuple[str, ...]:
 def rig_of(solution: BundleSolution) -> StereoRig:
     """Return the rig of an adjusted state: its covariance is that of cameras and relative pose, the shape averaged over.
 
-    Raises:
-        CalibrationError: the detections leave one of the rig's parameters undetermined.
+    CalibrationError: the detections leave one of the rig's parameters undetermined.
     """
     left, right = solution.state.cameras
     count = left.parameters.size + right.parameters.size + 6
@@ -293,14 +263,11 @@ def rig_of(solution: BundleSolution) -> StereoRig:
 
 
 def scaled(rig: StereoRig, heldout: HeldOutErrors) -> StereoRig:
-    """Scale a rig's uncertainty by what the held-out pairs show.
+    """Scale a rig's uncertainty by what the held-out pairs show; CalibrationError if they do not determine the noise.
 
     Up where residuals are not white, down where both cameras err alike and their points agree the better for it. Where
     boards moved between the exposures, the rig's ``sigma_px`` includes that motion as if it were noise of the
     detections: a measurement does not know whether a body moves before the cameras.
-
-    Raises:
-        CalibrationError: the held-out residuals do not determine the noise.
     """
     factor = heldout.normalised_rms
     if not (np.isfinite(factor) and factor > 0):

@@ -127,11 +127,7 @@ class Calibration(Record):
         )
 
     def plot(self) -> Any:  # noqa: ANN401 - matplotlib is no dependency
-        """Draw the errors of every pair when it was left out of the fit, mm and px; return matplotlib's figure.
-
-        Raises:
-            InputError: matplotlib is not installed.
-        """
+        """Draw the errors of every pair when it was left out of the fit, mm and px; return matplotlib's figure."""
         figure, axes = new_figure(2, 1, sharex=True)
         axes[0].bar(self.errors.pair, 1e3 * self.errors.rigid_m)
         axes[1].bar(self.errors.pair, self.errors.epipolar_px)

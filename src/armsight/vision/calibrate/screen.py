@@ -58,15 +58,9 @@ class Screened(Record):
 
 
 def noise_px(solution: BundleSolution, observations: Observations, free_count: float) -> float:
-    """Estimate a detection's standard deviation beyond its image covariance from the residuals, px.
+    """Estimate a detection's standard deviation beyond its image covariance from the residuals, px, 1e-3 at least.
 
-    Args:
-        solution: an adjustment without gross errors.
-        observations: what it was fitted to.
-        free_count: shared parameters that were estimated.
-
-    Returns:
-        The sigma under which the whitened residuals have the expected sum of squares; at least 1e-3 px.
+    Under it the whitened residuals have the expected sum of squares, ``free_count`` shared parameters being estimated.
     """
     d2 = (solution.residuals_px**2).sum(axis=1)
     freedom = 2 * len(d2) - 6 * observations.shot_count - free_count
@@ -89,18 +83,9 @@ def screen(
     sigma_px: float = 1.0,
     known: Mapping[int, str] | None = None,
 ) -> Screened:
-    """Adjust robustly and reject gross corners and bad pairs until no more are found.
+    """Adjust robustly from a start and reject gross corners and bad pairs until no more are found.
 
-    Args:
-        model: the board.
-        start: a start for all pairs.
-        observations: all detections.
-        names: (S,) names of the pairs.
-        sigma_px: standard deviation of a detection to begin with, px.
-        known: pairs that are known to be bad, and why.
-
-    Returns:
-        The detections that remain.
+    ``sigma_px``: of a detection to begin with; ``known``: pairs that are known to be bad, and why.
     """
     rejected = [RejectedPair(names[j], reason) for j, reason in (known or {}).items()]
     kept = np.setdiff1d(np.arange(observations.shot_count), list(known or ()))

@@ -71,16 +71,10 @@ def _apart(a: Array, b: Array, scale_m: float = 1.0) -> Array:
 
 
 def relative_poses(left: list[list[Array]], right: list[list[Array]], scale_m: float) -> list[Array]:
-    """Return the relative poses of two cameras that most shots agree on.
+    """Return a few T_left_right (4, 4) that most shots agree on, the widest agreement first; none without candidates.
 
-    Args:
-        left: per shot, candidate poses T_left_body.
-        right: per shot, candidate poses T_right_body.
-        scale_m: typical distance of the body, m: makes rotations and translations comparable.
-
-    Returns:
-        A few different T_left_right (4, 4), the one with the widest agreement first; none where no shot has candidates
-        in both cameras.
+    ``left``, ``right``: candidate poses of the body of each shot; ``scale_m``: its distance, makes rotations and
+    translations comparable.
     """
     each = [[Tl @ inverse(Tr) for Tl in ls for Tr in rs] for ls, rs in zip(left, right, strict=True)]
     each = [of_shot for of_shot in each if of_shot]
@@ -141,18 +135,9 @@ def agreed_symmetries(
 ) -> dict[int, Ids]:
     """Find pairs whose right image names the points in another order than the left one, even in most pairs.
 
-    A camera that is mounted upside down sees the other end of a symmetric board as its first. One order of each pair gives
-    the relative pose that the others give, too; wrong ones give another one wherever the board is.
-
-    Args:
-        points: (M, 3) points of the board, m.
-        sizes: image size of the left and of the right camera, px.
-        observations: the detections of all shots.
-        symmetries: permutations (M,) under which the board looks the same.
-        model: distortion model of the cameras.
-
-    Returns:
-        Shot -> the permutation that sorts its right detections into the left's order.
+    A camera that is mounted upside down sees the other end of a symmetric board as its first. One order of each pair
+    gives the relative pose that the others give, too; wrong ones give another one wherever the board is. Return shot ->
+    the permutation (M,) that sorts its right detections into the left's order.
     """
     candidates: list[list[list[list[Array]]]] = []  # by camera, order and shot
     for side, orders in enumerate(((), symmetries)):
@@ -187,19 +172,9 @@ def agreed_symmetries(
 def start_board(
     points: Array, sizes: tuple[tuple[int, int], tuple[int, int]], observations: Observations, model: str
 ) -> BundleSolution:
-    """Calibrate two cameras from nothing, roughly: the start for every later adjustment.
+    """Calibrate two cameras from nothing, roughly, under a noise of one pixel: the start for every later adjustment.
 
-    Args:
-        points: (M, 3) points of the board, m.
-        sizes: image size of the left and of the right camera, px.
-        observations: the detections of all shots; every shot has four or more in both cameras.
-        model: distortion model of the adjustment.
-
-    Returns:
-        The best minimum found, under a noise of one pixel.
-
-    Raises:
-        CalibrationError: no start leads anywhere.
+    Every shot has four or more detections in both cameras. CalibrationError: no start leads anywhere.
     """
     focals = [_focal_candidates(points, sizes[side], observations, side, model) for side in (0, 1)]
     plain = BundleModel(points, np.zeros((0, len(points), 3)), 1.0, True)
@@ -233,13 +208,7 @@ def residual_rms_px(solution: BundleSolution) -> float:
 
 
 def imitated(camera: Camera, model: str, uv: Array) -> Camera | None:
-    """Approximate a camera by another distortion model, by Gauss-Newton; None where none comes near.
-
-    Args:
-        camera: to be imitated.
-        model: the other model.
-        uv: (N, 2) raw pixels at which the two are compared.
-    """
+    """Approximate a camera by another distortion model at uv (N, 2), raw px, by Gauss-Newton; None if none is near."""
     rays = camera.unproject(uv)
     seen = np.isfinite(rays).all(axis=1)
     rays, uv = rays[seen], uv[seen]

@@ -32,11 +32,7 @@ _FIELD_DEGREE, _FIELD_SHARE, _FIELD_CHANCE = 4, 0.04, 1e-4
 
 
 def weaknesses(calibration: Calibration) -> tuple[str, ...]:
-    """Assess a calibration.
-
-    Returns:
-        One sentence per weakness: what it is and what to do; empty where nothing stands out.
-    """
+    """Assess a calibration: one sentence per weakness, what it is and what to do; empty where nothing stands out."""
     checks = [_agreement, _pairs, _focus, _synchrony, _sides]
     if calibration.rig.cov[0, 0] > 0:  # intrinsics were estimated, not given
         checks += [_tilts, _coverage, _focal, _scale]
@@ -216,11 +212,7 @@ def _sides(calibration: Calibration) -> str | None:
 
 
 def require_order(calibration: Calibration) -> None:
-    """Reject a rig whose right camera stands to the left of the other.
-
-    Raises:
-        CalibrationError: it does.
-    """
+    """Reject a rig whose right camera stands to the left of the other (CalibrationError)."""
     x, y, _ = calibration.rig.T_left_right[:3, 3]
     if x < 0 and abs(x) > abs(y):
         raise CalibrationError(

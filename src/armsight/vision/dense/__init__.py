@@ -25,11 +25,7 @@ METHODS = {"block": "Block", "scanline": "Scanline", "semiglobal": "Semiglobal",
 
 
 def open_method(name: str) -> Method:
-    """Return a method with its usual settings by its name.
-
-    Raises:
-        InputError: an unknown name.
-    """
+    """Return a method with its usual settings by its name; InputError where it is unknown."""
     if name not in METHODS:
         raise InputError(f"unknown dense method {name!r}; known are {', '.join(METHODS)}")
     method: Method = getattr(importlib.import_module(f"armsight.vision.dense.{name}"), METHODS[name])()

@@ -42,16 +42,7 @@ REACH = 4
 
 @kernel_types("u1[::1], u1[::1], u1[::1], u1[::1], u8, u8")
 class PairPlanes(NamedTuple):
-    """A pair as the costs need it: rows of bytes, one after another, widened so that every window lies inside.
-
-    Attributes:
-        left: grey levels.
-        left_census: census words.
-        right: grey levels; one pixel further left for each disparity.
-        right_census: census words.
-        left_stride: bytes in a row of the left planes.
-        right_stride: bytes in a row of the right planes.
-    """
+    """A pair as the costs need it, grey levels and census words: rows of bytes, widened so that all windows lie inside."""
 
     left: Bytes
     left_census: Bytes
@@ -77,13 +68,7 @@ def _census(padded: Bytes, out: Bytes) -> None:
 
 
 def prepare_planes(left: Image, right: Image, further: int) -> PairPlanes:
-    """Compute the planes of both images of a pair.
-
-    Args:
-        left: (H, W) uint8.
-        right: (H, W) uint8.
-        further: how far to the left of the right image a match may lie: the search's last disparity and one.
-    """
+    """Compute the planes of both images (H, W) of a pair; matches lie less than ``further`` to the left in the right."""
 
     def widened(image: Image, before: int) -> Bytes:
         return np.asarray(

@@ -35,17 +35,9 @@ _RAW_MAX = np.uint8(34)
 
 @kernel_types("u1[:, ::1], u1[:, ::1], u1[:, ::1], u4[:, ::1], u1[:, ::1], u1[:, ::1], u1[:, ::1], u4[:, ::1]")
 class CensusPair(NamedTuple):
-    """A pair as the costs need it; the planes of the right image are mirrored and padded by the search.
+    """A pair as the costs need it; planes of the right image (H, W + pad) are mirrored and padded by the search.
 
-    Attributes:
-        left: (H, W) grey.
-        left_low: (H, W) least grey level within half a pixel to either side.
-        left_high: (H, W) greatest.
-        left_census: (H, W) census words.
-        right: (H, W + pad) grey, mirrored.
-        right_low: (H, W + pad) mirrored.
-        right_high: (H, W + pad) mirrored.
-        right_census: (H, W + pad) mirrored.
+    ``low`` and ``high``: the least and the greatest grey level within half a pixel to either side.
     """
 
     left: Bytes
@@ -115,13 +107,7 @@ def _census_planes(image: Image) -> tuple[Bytes, Bytes, Bytes, Words32]:
 
 
 def prepare(left: Image, right: Image, pad: int) -> CensusPair:
-    """Compute the planes of both images of a pair.
-
-    Args:
-        left: (H, W) uint8.
-        right: (H, W) uint8.
-        pad: first disparity of the search and how many there are, together.
-    """
+    """Compute the planes of both images (H, W) of a pair; ``pad``: first disparity of the search and how many there are."""
 
     def mirrored(a: NDArray[Any]) -> NDArray[Any]:
         out = np.zeros((a.shape[0], a.shape[1] + pad), a.dtype)
@@ -202,14 +188,7 @@ def _blur_along(a: Bytes, size: np.uintp, out: Bytes, base: np.uintp) -> None:
 def smooth_row(y: int, height: int, size: np.uintp, raw: Bytes, mixed: Bytes, out: Bytes, base: np.uintp) -> None:
     """Write the costs of row y, smoothed over 3 x 3 pixels, into ``out`` from ``base`` on.
 
-    Args:
-        y: the row.
-        height: rows of the image.
-        size: disparities, padded.
-        raw: (3 * W * size,) raw costs of the rows y - 1, y and y + 1, each at its number modulo 3.
-        mixed: (W * size,) scratch.
-        out: where to.
-        base: first byte.
+    raw (3 * W * size,): of the rows y - 1, y and y + 1, each at its number modulo 3; mixed (W * size,): scratch.
     """
     n = np.uintp(mixed.shape[0])
     above, below = max(y - 1, 0) % 3, min(y + 1, height - 1) % 3

@@ -55,12 +55,7 @@ class DisparityErrors:
 
 @dataclass(frozen=True, eq=False)
 class TrueDisparity(Record):
-    """The true disparities of a left image.
-
-    Attributes:
-        disparity: (H, W) px, NaN where unknown.
-        seen: (H, W) whether the right camera sees it too.
-    """
+    """The true disparities (H, W) of a left image, px, NaN where unknown; ``seen``: by the right camera, too."""
 
     disparity: Array
     seen: NDArray[np.bool_]
@@ -74,13 +69,7 @@ class TrueDisparity(Record):
 def evaluate_disparity(
     disparity: NDArray[np.floating[Any]], truth: TrueDisparity, among: NDArray[np.bool_]
 ) -> DisparityErrors:
-    """Evaluate a disparity map over some of its pixels.
-
-    Args:
-        disparity: (H, W) px; NaN or infinite where there is none.
-        truth: the true disparities.
-        among: (H, W) the pixels that count, of those with a truth.
-    """
+    """Evaluate a disparity map (H, W), px, NaN or infinite where there is none, ``among`` some of its pixels."""
     chosen = among & truth.known
     error = np.abs(np.asarray(disparity, np.float64)[chosen] - truth.disparity[chosen])
     given = error[np.isfinite(error)]

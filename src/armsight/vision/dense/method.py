@@ -22,12 +22,7 @@ NOTHING, MEASURED, OCCLUDED, FILLED = range(4)
 
 @dataclass(frozen=True)
 class Search:
-    """The range of disparities that are tried.
-
-    Attributes:
-        first: the least, px.
-        count: how many, one pixel apart.
-    """
+    """The range of disparities that are tried: ``count`` from ``first`` on, px, one apart."""
 
     first: int
     count: int

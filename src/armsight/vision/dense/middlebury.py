@@ -32,11 +32,7 @@ from armsight.vision.image import IMAGE_MB, read_image
 
 
 def read_pfm(path: str | Path) -> NDArray[np.float32]:
-    """Read a grey PFM file into (H, W), the first row at the top.
-
-    Raises:
-        InputError: missing, unreadable, or no grey PFM.
-    """
+    """Read a grey PFM file into (H, W), the first row at the top; InputError where it is none."""
     data = read_bytes(path, IMAGE_MB)
     try:
         kind, size, scale, rest = data.split(b"\n", 3)
@@ -51,16 +47,7 @@ def read_pfm(path: str | Path) -> NDArray[np.float32]:
 
 
 def write_pfm(path: str | Path, image: NDArray[np.floating[Any]], scale: float = 1.0) -> None:
-    """Write a grey PFM file (H, W), little-endian; NaN becomes infinity, the benchmark's "unknown".
-
-    Args:
-        path: where to.
-        image: (H, W).
-        scale: factor of the values written, such as 1000 for mm instead of m.
-
-    Raises:
-        InputError: the file cannot be written.
-    """
+    """Write a grey PFM file (H, W), little-endian, values times ``scale``; NaN becomes infinity, the "unknown" there."""
     height, width = image.shape
     with replacing(path, "wb") as file:
         file.write(f"Pf\n{width} {height}\n-1.0\n".encode())
@@ -100,16 +87,7 @@ _WIDTH_2003, _WIDTH_2006 = 1800, 1240
 
 @dataclass(frozen=True, eq=False)
 class MiddleburyScene(Record):
-    """A pair with its truth.
-
-    Attributes:
-        name: the folder's.
-        left: as read.
-        right: as read.
-        truth: the true disparities of the left image.
-        search: the disparities a method may try.
-        weight: in averages over scenes.
-    """
+    """A pair with the true disparities of its left image, and the search; ``weight``: in averages over scenes."""
 
     name: str
     left: Image
@@ -185,12 +163,9 @@ def _seen(folder: Path, truth: Array) -> NDArray[np.bool_]:
 
 
 def load_scene(folder: str | Path) -> MiddleburyScene:
-    """Load a scene.
+    """Load a scene; InputError where its layout is unknown or files do not belong together.
 
     The search holds every true disparity: as many as ``calib.txt`` says, or as the truth's greatest in steps of 16.
-
-    Raises:
-        InputError: no known layout, or files that do not belong together.
     """
     folder = Path(folder)
     files = _files(folder)
@@ -212,11 +187,7 @@ def load_scene(folder: str | Path) -> MiddleburyScene:
 
 
 def find_scenes(folder: str | Path) -> list[Path]:
-    """Return the folders of scenes: the folder itself, or those in it.
-
-    Raises:
-        InputError: there is none.
-    """
+    """Return the folders of scenes: the folder itself, or those in it; InputError where there is none."""
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder")

@@ -108,15 +108,9 @@ def _mean_of(
 
 
 def aligned_to_edges(disparity: Singles, state: NDArray[np.uint8], image: Image) -> tuple[Singles, NDArray[np.uint8]]:
-    """Align depth breaks and gaps to the edges of the image.
+    """Align depth breaks and gaps of a filled disparity map (H, W), px, to the edges of the left image, and their states.
 
-    Args:
-        disparity: (H, W) px, filled.
-        state: (H, W) the state of each.
-        image: (H, W) uint8, the left image.
-
-    Returns:
-        The same two, aligned; a measured pixel that moves to another surface is FILLED.
+    A measured pixel that moves to another surface is FILLED.
     """
     doubtful, median = _doubtful(disparity, state), np.empty_like(disparity)
     alike = np.exp(-np.arange(256) / _EDGE_ALIKE).astype(np.float32)
@@ -183,14 +177,7 @@ def _fill(d: Singles, state: NDArray[np.uint8]) -> None:
 
 
 def filled(disparity: Singles) -> tuple[Singles, NDArray[np.uint8]]:
-    """Fill what was not measured.
-
-    Args:
-        disparity: (H, W) px; NaN where nothing was measured, but not everywhere.
-
-    Returns:
-        (H, W) px without NaN, and (H, W) the state of every pixel.
-    """
+    """Fill what was not measured, NaN in (H, W) px, but not everywhere: (H, W) px, and the state of every pixel."""
     out, state = disparity.copy(), np.where(np.isnan(disparity), np.uint8(FILLED), np.uint8(MEASURED))
     _fill(out, state)
     return out, state
@@ -253,15 +240,9 @@ def _columns(
 
 
 def smoothed(disparity: Singles, image: Image) -> tuple[Singles, NDArray[np.float32]]:
-    """Smooth measured disparities.
+    """Smooth measured disparities (H, W), px, NaN elsewhere, by the left image.
 
-    Args:
-        disparity: (H, W) px; NaN where nothing was measured.
-        image: (H, W) uint8, the left image.
-
-    Returns:
-        (H, W) px, NaN where it was; and (H, W) the share of each pixel's neighbours, each by its weight, that lie on
-        its surface.
+    Also return (H, W) the share of each pixel's neighbours, each by its weight, that lie on its surface.
     """
     height = disparity.shape[0]
     share, half, out = np.empty_like(disparity), np.empty_like(disparity), disparity
@@ -289,16 +270,12 @@ _LEAST_SHARE = 0.005
 
 @dataclass(frozen=True)
 class SigmaModel:
-    """The uncertainty of a method: sigma^2 = floor^2 + (gain * least / curvature)^2.
+    """The uncertainty of a method: sigma^2 = floor^2 + (gain * least / curvature)^2, px.
 
     The second term is the noise of a minimum: the cost that remains is noise, and the curvature of the costs converts
     it to pixels. The first is independent of the costs: the pull towards whole disparities, slants, the smoothing. Both
     are set so that 1.96 sigma covers about 95% of the errors on four rendered scenes; others, and real ones, then check
     it.
-
-    Attributes:
-        floor_px: px.
-        gain: of a method's own costs.
     """
 
     floor_px: float
@@ -354,15 +331,7 @@ def _write_sigmas(
 
 
 def finished(found: Winners, left: Image, search: Search, sigma_model: SigmaModel, *, edges: bool = False) -> Disparity:
-    """Convert the winners of a method to a result.
-
-    Args:
-        found: the winners.
-        left: (H, W) uint8, the left image.
-        search: which disparities were tried.
-        sigma_model: the uncertainty of the method.
-        edges: whether depth breaks are aligned to the edges of the image.
-    """
+    """Convert the winners of a method to a result; ``edges``: align depth breaks to the edges of the left image."""
     sure = without_speckles(found)
     if np.count_nonzero(sure == sure) < _LEAST_SHARE * sure.size:  # NaN is not even itself
         return Disparity.none(

@@ -31,11 +31,7 @@ _TEXTURE, _TEXTURED_SHARE = 1.5, 0.002
 
 
 def plain_grey(image: NDArray[np.generic], side: str) -> Image:
-    """Return an image as 8-bit grey, floats of 0 to 255 included.
-
-    Raises:
-        InputError: a shape or a type that is no image, or numbers that are NaN or infinite.
-    """
+    """Return an image as 8-bit grey, floats of 0 to 255 included; InputError where it is none, or has NaN."""
     if image.dtype.kind != "f":
         return grey(image)
     if not np.isfinite(image).all():
@@ -72,17 +68,9 @@ def vertical_offset_px(corners: Array) -> Array:
 
 
 def check_rectified(left: Image, right: Image) -> str | None:
-    """Check by corners whether two images are a rectified pair.
+    """Check by corners whether two images (H, W) are a rectified pair; InputError where exchanged or not rectified.
 
-    Args:
-        left: (H, W) uint8.
-        right: (H, W) uint8.
-
-    Returns:
-        A remark where they are a little off; None where nothing is.
-
-    Raises:
-        InputError: exchanged, or not rectified.
+    Return a remark where they are a little off; None where nothing is.
     """
     corners = alike(left, right)
     if len(corners) < _ENOUGH:
@@ -105,22 +93,14 @@ def check_rectified(left: Image, right: Image) -> str | None:
 
 
 def check_sizes(left: Image, right: Image) -> None:
-    """Reject images of two sizes.
-
-    Raises:
-        InputError: the sizes differ.
-    """
+    """Reject images of two sizes (InputError)."""
     if left.shape != right.shape:
         (h, w), (k, m) = left.shape, right.shape
         raise InputError(f"the left image is {w}x{h} px and the right one {m}x{k}; both must be of one size")
 
 
 def check_search(search: Search, width: int) -> None:
-    """Reject a search that leaves the image.
-
-    Raises:
-        InputError: the greatest disparity is not within the image.
-    """
+    """Reject a search whose greatest disparity is not within the image (InputError)."""
     if search.last >= width:
         raise InputError(
             f"disparities up to {search.last} px are outside an image {width} px wide; the greatest must be below its width"

@@ -58,15 +58,9 @@ def _vote(
 
 
 def vote(whole: Whole, image: Image, count: int) -> Whole:
-    """Let neighbouring rows, and then columns, vote.
+    """Let neighbouring rows, and then columns, vote on disparities (H, W), -1 where a pixel was skipped.
 
-    Args:
-        whole: (H, W) disparities from the search's first on, -1 where a pixel was skipped.
-        image: (H, W) uint8, the left image.
-        count: how many disparities there are.
-
-    Returns:
-        (H, W) the disparities with most votes; -1 where there are no votes.
+    Return (H, W) those with most votes, -1 where there are none; ``count``: how many disparities there are.
     """
     weights = (_ALIKE / (_ALIKE + np.arange(256))).astype(np.float32)
     size = -(-count // 64) * 64
@@ -150,15 +144,8 @@ def _ways(
 ) -> np.int16:
     """Write the costs of the best ways that end in a pixel, and return their least.
 
-    Args:
-        table: the row.
-        at: where the pixel's disparities begin.
-        stride: how far on the next pixel's do.
-        size: disparities, padded.
-        stop: cost of a break here.
-        best: disparity of the best way to the pixel before, whose cost is zero.
-        costs: the row's matching costs.
-        cost: where the pixel's begin.
+    Its disparities begin ``at`` in the table, the next pixel's ``stride`` further on, its matching costs at ``cost``.
+    ``stop``: of a break here; ``best``: disparity of the best way to the pixel before, whose cost is zero.
     """
     matched, skipping, before = table.matched, table.skipping, at - stride
     least = _HIGH

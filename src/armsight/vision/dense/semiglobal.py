@@ -134,21 +134,11 @@ def forward(
     p1: np.uint8,
     p2: Bytes,
 ) -> None:
-    """Advance the paths from the row before to row y, and the path along the row to the right.
+    """Advance the paths from row from_y, < 0 for none, to row y, and the path along the row to the right.
 
     The paths alternate pixel by pixel: the one along the row depends on its own last step, and the others fill the
-    waiting time.
-
-    Args:
-        work: the strip's buffers, the row's costs in them.
-        image: (H, W) left image, for the steps between pixels.
-        y: this row.
-        from_y: the row before, above or below; < 0 where there is none.
-        keep: RUN_UP for no totals, WRITE to go along the row too and write them, ADD to add to them.
-        size: disparities, padded.
-        at: where the row's totals begin.
-        p1: penalty of a slant.
-        p2: (256,) penalty of a jump at each difference of grey levels.
+    waiting time. ``keep``: RUN_UP for no totals, WRITE to go along the row too and write them from ``at`` on, ADD to
+    add to them; p1: penalty of a slant, p2 (256,): of a jump at each difference of grey levels.
     """
     width = image.shape[1]
     slot, costs, now = size + _GUARD, cost_base(width, size), y & 1
@@ -258,11 +248,7 @@ def _strip(
 
 @dataclass(frozen=True)
 class Semiglobal:
-    """Semi-global matching.
-
-    Attributes:
-        paths: 5 or 8. Five are faster and need less memory, for all come from above or along the row.
-    """
+    """Semi-global matching over 5 or 8 paths; 5 are faster and need less memory, all from above or along the row."""
 
     paths: int = 8
 

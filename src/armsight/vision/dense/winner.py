@@ -31,12 +31,9 @@ STRIP_ROWS = 192
 
 
 def for_each_strip(height: int, work: Callable[[int, int], None], rows: int = STRIP_ROWS) -> None:
-    """Call ``work(begin, end)`` for strips that cover all rows, on as many threads as the process has processors.
+    """Call ``work(begin, end)``, compiled without the interpreter's lock, for strips of all rows, on all processors.
 
-    Args:
-        height: rows of the image.
-        work: compiled without the interpreter's lock; writes to its own rows only.
-        rows: at most so many a strip; the strips are about equal, and do not depend on the number of threads.
+    Strips are about equal, of ``rows`` at most, and do not depend on the number of threads.
     """
     count = -(-height // rows)
     bounds = [height * k // count for k in range(count + 1)]
@@ -112,17 +109,9 @@ def _least_of(total: Counts, at: np.uintp, count: np.uintp, best_right: Counts, 
 def choose_row(
     total: Counts, at: np.uintp, best_right: Counts, y: int, first: int, count: int, size: np.uintp, found: Winners
 ) -> None:
-    """Choose the disparities of row y.
+    """Choose the disparities of row y from its totals, ``size`` for each pixel from ``at`` on.
 
-    Args:
-        total: totals, those of the row from ``at`` on, ``size`` for each pixel.
-        at: where the row begins.
-        best_right: (W + pad,) least total of every right pixel, mirrored; scratch.
-        y: the row.
-        first: first disparity of the search.
-        count: how many there are; ``size`` with the padding.
-        size: stride.
-        found: filled.
+    best_right (W + pad,), least total of every right pixel, mirrored, is scratch.
     """
     width = found.disparity.shape[1]
     best_right[:] = NOWHERE

@@ -30,12 +30,9 @@ Claim = tuple[Ids, Ids]
 
 @dataclass(frozen=True, eq=False)
 class Assigned(Record):
-    """Detections identified by a pose.
+    """Detections identified by a pose: rows (M, 2) of the left and the right camera's discs, -1 where one was not seen.
 
-    Attributes:
-        rows: (M, 2) rows of the left and the right camera's discs, -1 where a disc was not seen.
-        T_left_body: (4, 4) the pose, updated by the assigned detections.
-        dropped: discs for which detections compete.
+    ``T_left_body`` (4, 4) is updated by the assigned detections; detections compete for the discs that are ``dropped``.
     """
 
     rows: Ids
@@ -46,15 +43,7 @@ class Assigned(Record):
 def assign(
     rig: StereoRig, target: DiscTarget, T_left_body: Array, cov: Array, left: Discs, right: Discs
 ) -> Correspondences | Missed:
-    """Identify the discs of a body whose pose is known approximately.
-
-    Args:
-        rig: the calibrated pair.
-        target: the discs.
-        T_left_body: (4, 4) approximate pose: predicted, or from its coded markers.
-        cov: (6, 6) covariance of its tangent.
-        left: the discs detected in the left image.
-        right: the discs detected in the right image.
+    """Identify the discs of a body whose pose, covariance cov (6, 6) of its tangent, is known approximately.
 
     Returns:
         Ellipse centres by rows of the target's body; discs for which detections compete are dropped by name. Missed
@@ -82,13 +71,9 @@ def correspondences(view: DiscView, found: Assigned) -> Correspondences:
 
 
 def settle(view: DiscView, T_left_body: Array, cov: Array, rows: Ids) -> Assigned:
-    """Assign detections to discs by a pose, the unambiguous ones first.
+    """Assign detections to discs by an approximate pose, the unambiguous ones first.
 
-    Args:
-        view: the discs that both cameras detected.
-        T_left_body: (4, 4) approximate pose.
-        cov: (6, 6) covariance of its tangent.
-        rows: (M, 2) detections already assigned, which the pose includes; -1 elsewhere.
+    ``rows`` (M, 2): detections already assigned, which the pose includes; -1 elsewhere.
     """
     T, rows = T_left_body, rows.copy()
     while True:

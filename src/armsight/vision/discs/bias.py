@@ -58,10 +58,9 @@ def disc_image(
     J_P: Array,
     J_n: Array,
 ) -> bool:
-    """Project one disc; see :func:`project_discs`. Fills uv (2,), shape (3,), J_P (2, 3), J_n (2, 3).
+    """Project one disc as :func:`project_discs` does, into uv (2,), shape (3,), J_P (2, 3), J_n (2, 3), and return True.
 
-    Returns:
-        False where the disc is not all in front of the camera, or is seen edge-on; nothing is filled then.
+    Nothing is filled where the disc is not all in front of the camera, or is seen edge-on.
     """
     if not P[2] > radius:
         return False
@@ -249,13 +248,7 @@ def _each(
 
 
 def project_discs(camera: Camera, p: Array, normals: Array, radii_m: Array) -> tuple[Array, Array, Array, Array]:
-    """Project discs to the ellipses that a camera shows, and their centres.
-
-    Args:
-        camera: the camera.
-        p: (N, 3) centres of the discs, m, camera's frame.
-        normals: (N, 3) unit normals of the discs, camera's frame; the sign does not matter.
-        radii_m: (N,) radii, m.
+    """Project discs, centres p (N, 3), m, and normals of either sign, camera's frame, to the ellipses that a camera shows.
 
     Returns:
         (N, 2) centres of the ellipses, raw px; (N, 3) S11, S12, S22 of the ellipses, px^2; (N, 2, 3) derivative of the
@@ -272,16 +265,9 @@ def project_discs(camera: Camera, p: Array, normals: Array, radii_m: Array) -> t
 
 
 def disc_bias(camera: Camera, T_camera_board: Array, points: Array, radius_m: float) -> Array:
-    """Return by how much the centres of the ellipses of a board's discs are off the images of their middles.
+    """Return by how much, (N, 2) px, centres of ellipses of a board's discs are off the images of their middles.
 
-    Args:
-        camera: the camera.
-        T_camera_board: (4, 4) pose of the board, whose discs face along z.
-        points: (N, 3) the discs' middles, m, board frame.
-        radius_m: their radius, m.
-
-    Returns:
-        (N, 2) px; zero where a disc has no ellipse.
+    ``points`` (N, 3) are the middles, m, board frame, where discs face along z; zero where a disc has no ellipse.
     """
     p = transform(T_camera_board, points)
     normals = np.tile(T_camera_board[:3, 2], (len(p), 1))
@@ -289,14 +275,9 @@ def disc_bias(camera: Camera, T_camera_board: Array, points: Array, radius_m: fl
 
 
 def apparent_radii(camera: Camera, T_camera_board: Array, points: Array, shape: Array, about_m: float) -> Array:
-    """Return (N,) which radius, m, the ellipse of each disc of a board has according to its area.
+    """Return (N,) which radius, m, the ellipse of each disc of a board has according to its area, near about_m.
 
-    Args:
-        camera: the camera.
-        T_camera_board: (4, 4) pose of the board, whose discs face along z.
-        points: (N, 3) the discs' middles, m, board frame.
-        shape: (N, 3) S11, S12, S22 of the ellipses, px^2.
-        about_m: a radius of about the right size.
+    ``shape`` (N, 3): S11, S12, S22, px^2; ``points`` (N, 3) the middles, m, board frame, where discs face along z.
     """
     p = transform(T_camera_board, points)
     normals = np.tile(T_camera_board[:3, 2], (len(p), 1))
@@ -337,10 +318,9 @@ class Expected(Record):
 
 
 def bias_normals(target: DiscTarget) -> Array:
-    """Return normals for the perspective bias, for which their sign does not matter.
+    """Return normals (M, 3) for the perspective bias, for which their sign does not matter.
 
-    Returns:
-        (M, 3) those given; where none is given, that of the plane of all discs; NaN where they are not coplanar.
+    Where none is given, that of the plane of all discs; NaN where they are not coplanar.
     """
     normals = np.array(target.normals)
     unknown = np.isnan(normals[:, 0])
@@ -353,13 +333,7 @@ def bias_normals(target: DiscTarget) -> Array:
 
 
 def expect(rig: StereoRig, target: DiscTarget, T_left_body: Array) -> Expected:
-    """Predict what both cameras see of a body's discs.
-
-    Args:
-        rig: the calibrated pair.
-        target: the discs.
-        T_left_body: (4, 4) pose of the body.
-    """
+    """Predict what both cameras see of a body's discs at a pose (4, 4)."""
     points, normals = target.body.points, bias_normals(target)
     known = np.isfinite(normals[:, 0])
     T_right_left, count = inverse(rig.T_left_right), len(points)
@@ -396,16 +370,9 @@ def expect(rig: StereoRig, target: DiscTarget, T_left_body: Array) -> Expected:
 def centred(rig: StereoRig, target: DiscTarget, T_left_body: Array, seen: Correspondences) -> Correspondences:
     """Convert centres of ellipses to images of the discs' centres: subtract the perspective bias.
 
-    Args:
-        rig: the calibrated pair.
-        target: the discs; ``seen.ids`` are rows of its body.
-        T_left_body: (4, 4) pose of the body, the one that is estimated from the result: an error of it is none of the
-            detections', for the bias follows the estimate.
-        seen: centres of ellipses.
-
-    Returns:
-        The same correspondences less the bias, with the covariance of both, as far as the normals are not known.
-        Detections whose disc would have no image at the pose become NaN.
+    An error of T_left_body, the pose that is estimated from the result, is none of the detections', for the bias
+    follows the estimate. The covariance has that of the bias as far as normals are not known. Detections whose disc
+    would have no image at the pose become NaN.
     """
     expected = expect(rig, target, T_left_body)
     cov = seen.cov_uv + expected.cov_bias[seen.ids]

@@ -138,12 +138,9 @@ def _edges(view: DiscView, pairs: Pairs) -> tuple[Ids, Ids, Ids, Array] | None:
 def _triangles(start: Ids, second: Ids, shared: Ids, enough: int, found: Ids) -> int:
     """List triangles of nodes a < b < c that are all shared by ``enough`` of them; return how many there are.
 
-    Args:
-        start: (V + 1,) where each node's edges to higher nodes begin.
-        second: (E,) the higher nodes, rising from each.
-        shared: (V,) in how many triangles each node is; with ``enough`` zero it is counted here.
-        enough: least of ``shared``.
-        found: (T, 5) is filled with nodes a, b, c and the edges ab and ac, as far as it reaches.
+    start (V + 1,) where each node's edges to higher nodes, second (E,), rising, begin; shared (V,) in how many
+    triangles each node is, counted here where ``enough`` is zero; found (T, 5) receives nodes a, b, c and the edges ab
+    and ac.
     """
     count = 0
     for a in range(len(start) - 1):
@@ -224,17 +221,9 @@ class IdentifiedDiscs(Record):
 
 
 def identify(rig: StereoRig, target: DiscTarget, left: Discs, right: Discs) -> IdentifiedDiscs | Missed:
-    """Find a body by its discs.
+    """Find a body by its discs, pose and names, or why there are none.
 
-    Args:
-        rig: the calibrated pair.
-        target: the discs.
-        left: the discs detected in the left image.
-        right: the discs detected in the right image.
-
-    Returns:
-        Pose and names, or why there are none: too few discs, none with the body's distances, all facing away, or more
-        than one way to name them.
+    Too few discs, none with the body's distances, all facing away, or more than one way to name them.
     """
     body = target.body
     if len(body.points) < 3 or not spread(body.points[list(combinations(range(len(body.points)), 3))]).any():
@@ -294,10 +283,9 @@ def _hypotheses(view: DiscView, pairs: Pairs, found: Triples) -> list[Hypothesis
 
 
 def _settled(accepted: list[Hypothesis], most: int) -> bool:
-    """Whether no hypothesis of at most so many discs can come near the best one.
+    """Whether no hypothesis of at most so many discs can come near the best one, by half as much again.
 
-    A score is about proportional to the number of discs, less a constant for the pose; a margin of half as much again
-    is allowed.
+    A score is about proportional to the number of discs, less a constant for the pose.
     """
     best = max(accepted, key=lambda h: h.score, default=None)
     if best is None:

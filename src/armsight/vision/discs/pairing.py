@@ -320,13 +320,7 @@ def _by_rig(rig: StereoRig, p_left: Array) -> Array:
 
 @kernel_types("const f8[::1], const f8[::1], const f8[:, ::1], const f8[:, ::1], f8[::1], f8[::1], const b1[::1]")
 class _Side(NamedTuple):
-    """The N discs of one image as the compiled sweep needs them; the first four as in :class:`_Lines`.
-
-    Attributes:
-        radius_px: (N,) longer half axis of the ellipse.
-        tolerance_px: (N,) of that half axis.
-        bright: (N,) whether the disc is bright.
-    """
+    """The N discs of one image as the compiled sweep needs them, as in :class:`_Lines` and :class:`DiscView`."""
 
     angle: Array
     along: Array
@@ -354,18 +348,11 @@ def _sweep(
     bright: NDArray[np.bool_],
     rows: Ids,
 ) -> int:
-    """Write the possible pairs into ``rows``; return their number, more than its length when it overflows.
+    """Write the possible pairs into ``rows`` (L, 2); return their number, more than its length when it overflows.
 
-    Args:
-        gate: (N,) largest difference of the epipolar planes' angles, rad, for each left disc.
-        order: (K,) rows of the right discs that have a ray, by the angle of their plane.
-        angle_r: (K,) those angles, ascending, rad.
-        left: the left discs.
-        right: the right discs.
-        t: (3,) position of the right camera, m, left frame.
-        radii: (R,) radii of the body's kinds of disc, m.
-        bright: (R,) whether a kind is bright.
-        rows: (L, 2) filled with rows of the left and the right discs.
+    gate (N,): largest difference of the epipolar planes' angles for each left disc, rad; order (K,): right discs that
+    have a ray by angle_r, ascending, rad; t (3,): position of the right camera, m, left frame; radii and bright (R,):
+    the body's kinds of disc.
     """
     count, baseline = 0, np.sqrt(t[0] ** 2 + t[1] ** 2 + t[2] ** 2)
     for i in range(len(left.angle)):

@@ -22,14 +22,10 @@ from armsight.data import Array
 
 
 class FamilyLayout(NamedTuple):
-    """Where a family has its data.
+    """Where a family has its data: cells along the inner square and the whole tag, least Hamming ``distance`` of two codes.
 
-    Attributes:
-        square: cells along the inner square.
-        cells: cells along the whole tag.
-        distance: least Hamming distance of two codes.
-        quarter: data cells of the first quarter, in order, as rows of columns "row:first-last"; the other quarters are
-            the same rotated by 90, 180, 270 degrees, and a cell in the middle comes last.
+    ``quarter``: data cells of the first quarter, in order, as rows of columns "row:first-last"; the others are the same
+    rotated by 90, 180, 270 degrees, and a cell in the middle comes last.
     """
 
     square: int
@@ -101,13 +97,7 @@ def negative_square(family: str, identity: int) -> NDArray[np.int8]:
 
 
 def read_tag(image: NDArray[np.uint8], quad: Array, family: str) -> tuple[int, Array] | None:
-    """Return identity and upright corners (4, 2) of the tag whose inner square a quadrilateral (4, 2) is, if it is one.
-
-    Args:
-        image: (H, W) grey image.
-        quad: corners, clockwise from any.
-        family: a key of LAYOUTS.
-    """
+    """Return identity and upright corners (4, 2) of the tag whose inner square a quadrilateral (4, 2) is, if it is one."""
     layout = LAYOUTS[family]
     rim, n = (layout.cells - layout.square) // 2, layout.cells
     ends = np.array([[rim, rim], [n - rim, rim], [n - rim, n - rim], [rim, n - rim]], np.float32) * _SAMPLES - 0.5

@@ -36,11 +36,7 @@ _MOST, _CORRECTED = 1024, 0.6
 
 
 def family_name(text: str) -> str:
-    """Return the family that a text names: any case, with or without ``DICT_`` or ``tag``.
-
-    Raises:
-        InputError: unknown; the message lists the known ones.
-    """
+    """Return the family that a text names, in any case, with or without ``DICT_`` or ``tag``; InputError if unknown."""
     for name in FAMILIES:
         if text.lower() in (name.lower(), name.lower().removeprefix("dict_"), name.lower().removeprefix("tag")):
             return name
@@ -109,15 +105,9 @@ def _read_quickly(image: NDArray[np.uint8], family: str, border: int) -> tuple[l
 def detect_markers(
     image: NDArray[np.uint8], family: str, border: int = 1
 ) -> tuple[Sequence[NDArray[Any]], NDArray[Any]]:
-    """Find the markers of a family as OpenCV gives them.
+    """Find the markers of a family in a grey image (H, W): (1, 4, 2) corners of each in OpenCV's order, (n, 1) identities.
 
-    Args:
-        image: (H, W) grey image.
-        family: a name of FAMILIES.
-        border: width of the markers' dark border, cells.
-
-    Returns:
-        (1, 4, 2) corners of each marker, in OpenCV's order whatever the family; (n, 1) identities.
+    ``border``: width of their dark border, cells.
     """
     image = _full_range(image)
     share = round(4.0 * SIDE_MIN_PX / max(image.shape), 4)
@@ -232,17 +222,11 @@ def _without_repeats(corners: Array, identities: NDArray[Any]) -> list[int]:
 def find_squares(
     image: NDArray[np.uint8], family: str, border: int = 1, requested: Collection[int] | None = None
 ) -> list[tuple[int, Array]]:
-    """Find the markers of a family, upright by the convention of the family's name.
+    """Find the markers of a family in a grey image (H, W), upright by the convention of its name: identity, corners (4, 2).
 
-    Args:
-        image: (H, W) grey image.
-        family: a name of FAMILIES or of LAYOUTS.
-        border: width of the markers' dark border, cells.
-        requested: identities that are looked for: when the quick search reads all of them it is enough; all by default.
-
-    Returns:
-        Identity and rough corners (4, 2), raw pixels, of each marker seen: upper left, upper right, lower right, lower
-        left of the upright marker; of AprilTag 3's families those of the inner square.
+    Corners are rough, raw pixels: upper left, upper right, lower right, lower left; of AprilTag 3's families those of
+    the inner square. The quick search is enough where it reads all that are ``requested``. ``border``: of the dark
+    border, cells.
     """
     if family in LAYOUTS:
         return _find_apriltag3(image, family)

@@ -28,14 +28,7 @@ _ABOUT_X = np.diag([1.0, -1.0, -1.0, 1.0])
 
 @dataclass(frozen=True, eq=False)
 class MountedBoard(Record):
-    """One board on a body, seen from its face.
-
-    Attributes:
-        name: what its points are named after.
-        board: the board.
-        T_body_board: (4, 4) pose of the board's own frame on the body, m.
-        normal: (3,) out of its face, body frame.
-    """
+    """One board on a body: ``T_body_board`` (4, 4), m, and the ``normal`` (3,) out of its face, body frame."""
 
     name: str
     board: CalibrationBoard
@@ -45,12 +38,7 @@ class MountedBoard(Record):
 
 @dataclass(frozen=True, eq=False)
 class BoardTarget(Record, Target):
-    """A body found by its boards.
-
-    Attributes:
-        name: what the body is called.
-        boards: its boards.
-    """
+    """A body found by its boards."""
 
     name: str
     boards: tuple[MountedBoard, ...]
@@ -59,9 +47,8 @@ class BoardTarget(Record, Target):
     def from_markers(name: str, markers: Sequence[Marker]) -> BoardTarget:
         """Build the target from a body file's markers of kind ``board``.
 
-        Raises:
-            InputError: a malformed spec, a missing or unknown key, a board that looks the same when it is rotated, or
-                two boards of one body that may be taken for one another.
+        InputError: a malformed spec, a missing or unknown key, a board that looks the same when it is rotated, or two
+        boards of one body that may be taken for one another.
         """
         boards: list[MountedBoard] = []
         for marker in markers:
@@ -106,15 +93,7 @@ def _checked(spec: str) -> str:
 
 
 def check_codes(tags: Sequence[Marker], boards: Sequence[Marker]) -> None:
-    """Reject a tag that is also on a board of the same body: it would be detected twice, and the two are ambiguous.
-
-    Args:
-        tags: entries of kind ``tag``, already checked.
-        boards: entries of kind ``board``, already checked.
-
-    Raises:
-        InputError: such a tag; the message names it and the board.
-    """
+    """Reject a tag that is also on a board of the same body with InputError: it would be detected twice, ambiguously."""
     for entry in boards:
         family, ids = board_codes(open_board(entry.fields["spec"]))
         for tag in tags:

@@ -1,11 +1,8 @@
-"""Body files: which markers a rigid body carries, and where they are on it.
+"""Body files: which markers a rigid body carries, and where they are on it; the format is in docs/howto/targets.md.
 
-A TOML body file goes in, a :class:`Marker` for each ``[[markers]]`` entry comes out. This file reads what every kind of
-marker shares: name, position and orientation in the body frame. The table of a marker's own kind is read by that kind
-(``tag.py``, ``board_marker.py``, ``discs.py``). The checks that no body may fail follow: markers at one position,
-on one line, too few, or of an implausible size. Last, bodies as CSV tables of named points, in metres.
-
-The format: docs/howto/targets.md. How well a body can be located is a separate question: ``armsight body check``.
+A TOML body file goes in, a :class:`Marker` for each ``[[markers]]`` entry comes out, with what every kind shares: name,
+position and orientation in the body frame. The table of its kind is read by ``tag.py``, ``board_marker.py`` or
+``discs.py``. The checks that no body may fail follow; last, bodies as CSV tables of named points, in metres.
 """
 
 from __future__ import annotations
@@ -39,15 +36,9 @@ _POSE_KEYS = ("position_mm", "normal", "x_axis", "quaternion_wxyz", "euler_zyx_d
 
 @dataclass(frozen=True, eq=False)
 class Marker(Record):
-    """One ``[[markers]]`` entry of a body file.
+    """One ``[[markers]]`` entry of a body file: ``fields`` are the table of its ``kind``, ``where`` is for messages.
 
-    Attributes:
-        where: file and entry, for messages.
-        name: its name.
-        kind: its kind, the key of its own table.
-        fields: its own table.
-        position: (3,) its position, m, body frame.
-        orientation: what the file gives of its orientation: a subset of normal, x_axis, quaternion_wxyz, euler_zyx_deg.
+    ``position`` (3,) m, body frame; ``orientation`` is a subset of normal, x_axis, quaternion_wxyz, euler_zyx_deg.
     """
 
     where: str
@@ -93,11 +84,7 @@ class Marker(Record):
         return _unit(self, "normal") if set(self.orientation) == {"normal"} else -self.pose()[:3, 2]
 
     def pose(self) -> Array:
-        """Return T_body_marker (4, 4): x to the marker's right, y down, z into its face.
-
-        Raises:
-            InputError: the file gives no orientation, more than one, or a malformed one.
-        """
+        """Return T_body_marker (4, 4), x right, y down, z into its face; InputError without one well-formed orientation."""
         given = set(self.orientation)
         if given == {"normal", "x_axis"}:
             x, z = _unit(self, "x_axis"), -_unit(self, "normal")
@@ -124,14 +111,7 @@ def _unit(marker: Marker, key: str) -> Array:
 
 
 def read_body_file(path: str | Path, kinds: Collection[str]) -> tuple[str, tuple[Marker, ...]]:
-    """Read a body file.
-
-    Args:
-        path: the TOML file.
-        kinds: the kinds of marker that are known.
-
-    Returns:
-        The body's name (the file's, where none is given) and its markers.
+    """Read a body file of markers of known kinds: its name (the file's, where none is given) and its markers.
 
     Raises:
         InputError: missing, not TOML, or not a body; the message names the file and the entry.
@@ -207,16 +187,7 @@ _OPPOSED = -0.5
 
 
 def check_discs(markers: Sequence[Marker], radii_m: Sequence[float]) -> None:
-    """Reject discs of one body that cannot all exist.
-
-    Args:
-        markers: their entries in the body file.
-        radii_m: their radii, m.
-
-    Raises:
-        InputError: a radius or a distance that suggests a wrong unit, or two discs at one position; the message names
-            file and entry.
-    """
+    """Reject discs of radii ``radii_m`` that cannot all exist: a wrong unit, or two at one position (InputError)."""
     positions = np.array([marker.position for marker in markers])
     away = np.linalg.norm(positions - positions[0], axis=1)
     for marker, radius, distance in zip(markers, radii_m, away, strict=True):
@@ -243,15 +214,7 @@ def _back_to_back(one: Marker, other: Marker) -> bool:
 
 
 def check_points(path: str | Path, body: Body) -> None:
-    """Reject a body whose points cannot determine a pose.
-
-    Args:
-        path: its file, for the message.
-        body: all its points.
-
-    Raises:
-        InputError: fewer than three points, or all on one line.
-    """
+    """Reject a body whose points cannot determine a pose: fewer than three, or all on one line (InputError)."""
     count = len(body.points)
     if count < 3:
         raise InputError(
@@ -281,10 +244,7 @@ HEADERS = (
 
 
 def load_body_csv(path: str | Path) -> Body:
-    """Read a body from a table of its points.
-
-    Args:
-        path: CSV with a header of HEADERS and a line for each point.
+    """Read a body from a table of its points: CSV with a header of HEADERS and a line for each point.
 
     Raises:
         InputError: missing, malformed, not numbers, a name twice, fewer than three points, or a size that suggests a
@@ -329,11 +289,7 @@ def _coordinate(where: str, text: str) -> float:
 
 
 def save_body_csv(body: Body, path: str | Path) -> None:
-    """Write a body as a table of its points, metres, to the nanometre, in one step.
-
-    Raises:
-        InputError: the file cannot be written.
-    """
+    """Write a body as a table of its points, metres, to the nanometre, in one step; InputError if it cannot be written."""
     lines = [",".join(HEADERS[0])]
     lines += [
         f"{name},{x:.9f},{y:.9f},{z:.9f}"

@@ -33,12 +33,7 @@ _MOST_OFF = 0.1
 
 @dataclass(frozen=True, eq=False)
 class EstimatedBoard(Record, Target):
-    """A board whose points are where a calibration found them.
-
-    Attributes:
-        drawing: the board as its spec describes it.
-        points: (M, 3) positions of its points, m, board frame.
-    """
+    """The board of a spec, ``drawing``, whose points (M, 3), m, board frame, are where a calibration found them."""
 
     drawing: CalibrationBoard
     points: Array
@@ -65,27 +60,14 @@ class EstimatedBoard(Record, Target):
 
 
 def save_board_file(path: str | Path, spec: str, points: Array) -> None:
-    """Write a board file, to the nanometre, in one step.
-
-    Args:
-        path: the file.
-        spec: of the board.
-        points: (M, 3) positions of its points, m, board frame.
-
-    Raises:
-        InputError: the file cannot be written.
-    """
+    """Write a board file of points (M, 3), m, board frame, to the nanometre; InputError if it cannot be written."""
     rows = ",\n".join(f"  [{', '.join(f'{1e3 * x + 0.0:.6f}' for x in row)}]" for row in points.tolist())
     head = f"# The board as armsight calibrate found it: armsight measure --target {Path(path).name}\nversion = {VERSION}\n"
     write_text(path, f"{head}board = {json.dumps(spec)}\npoints_mm = [\n{rows},\n]\n")
 
 
 def load_board_file(path: str | Path) -> EstimatedBoard:
-    """Read a board file.
-
-    Raises:
-        InputError: missing, malformed, or points that are not those of the board; the message names the file.
-    """
+    """Read a board file; InputError where it is missing, malformed or its points are not those of the board."""
     document = read_toml(path)
     if unknown := document.keys() - {"version", "board", "points_mm"}:
         raise InputError(f"{path}: unknown key {min(unknown)!r}; a board file has version, board and points_mm")

@@ -43,16 +43,7 @@ _TO_M = 5e-4  # m; sides of unknown markers are given to this; half: digits that
 
 @dataclass(frozen=True, eq=False)
 class Charuco(Record, CalibrationBoard):
-    """A chessboard with markers in its bright squares.
-
-    Attributes:
-        columns: squares along x.
-        rows: squares along y.
-        square_m: side of a square, m.
-        marker_m: side of a marker, m.
-        family: the markers' family.
-        first: number of its first marker; the others follow.
-    """
+    """A chessboard of columns x rows squares with markers of a family, numbered from ``first`` on, in its bright ones."""
 
     columns: int
     rows: int
@@ -211,11 +202,10 @@ class Charuco(Record, CalibrationBoard):
     def _sides(
         self, corners: Array, outlined: NDArray[np.bool_], identities: NDArray[Any], legacy: bool
     ) -> tuple[float, float, float]:
-        """Compare the markers with where one of OpenCV's layouts has them.
+        """Compare the markers with where one of OpenCV's layouts has them; infinite and NaN where too few are.
 
-        Returns:
-            How far off the middles of the markers are, squares; the side of a marker, m; pixels a metre: medians of all
-            markers that have neighbours, the side of those that are outlined. Infinite and NaN where too few are.
+        Return how far off their middles are, squares; the side of a marker, m, of those that are outlined; pixels a
+        metre: medians.
         """
         layout = marker_corners((self.columns, self.rows), self.square_m, self.marker_m, self.family, legacy)
         known = [k for k, identity in enumerate(identities.ravel()) if 0 <= identity < len(layout)]

@@ -44,13 +44,7 @@ _ENDS = ((np.s_[0], np.s_[1]), (np.s_[-1], np.s_[-2]), (np.s_[:, 0], np.s_[:, 1]
 
 @dataclass(frozen=True, eq=False)
 class Chessboard(Record, CalibrationBoard):
-    """A chessboard; its points are the inner corners, row by row.
-
-    Attributes:
-        columns: inner corners along x.
-        rows: inner corners along y.
-        square_m: side of a square, m.
-    """
+    """A chessboard; its points are the columns x rows inner corners, row by row."""
 
     columns: int
     rows: int
@@ -174,15 +168,9 @@ def _search_copy(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], float]:
 
 
 def fit_grid(image: NDArray[np.uint8], rough: Array, arm: float = 1.0) -> CornerFits:
-    """Fit the corners of a grid, each window shaped by its neighbours: a rough fit first, then one that starts from it.
+    """Fit the corners of a grid from rough pixel positions (rows, columns, 2), NaN where none: roughly, then from there.
 
-    Args:
-        image: (H, W) grey image.
-        rough: (rows, columns, 2) rough pixel positions; NaN where there is none.
-        arm: as in :func:`~armsight.vision.markers.corner.refine_corners`.
-
-    Returns:
-        The fits row by row; one without a rough position is not kept.
+    Each window is shaped by its neighbours; ``arm`` as in :func:`~armsight.vision.markers.corner.refine_corners`.
     """
     rough_uv = rough.reshape(-1, 2)
     first = refine_corners(image, rough_uv, local_squares(rough)[0].reshape(-1, 2, 2), arm=arm, rough=True)
@@ -221,12 +209,8 @@ def extends_beyond(
 ) -> bool:
     """Return whether a further row or column of corners follows where the board should end: the board exceeds its spec.
 
-    Args:
-        image: (H, W) grey image.
-        fits: of the board's corners, row by row.
-        kept: (M,) whether each of them is good.
-        colours: (M,) +1 and -1 alternately: the signs of the corners' contrast.
-        shape: (rows, columns).
+    ``kept`` (M,): which of the fits, row by row of ``shape``, are good; ``colours`` (M,): +1 and -1, the signs of the
+    contrast.
     """
     uv = np.where(kept[:, None], fits.uv, np.nan).reshape(*shape, 2)
     squares = local_squares(uv)[0]

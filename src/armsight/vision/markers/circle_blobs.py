@@ -58,16 +58,9 @@ def _level(image: Grey, u: float, v: float) -> float:
 
 @kernel
 def _rim_contrast(image: Grey, theta: Array, sign: int, across: Array) -> tuple[float, bool]:
-    """Compare grey inside and outside an ellipse.
+    """Compare grey inside and outside an ellipse, theta (10,), by buffer ``across`` (_RAYS,); ``sign`` 1 for a bright disc.
 
-    Args:
-        image: (H, W) grey.
-        theta: (10,) the ellipse: centre and M.
-        sign: 1 for a bright disc, -1 for a dark one.
-        across: (_RAYS,) buffer.
-
-    Returns:
-        The median contrast in grey levels, 0 where it is no closed rim; whether the middle has the surround's level.
+    Return the median contrast, grey levels, 0 where it is no closed rim; whether the middle has the surround's level.
     """
     det = theta[2] * theta[4] - theta[3] * theta[3]
     s11, s12, s22 = theta[4] / det, -theta[3] / det, theta[2] / det
@@ -105,9 +98,8 @@ def _outlines(
 ) -> int:  # fmt: skip
     """Search an image for outlines of discs; return their number.
 
-    Filled are ``starts`` (N, 10), the outlines: centre, M, blur, contrast, base, gradient; ``signs`` (N,), 1 for bright
-    ones, -1 for dark ones; and ``contrast`` (N,), grey levels. The others are those of
-    :func:`~armsight.vision.markers.disc.search.search`.
+    ``starts`` (N, 10), ``signs`` (N,), 1 or -1 for dark ones, and ``contrast`` (N,), grey levels, are filled; the
+    others are those of :func:`~armsight.vision.markers.disc.search.search`.
     """
     n, _ = search(image, words, noise_of(image), bright, dark, starts, codes, signs, room)
     across, good = np.empty(_RAYS), 0
@@ -218,17 +210,7 @@ _ODD_SHARE = 0.3
 def _fit_each(
     image: Grey, theta: Array, cov: Array, shape: Array, codes: NDArray[np.int64], shared: Array, work: FitBuffers
 ) -> None:
-    """Fit discs.
-
-    Args:
-        image: (H, W) grey.
-        theta: (N, 10) starts, replaced by the results.
-        cov: (N, 2, 2) filled with the covariance of the centres, px^2; also of those with a harmless reason.
-        shape: (N, 3) filled with the ellipses S11, S12, S22, px^2.
-        codes: (N,) filled with 0 or the reason why it is not a disc (``fit.REASONS``).
-        shared: (SHARED,) filled with what they have in common (``disc.common``).
-        work: buffers.
-    """
+    """Fit discs from ``theta`` (N, 10), which is replaced; the arrays of :class:`Fits` are filled."""
     noise, count = noise_of(image), 0
     for i in range(len(theta)):
         codes[i] = fit(image, noise, theta[i], cov[i], work)
@@ -299,12 +281,7 @@ class Fits(Record):
 
 
 def odd_sized(theta: Array, factor: float) -> NDArray[np.bool_]:
-    """(N,) whether a disc's area is far from what the others' areas, linear over the image, let expect.
-
-    Args:
-        theta: (N, 10) discs of one grid.
-        factor: by which an area may be larger or smaller, beyond what is usual among them.
-    """
+    """(N,) whether a disc's area is off by more than ``factor`` from that of the others, linear over the image."""
     area, uv = -0.5 * np.log(np.maximum(theta[:, 2] * theta[:, 4] - theta[:, 3] ** 2, 1e-300)), theta[:, :2]
     keep = np.ones(len(area), bool)
     basis = np.column_stack([np.ones(len(area)), (uv - uv.mean(axis=0)) / max(float(np.ptp(uv)), 1.0)])
@@ -320,15 +297,10 @@ def odd_sized(theta: Array, factor: float) -> NDArray[np.bool_]:
 
 
 def contrasts(image: Grey, theta: Array, sign: int) -> tuple[Array, NDArray[np.bool_]]:
-    """Compare grey inside and outside of ellipses.
+    """Compare grey inside and outside of ellipses theta (N, 10); ``sign`` 1 for bright discs, -1 for dark ones.
 
-    Args:
-        image: (H, W) grey.
-        theta: (N, 10) the ellipses.
-        sign: 1 for bright discs, -1 for dark ones.
-
-    Returns:
-        (N,) contrast in grey levels, 0 where the rim is not closed; (N,) whether the middle has the surround's level.
+    Return (N,) contrast in grey levels, 0 where the rim is not closed; (N,) whether the middle has the surround's
+    level.
     """
     contrast, hollow = np.empty(len(theta)), np.empty(len(theta), bool)
     _each_contrast(np.ascontiguousarray(image), np.ascontiguousarray(theta), sign, contrast, hollow)

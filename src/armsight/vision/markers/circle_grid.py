@@ -38,11 +38,8 @@ Cell: TypeAlias = tuple[int, int]
 class Lattice(Record):
     """Discs that hang together as a square lattice, right-handed in the image (x to the right, y down).
 
-    Attributes:
-        cells: (N, 2) their integer positions.
-        blobs: (N,) rows of the outlines.
-        weight: how much speaks for it: its discs, fewer the more unevenly they stand, and the more they are than the
-            board has. Texture may be large, but not even.
+    ``cells`` (N, 2) integer positions, ``blobs`` (N,) rows of the outlines; ``weight``: the number of discs, less the
+    more unevenly they stand and the more they are than the board has. Texture may be large, but not even.
     """
 
     cells: Ids
@@ -51,12 +48,7 @@ class Lattice(Record):
 
 
 def grow_lattices(blobs: Blobs, count: int) -> list[Lattice]:
-    """Assemble lattices from outlines, the best first.
-
-    Args:
-        blobs: the outlines.
-        count: of the board's discs. No further seeds are tried once a lattice has nearly the weight of so many.
-    """
+    """Assemble lattices from outlines, best first; none after one has nearly the weight of the board's ``count`` discs."""
     if len(blobs.theta) < 4:
         return []
     beside = _neighbours(blobs)
@@ -194,15 +186,7 @@ def _beside(cell: Cell) -> list[Cell]:
 
 
 def extrapolated(cell: Cell, known: Mapping[Cell, complex]) -> tuple[complex, float] | None:
-    """Predict where a cell of a lattice is from the positions of cells nearby.
-
-    Args:
-        cell: the cell.
-        known: positions u + iv, px, of cells.
-
-    Returns:
-        The position, px, and the step from its neighbours, px; None where nothing beside it is known.
-    """
+    """Predict where a cell of a lattice is from positions u + iv, px, of cells nearby, and the step there, px."""
     x, y = cell
     guesses: list[complex] = []
     steps: list[float] = []
@@ -268,12 +252,9 @@ _SKIPPED = 1.5
 
 @dataclass(frozen=True, eq=False)
 class GridLayout(Record):
-    """The cells of a board's discs on a square lattice.
+    """The ``cells`` (M, 2) of a board's discs on a square lattice, in its points' order, and which are ``rings`` (M,).
 
-    Attributes:
-        cells: (M, 2) integer positions, in the order of the board's points.
-        rings: (M,) whether a disc is a ring.
-        symmetries: permutations (M,) under which the board looks the same, without identity.
+    ``symmetries``: permutations (M,) under which the board looks the same, without identity.
     """
 
     cells: Ids
@@ -283,13 +264,9 @@ class GridLayout(Record):
 
 @dataclass(frozen=True, eq=False)
 class Placement(Record):
-    """Which discs of a board a lattice shows.
+    """Which discs of a board a lattice shows: ``ids`` (N,), -1 beside the board; ``lost``: discs in view but not found.
 
-    Attributes:
-        ids: (N,) the board's disc at each position of the lattice, -1 beside the board.
-        lost: how many discs of the board should be in view and were not found.
-        wrong: how much speaks against it: discs missing or too many, rings in the wrong position.
-        rings_wrong: rings in the wrong position.
+    ``wrong`` counts discs missing or too many and, weighted, rings in the wrong position.
     """
 
     ids: Ids
@@ -301,18 +278,10 @@ class Placement(Record):
 def number_cells(
     cells: Ids, theta: Array, hollow: NDArray[np.bool_], layout: GridLayout, size_px: tuple[int, int]
 ) -> Placement | str:
-    """Find which part of a board a lattice shows.
+    """Find which part of a board a lattice shows: the placement that explains most, or the reason why there is none.
 
-    Args:
-        cells: (N, 2) the lattice's cells.
-        theta: (N, 10) its discs, as in :class:`~armsight.vision.markers.circle_blobs.Blobs`.
-        hollow: (N,) whether a disc has a hole.
-        layout: the board.
-        size_px: width and height of the image.
-
-    Returns:
-        The placement that explains most, of several that are equivalent under the board's symmetries any one; or the
-        reason why there is none.
+    ``cells`` (N, 2) with discs ``theta`` (N, 10), ``hollow`` (N,) those with a hole. Of placements that are equivalent
+    under the board's symmetries any one is returned.
     """
     predicted, _ = expected(cells, theta, size_px)
     origin = layout.cells.min(axis=0) - 1
@@ -362,10 +331,6 @@ def skips_line(cells: Ids, theta: Array) -> bool:
 
     Three lines left of four fit a projection as well, one numbered wrongly. Steps are measured by the discs they lead to:
     in coordinates in which these are unit circles, one across a line that is missing is twice as long as others.
-
-    Args:
-        cells: (N, 2) the lattice's cells.
-        theta: (N, 10) its discs, as in :class:`~armsight.vision.markers.circle_blobs.Blobs`.
     """
     at = {(x, y): i for i, (x, y) in enumerate(cells.tolist())}
     steps: dict[tuple[int, int], list[float]] = {}
@@ -386,11 +351,6 @@ def shown_size(cells: Ids, *, staggered: bool, like: tuple[int, int]) -> tuple[i
 
     Outer lines that lack more than a tenth of the discs of the next ones (in a staggered grid the next but one) are not of
     the grid.
-
-    Args:
-        cells: (N, 2) the lattice's cells.
-        staggered: whether the lattice lies diagonally in the grid.
-        like: columns and rows of the board.
 
     Returns:
         None where the lattice fills no grid.
@@ -421,16 +381,7 @@ def positions(cells: Ids, uv: Array) -> dict[Cell, complex]:
 
 
 def expected(cells: Ids, theta: Array, size_px: tuple[int, int]) -> tuple[Ids, Array]:
-    """Predict where discs next to those of a lattice would be, as far as they would be in the image.
-
-    Args:
-        cells: (N, 2) the lattice's cells.
-        theta: (N, 10) its discs.
-        size_px: width and height of the image.
-
-    Returns:
-        (K, 2) further cells; (K, 2) where they would be, px.
-    """
+    """Predict discs next to those, theta (N, 10), of a lattice's cells (N, 2) in the image: (K, 2) cells, (K, 2) px."""
     seen = positions(cells, theta[:, :2])
     radius_px = float(np.median(theta[:, 2] * theta[:, 4] - theta[:, 3] ** 2) ** -0.25)
     known, front = dict(seen), set(seen)

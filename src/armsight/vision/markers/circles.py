@@ -70,16 +70,9 @@ POLARITIES = {False: "dark", True: "light"}
 
 @dataclass(frozen=True, eq=False)
 class CircleGrid(Record, CalibrationBoard):
-    """A grid of discs.
+    """A grid of discs, ``pitch_m`` apart; ``disc_radius_m`` and ``light`` (on a dark board) are None if the spec is silent.
 
-    Attributes:
-        columns: discs in a row.
-        rows: rows.
-        pitch_m: distance of the grid's lines, m.
-        staggered: whether every other row is shifted by a pitch.
-        disc_radius_m: radius of a disc, m; None where the spec does not give it.
-        light: whether the discs are light on a dark board; None where the spec does not say.
-        rings: (column, row) of the discs that have a hole.
+    ``staggered``: every other row is shifted by a pitch. ``rings``: (column, row) of the discs that have a hole.
     """
 
     columns: int
@@ -229,15 +222,7 @@ class CircleGrid(Record, CalibrationBoard):
 
 
 def unseen_row(target: Target, seen: Sequence[Ids]) -> tuple[str, ...]:
-    """Say which outer row of a grid of discs no image shows: the board may have a row less than its spec says.
-
-    Args:
-        target: anything; of other targets nothing is said.
-        seen: the discs that were found in each image that shows the board.
-
-    Returns:
-        One note, or none.
-    """
+    """Note which outer row of a grid of discs no image shows: the board may have a row less than its spec says."""
     if not isinstance(target, CircleGrid) or len(seen) < _IMAGES:
         return ()
     rows = np.unique(np.concatenate(list(seen)) // target.columns)
@@ -256,9 +241,8 @@ def _completed(
 ) -> tuple[Ids, Array, NDArray[np.bool_]]:
     """Replace the odd outlines of a grid by what their neighbours let expect, and add discs that the search missed.
 
-    In: its cells (N, 2) and outlines ``theta`` (N, 10) in a grey image (H, W); ``sign`` is 1 for light discs, -1 for dark
-    ones; ``rings``: whether the board has rings, of which a part may have been taken for a disc. Out: cells (M, 2),
-    outlines (M, 10), and whether a disc has a hole (M,).
+    In and out: cells (N, 2), outlines ``theta`` (N, 10), and whether a disc has a hole (N,). ``sign``: 1 for light
+    discs; ``rings``: whether the board has rings, of which a part may have been taken for a disc.
     """
     kept = ~odd_sized(theta, _ODD_OUTLINE)
     if rings:

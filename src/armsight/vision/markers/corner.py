@@ -68,19 +68,9 @@ def gather(
 ) -> int:
     """Collect the pixels of the window about a corner: those near an edge into w, the others into the moments.
 
-    Args:
-        image: (H, W) grey image.
-        c: (2,) the corner; pixel positions are relative to the nearest whole pixel.
-        square: (2, 2) the sides of the square at it, px.
-        bow: (2, 2) how the edges bow, 1/px.
-        arm: as in ``refine_corners``.
-        most: how far the window extends along the sides at most, px.
-        near: (2,) distance from each edge below which a pixel counts as near it, px.
-        w: (WORK,) receives x, y and grey of the pixels near the edges.
-        flat: (2, MOMENTS) receives the moments of those of plain squares.
-
-    Returns:
-        The number of pixels near the edges.
+    c (2,) is the corner, from the nearest whole pixel; square (2, 2) the sides there, px; bow (2, 2), 1/px; ``arm`` as
+    in ``refine_corners``; ``most`` the window's extent, px; near (2,) px from an edge. w (WORK,) receives x, y and
+    grey, flat (2, MOMENTS) the moments of plain squares. Return the number of pixels near the edges.
     """
     height, width = image.shape
     s1, s2 = np.hypot(square[0, 0], square[0, 1]), np.hypot(square[1, 0], square[1, 1])
@@ -262,9 +252,8 @@ def _fit_one(
 ) -> int:
     """Fit one corner, from q where that is known, else from a given blur; q, w and L are left at the solution.
 
-    origin (2,) receives the pixel to which those of w are relative.
-
-    Return the number of pixels near the edges that were fitted, or minus the outcome.
+    origin (2,) is the pixel to which w is relative. Return the number of fitted pixels near the edges, or minus the
+    outcome.
     """
     if not np.isfinite(start[0] + start[1] + square.sum()):
         return -_BORDER
@@ -357,16 +346,10 @@ def _pixels(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def crossing_signs(image: NDArray[np.uint8], uv: Array, squares: Array) -> Array:
-    """Find where squares of two colours may meet crosswise, by a quick test.
+    """Find where squares of two colours, sides (N, 2, 2) px, may meet crosswise at uv (N, 2), right to a quarter square.
 
-    Args:
-        image: (H, W) grey image.
-        uv: (N, 2) raw pixels, right to a quarter of a square.
-        squares: (N, 2, 2) the two sides of the square at each position, px.
-
-    Returns:
-        (N,) 1 where a patch in the square between the first and the second side, and one in the opposite square, are
-        both brighter than those in the other two, -1 where they are darker, 0 elsewhere.
+    Return (N,) 1 where a patch in the square between the first and the second side, and one in the opposite square, are
+    both brighter than those in the other two, -1 where they are darker, 0 elsewhere.
     """
     out = np.zeros(len(uv))
     _quick_signs(_pixels(image), uv, squares, out)
@@ -403,21 +386,16 @@ def refine_corners(
     rough: bool = False,
     like: CornerFits | None = None,
 ) -> CornerFits:
-    """Fit X corners.
+    """Fit X corners, rough at uv (N, 2) to a few pixels and a quarter of a square, in their order.
 
     Args:
         image: (H, W) grey image.
-        uv: (N, 2) rough corners, raw pixels, right to a few pixels and a quarter of a square.
+        uv: (N, 2) raw pixels.
         squares: (N, 2, 2) the two sides of the square at each corner, px: along the columns, along the rows.
-        bows: (N, 2, 2) how each of the two edges bows, 1/px: a point t px along it lies ``t^2 * bow`` off its tangent;
-            straight by default.
-        arm: how far from the edges the squares are plain, as a share of a side; pixels further from both edges are
-            ignored. The squares of a charuco board are plain only along their sides.
-        rough: fit a share of the pixels only, in half the time; good to some hundredths of a pixel, without covariance.
-        like: earlier fits of the same corners at uv; the fits start from those it kept, in half the time.
-
-    Returns:
-        The fits, in the order of uv.
+        bows: (N, 2, 2) of the edges, 1/px: a point t px along one lies ``t^2 * bow`` off its tangent; straight by default.
+        arm: how far from the edges squares are plain, as a share of a side (of charuco boards, along their sides only).
+        rough: fit a share of the pixels, in half the time; good to some hundredths of a pixel, without covariance.
+        like: earlier fits at uv, from which those start that it kept, in half the time.
     """
     n = len(uv)
     uv, squares = np.ascontiguousarray(uv, dtype=np.float64), np.ascontiguousarray(squares, dtype=np.float64)
@@ -446,11 +424,7 @@ def _effective(noise: Array, gains: Array) -> Array:
     """Return the variance of white noise that would move each corner as far as the image's noise does, grey levels squared.
 
     What the fits absorb of the noise lowers the residuals' products at all lags; white noise shows by how much.
-
-    Args:
-        noise: (3, LAGS + 1, 2 LAGS + 1) of all corners: products of odd residuals at each lag, their weights, and what
-            white noise of unit variance leaves of the products.
-        gains: (N, LAGS + 1, 2 LAGS + 1) autocorrelation of each corner's derivatives by grey levels.
+    ``noise`` and the corners' ``gains`` as :func:`~armsight.vision.markers.crossing.edge_noise` fills them.
     """
     both = np.full(gains.shape[1:], 2.0)  # each lag below the first row is that of two neighbours, above and below
     both[0, :LAGS], both[0, LAGS] = 0.0, 1.0

@@ -1,7 +1,6 @@
 """Plain discs: which discs a body carries, and where one image shows discs.
 
-Discs carry no code. One camera alone measures only where discs are; which of the body's discs each one is follows from
-both cameras and the body's geometry together (:mod:`~armsight.vision.discs.identify`).
+Discs carry no code: which of the body's each one is follows from both cameras (:mod:`~armsight.vision.discs.identify`).
 """
 
 from __future__ import annotations
@@ -53,11 +52,7 @@ class DiscTarget(Record):
 
     @staticmethod
     def from_markers(name: str, markers: Sequence[Marker]) -> DiscTarget:
-        """Make the target of a body file's discs: ``disc = { radius_mm = 8.0, bright = true }``.
-
-        Raises:
-            InputError: an unknown or missing key, a malformed radius; the message names file and entry.
-        """
+        """Make the target of a file's discs: ``disc = { radius_mm = 8.0, bright = true }``; InputError names the entry."""
         radii, bright, normals = [], [], []
         for marker in markers:
             marker.check_keys("disc", ("radius_mm",), ("bright",))
@@ -136,11 +131,7 @@ def enlarged(theta: Array, scale: int) -> Array:
 
 
 def _larger(image: NDArray[np.uint8], bright: bool, dark: bool) -> tuple[Array, NDArray[np.int64]]:
-    """Look for discs that are too large for the search, in copies of half the size, a quarter, ...
-
-    Returns:
-        (K, 10) starts for the fit in the image itself, (K,) 1 for bright ones, -1 for dark ones.
-    """
+    """Look for discs too large for the search in smaller copies: (K, 10) starts for the fit, (K,) 1 bright, -1 dark."""
     if not hasattr(_KEPT, "outlines"):
         n = _MOST_CANDIDATES
         _KEPT.outlines = np.empty((n, fit.UNKNOWNS)), np.empty(n, np.int64), np.empty(n, np.int64), search.workspace()

@@ -61,10 +61,8 @@ class Target(Protocol):
 def detect_parts(image: Image, parts: Iterable[tuple[str, Target]], nothing: str = "") -> Detections:
     """Find the parts of a body in one grey image (H, W) whose points follow one another in the body.
 
-    Args:
-        image: (H, W) uint8.
-        parts: what the reason of a part that is not found begins with, and the part.
-        nothing: the reason where there is no part.
+    Each of ``parts`` is what the reason begins with if it is not found, and the part; ``nothing`` is the reason without
+    parts.
     """
     first, found, problems = 0, list[Detections](), list[str]()
     for name, part in parts:

@@ -82,11 +82,7 @@ def _extremes(image: Grey, low: Grey, high: Grey) -> float:
 
 @kernel
 def _threshold(image: Grey, dark: Grey) -> NDArray[np.bool_]:
-    """Mark dark pixels in ``dark`` (H + 2, W + 2), a border of one pixel around the image, zero before.
-
-    Returns:
-        (H + 2,) whether a row may have dark pixels.
-    """
+    """Mark dark pixels in ``dark`` (H + 2, W + 2), zero before; (H + 2,) whether a row may have some."""
     height, width = image.shape
     rows, columns = (height + _TILE - 1) // _TILE, (width + _TILE - 1) // _TILE
     low, high = np.empty((rows + 2, columns + 2), np.uint8), np.empty((rows + 2, columns + 2), np.uint8)
@@ -113,16 +109,9 @@ def _threshold(image: Grey, dark: Grey) -> NDArray[np.bool_]:
 def _follow(dark: Grey, start: int, stride: int, at: NDArray[np.int32]) -> tuple[int, int]:
     """Follow the border of a dark region from the left side of the pixel ``start``, the region to the right.
 
-    Pixels with only a corner in common are not connected. Left sides that are passed are marked in ``dark``.
-
-    Args:
-        dark: (N,) pixels, row by row.
-        start: a dark pixel whose left neighbour is not.
-        stride: pixels in a row.
-        at: (2, M) filled with the middles of the border's steps, two times their column and row.
-
-    Returns:
-        The number of steps, or M + 1 where they are more; the area inside, px^2, negative for a hole.
+    Pixels with only a corner in common are not connected. Left sides that are passed are marked in ``dark`` (N,), of
+    rows ``stride`` long; at (2, M) receives the middles of the steps, twice column and row. Return the number of steps,
+    or M + 1 where they are more; the area inside, px^2, negative for a hole.
     """
     most, n, area = at.shape[1], 0, 0
     point, way = start + stride, 0  # a pixel's upper left corner, and up, right, down or left
@@ -266,16 +255,10 @@ def _quad(n: int, at: NDArray[np.int32], area: float, quad: Array) -> bool:
 
 @kernel("const u1[:, ::1], u1[:, ::1], i4[:, ::1], f8[:, :, ::1]")
 def outlines(image: Grey, dark: Grey, at: NDArray[np.int32], quads: Array) -> tuple[int, int]:
-    """Find the dark quadrilaterals of an image.
+    """Find the dark quadrilaterals of an image, quads (N, 4, 2), corners clockwise as seen, px.
 
-    Args:
-        image: (H, W) grey.
-        dark: (H + 2, W + 2) zeros; overwritten.
-        at: (2, M) room for a border of so many steps.
-        quads: (N, 4, 2) filled with corners, clockwise as seen, px.
-
-    Returns:
-        Their number, and how many dark regions are large enough for a marker.
+    dark (H + 2, W + 2), zeros, is overwritten; at (2, M) is room for a border of M steps. Return their number, and how
+    many dark regions are large enough for a marker.
     """
     some, pixels, stride, count, regions = _threshold(image, dark), dark.reshape(-1), dark.shape[1], 0, 0
     for y in range(1, dark.shape[0] - 1):
@@ -318,10 +301,9 @@ def square_to_quad(quad: Array, H: Array) -> None:
 
 @kernel
 def _cells_seen(image: Grey, quad: Array, spread: float, seen: Array) -> None:
-    """Sample the cells of a marker with corners ``quad`` (4, 2), px, and a ring around it.
+    """Sample the cells of a marker with corners ``quad`` (4, 2), px, and a ring around it, into seen (N + 2, N + 2).
 
-    seen (N + 2, N + 2) is filled with the mean of three by three samples, ``spread`` cells apart, in each cell and of the
-    ring.
+    Each is the mean of three by three samples, ``spread`` cells apart.
     """
     height, width = image.shape
     H, count = np.empty((3, 3)), len(seen)
@@ -373,13 +355,8 @@ _NONE, _ONE = np.uint64(0), np.uint64(1)
 def _match(seen: Array, border: int, level: Array, shift: float, codes: NDArray[np.uint64], allowed: int) -> int:
     """Return 4 times the number of the code that cells show, plus its rotation; -1 where there is none.
 
-    Args:
-        seen: (N + 2, N + 2) cells and a ring around them.
-        border: width of the dark border, cells.
-        level: (3,) plane above which a cell is bright.
-        shift: added to it.
-        codes: (M, 4) codes in four rotations.
-        allowed: cells that may be wrong.
+    seen (N + 2, N + 2) has a ring around the cells, bright above the plane ``level`` (3,) + ``shift``; up to
+    ``allowed`` cells may be wrong.
     """
     count, half, code = len(seen), 0.5 * (len(seen) - 1), np.uint64(0)
     for j in range(border + 1, count - border - 1):
@@ -402,16 +379,11 @@ def _match(seen: Array, border: int, level: Array, shift: float, codes: NDArray[
 def read_codes(
     image: Grey, quads: Array, codes: NDArray[np.uint64], cells: int, border: int, allowed: int, found: Ids
 ) -> None:
-    """Read the codes of quadrilaterals.
+    """Read the codes of quadrilaterals (K, 4, 2), px, clockwise as seen.
 
-    Args:
-        image: (H, W) grey.
-        quads: (K, 4, 2) corners, clockwise as seen, px.
-        codes: (M, 4) codes of the family in four rotations, row by row, the first cell in the highest bit.
-        cells: N along a side, border included.
-        border: width of the dark border, cells.
-        allowed: cells that may be wrong.
-        found: (K,) filled with four times the number of the code plus its rotation, -1 for what is no marker.
+    codes (M, 4): the family's in four rotations, row by row, the first cell in the highest bit; ``cells``: along a
+    side, with the border; ``allowed``: that may be wrong. found (K,) receives four times the number of the code plus
+    its rotation, -1 for no marker.
     """
     seen, dark, white, level = np.empty((cells + 2, cells + 2)), np.empty(3), np.empty(3), np.empty(3)
     for k in range(len(quads)):

@@ -13,13 +13,10 @@ _NUMBER = r"[0-9]+(?:\.[0-9]*)?(?:e-?[0-9]+)?|\.[0-9]+"
 
 @dataclass(frozen=True)
 class Fields:
-    """The fields of one board spec, read in order by their kind.
+    """The fields of one board spec, read in order by their kind: ``values`` are the texts between the colons after it.
 
-    Attributes:
-        spec: the whole spec, for messages.
-        form: the form it must have, up to the first space, then an explanation for messages; ``[:OPTION...]`` at its end
-            where options may follow.
-        values: the texts between the colons after the kind.
+    ``form``: what it must look like, up to the first space, then an explanation for messages; ``[:OPTION...]`` at its
+    end where options may follow.
     """
 
     spec: str
@@ -37,11 +34,7 @@ class Fields:
         return self.form.split()[0].partition("[")[0].count(":")
 
     def options(self, *known: str) -> dict[str, str]:
-        """Read what follows the fields: the names of options, and their values where they have one (``name=value``).
-
-        Args:
-            known: names, with a trailing ``=`` where a value belongs to them.
-        """
+        """Read what follows the fields: names, those known with a trailing ``=`` with values (``name=value``)."""
         found: dict[str, str] = {}
         for text in self.values[self._count :]:
             name, equals, value = text.partition("=")

@@ -189,17 +189,10 @@ def _assemble(n: int, px: Array, grid: Array, prior: Array, q: Array, J: Array, 
 
 @kernel
 def _minimise(n: int, px: Array, grid: Array, prior: Array, stop: float, q: Array, J: Array, inverse: Array) -> bool:
-    """Minimise from q by Levenberg-Marquardt; whether it settles.
+    """Minimise from q (18,) by Levenberg-Marquardt, px and grid as in ``_fill``; whether it settles.
 
-    Args:
-        n: number of pixels.
-        px: as in ``_fill``.
-        grid: as in ``_fill``.
-        prior: (15, 2) mean and weight of the parameters' priors.
-        stop: a step is the last when it lowers the cost by less than so many times one pixel's noise.
-        q: (18,) start, and solution.
-        J: (blocks, 19, _BLOCK) filled with derivatives and residuals.
-        inverse: (18, 18) filled with that of the normal matrix.
+    prior (15, 2): mean and weight; ``stop``: a step is the last when it lowers the cost by less, in one pixel's noise.
+    Filled are J (blocks, 19, _BLOCK), derivatives and residuals, and inverse (18, 18), of the normal matrix.
     """
     A, T = np.empty((PARAMETERS + 1, PARAMETERS + 1)), np.empty((PARAMETERS + 1, PARAMETERS + 1))
     L, step, trial = np.zeros((PARAMETERS, PARAMETERS)), np.empty(PARAMETERS), np.empty(PARAMETERS)
@@ -334,18 +327,9 @@ def _gather(
 ) -> int:  # fmt: skip
     """Collect up to ``most`` pixels of a marker and its margin, px (N, 8) as in ``_fill``; return their number.
 
-    Those from which no edge of a cell is near are thinned: they say nothing of where the marker is.
-
-    Args:
-        image: (H, W) grey.
-        corners: (4, 2) of the marker.
-        inverse: (3, 3) homography from the image to the marker, its scale positive before the horizon.
-        grid: its cells, as in ``_fill``.
-        whole: whether pixels beyond the corners count.
-        most: pixels.
-        near: how far an edge is seen, px.
-        px: filled.
-        at: (N, 2) filled with their columns and rows.
+    Those from which no edge of a cell is near, within ``near`` px, are thinned. corners (4, 2); inverse (3, 3)
+    homography from the image to the marker, its scale positive before the horizon; ``whole``: pixels beyond the corners
+    count; at (N, 2) receives columns and rows.
     """
     area, size_of = 0.0, np.array([image.shape[1], image.shape[0]])
     for k in range(4):
@@ -408,14 +392,8 @@ def _corners(q: Array, H: Array, uv: Array, by_field: Array) -> None:
 def _correlated(n: int, at: Ids, left: Array) -> float:
     """Return by how much the variance of a fit's result grows because the noise of neighbouring pixels is correlated.
 
-    Args:
-        n: number of pixels.
-        at: (N, 2) their columns and rows.
-        left: (N + 1, 4) one, the residuals, and derivatives of two results by the pixels' grey levels; zeros.
-
-    Returns:
-        The mean over the results, one at least. The noise's autocovariance is that of the residuals, over up to four
-        pixels.
+    at (N, 2): columns and rows; left (N + 1, 4): one, the residuals, and derivatives of two results by grey levels. The
+    mean over both, one at least; the autocovariance is that of the residuals, over up to four pixels.
     """
     x0, y0, x1, y1 = at[0, 0], at[0, 1], at[0, 0], at[n - 1, 1]
     for i in range(n):
@@ -500,18 +478,10 @@ def _fit_from(
 
 @kernel("const u1[:, ::1], const f8[:, ::1], const f8[:, ::1], b1, f8[:, ::1], f8[:, :, ::1]")
 def fit_marker(image: NDArray[np.uint8], corners: Array, grid: Array, whole: bool, uv: Array, cov: Array) -> int:
-    """Fit one marker.
+    """Fit one marker from rough corners (4, 2), px, into uv (4, 2) and cov (4, 2, 2), px^2; an index into PROBLEMS.
 
-    Args:
-        image: (H, W) grey.
-        corners: (4, 2) rough corners, px.
-        grid: (N + 4, N + 4) its cells as -1 and 1, and two rings around.
-        whole: whether the colour beyond the corners is known.
-        uv: (4, 2) filled with the corners.
-        cov: (4, 2, 2) filled with their covariances, px^2.
-
-    Returns:
-        An index into PROBLEMS.
+    grid (N + 4, N + 4): its cells as -1 and 1, and two rings around; ``whole``: whether the colour beyond the corners
+    is known.
     """
     px, at, here = np.empty((PIXELS_LAST, 8)), np.empty((PIXELS_LAST, 2), np.int64), corners.copy()
     cell = 0.0
@@ -537,13 +507,7 @@ def fit_marker(image: NDArray[np.uint8], corners: Array, grid: Array, whole: boo
 
 @dataclass(frozen=True, eq=False)
 class SquareFit(Record):
-    """The fitted corners of one marker.
-
-    Attributes:
-        uv: (4, 2) corners in the same order as the rough ones, raw pixels.
-        cov_uv: (4, 2, 2) covariance of each, px^2.
-        problem: why the fit must not be used; None when it is good.
-    """
+    """Fitted corners uv (4, 2), raw pixels, cov_uv (4, 2, 2), px^2, of one marker, or the problem: why not to use them."""
 
     uv: Array
     cov_uv: Array
@@ -553,16 +517,9 @@ class SquareFit(Record):
 def fit_square(
     image: NDArray[np.uint8], corners: Array, cells: NDArray[np.int8], diagonal: int | None = None
 ) -> SquareFit:
-    """Fit one marker.
+    """Fit one marker from rough corners (4, 2), raw px: upper left, upper right, lower right, lower left of its cells.
 
-    Args:
-        image: (H, W) grey image.
-        corners: (4, 2) rough corners, raw pixels: those of the cells' upper left, upper right, lower right, lower left.
-        cells: (N, N) the marker's cells, its dark border included: 1 bright, -1 dark.
-        diagonal: the colour beyond the marker's corners, as a cell's; unknown by default, and then ignored.
-
-    Returns:
-        The fitted corners, or why they cannot be fitted.
+    cells (N, N): 1 bright, -1 dark, the border included; ``diagonal``: the colour beyond the corners, ignored if None.
     """
     grid = np.pad(cells.astype(np.float64), 2, constant_values=1.0)
     grid[np.ix_((0, 1, -2, -1), (0, 1, -2, -1))] = 1.0 if diagonal is None else diagonal

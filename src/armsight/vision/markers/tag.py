@@ -48,12 +48,7 @@ class Tag(Record):
 
 @dataclass(frozen=True, eq=False)
 class TagTarget(Record, Target):
-    """A body found by its square markers.
-
-    Attributes:
-        name: what the body is called.
-        tags: its markers.
-    """
+    """A body found by its square markers."""
 
     name: str
     tags: tuple[Tag, ...]
@@ -62,8 +57,7 @@ class TagTarget(Record, Target):
     def from_markers(name: str, markers: Sequence[Marker]) -> TagTarget:
         """Build the target from a body file's markers of kind ``tag``: ``{ family = "tag36h11", id = 3, size_mm = 40 }``.
 
-        Raises:
-            InputError: unknown family or id, a missing or unknown key, or one marker twice.
+        InputError: unknown family or id, a missing or unknown key, or one marker twice.
         """
         tags = []
         taken: dict[tuple[str, int], str] = {}

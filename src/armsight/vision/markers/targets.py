@@ -38,13 +38,7 @@ _SAME_M = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Composite(Record, Target):
-    """A body that carries markers of several kinds; its points are those of its parts, one part after the other.
-
-    Attributes:
-        name: what the body is called.
-        parts: one target for each kind of coded marker, all in the body's frame.
-        discs: its plain discs, whose points come last; None where it has none.
-    """
+    """A body that carries markers of several kinds: its points are those of its ``parts``, then of its ``discs``."""
 
     name: str
     parts: tuple[Target, ...]
@@ -87,12 +81,7 @@ class Composite(Record, Target):
 
 
 def read_layout(path: str | Path) -> Composite:
-    """Read a body file.
-
-    Raises:
-        InputError: missing, malformed, an unknown kind of marker, no TOML, or a body that no command accepts
-            (``check_points``); the message names file and entry.
-    """
+    """Read a body file; InputError names file and entry, also of a body that no command accepts (``check_points``)."""
     if Path(path).suffix.lower() != ".toml":
         raise InputError(f"{path}: expected a TOML body file, which describes its markers (docs/howto/targets.md)")
     name, markers = read_body_file(path, (*MARKERS, DISC))
@@ -111,10 +100,7 @@ def load_body_toml(path: str | Path) -> Target:
 
 
 def open_target(spec: str | Path) -> Target:
-    """Make a target that can be found in images.
-
-    Args:
-        spec: a board such as ``chessboard:9x6:25mm``, a TOML body file, or a TOML board file of ``calibrate``.
+    """Make a target that can be found in images: of a board's spec, a TOML body file, or a board file of ``calibrate``.
 
     Raises:
         InputError: neither, malformed, or a CSV body, which has points but no description of its markers.
@@ -193,11 +179,7 @@ def _is_board_file(path: str) -> bool:
 
 
 def open_body(spec: str | Path) -> Body:
-    """Return the body that a board's spec, a TOML body file or a CSV of points describes.
-
-    Raises:
-        InputError: none of these, or malformed.
-    """
+    """Return the body that a board's spec, a TOML body file or a CSV of points describes; else InputError."""
     return load_body_csv(spec) if _kind(str(spec)) == ".csv" else open_target(spec).body
 
 

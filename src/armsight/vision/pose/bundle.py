@@ -64,18 +64,12 @@ def _accumulate(
 ) -> None:
     """Add the products of every detection's weighted derivatives, the residual being one more column.
 
-    With the loss's own curvature along each residual (Triggs et al., 2000, section 4.3), which is smaller than the weight
-    and below zero beyond the loss's scale, where it is held positive.
-
-    Args:
-        J: (N, 2, m) derivatives, those by the point last.
-        W: (N, 2, 2) whiteners.
-        white: (N, 2) whitened residuals.
-        loss: square of the Cauchy loss's scale; whether its curvature is taken.
-        rows: camera, point and shot of each, (N,).
-        sums: of each shot and camera (S, 2, m - 3, m - 2) without the point, upper triangles; of each point and camera, its
-            three derivatives by all (M, 2, 3, m + 1), residual before point; of each shot its own k by each point
-            (S, M, k, 3).
+    With the loss's own curvature along each residual (Triggs et al., 2000, section 4.3), which is smaller than the
+    weight and below zero beyond the loss's scale, where it is held positive.
+    J (N, 2, m), those by the point last; W (N, 2, 2) whiteners; white (N, 2) whitened residuals; ``loss``: square of
+    the Cauchy loss's scale, and whether its curvature is taken; ``rows``: camera, point and shot of each, (N,). Sums:
+    of each shot and camera (S, 2, m - 3, m - 2) without the point, upper triangles; of each point and camera, its three
+    derivatives by all (M, 2, 3, m + 1), residual before point; of each shot its own k by each point (S, M, k, 3).
     """
     shots, points, cross = sums
     m, k = J.shape[2] - 3, cross.shape[2]
@@ -113,15 +107,10 @@ _SOUND = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Arrow(Record):
-    """Normal equations of Q shared parameters and K own ones of each of S shots.
+    """Normal equations of Q shared parameters and K own ones of each of S shots, ``cost`` being minimised.
 
-    Attributes:
-        H_shared: (Q, Q) information of the shared parameters.
-        H_cross: (S, K, Q) what couples them with every shot's own.
-        H_shots: (S, K, K) information of every shot's own parameters.
-        g_shared: (Q,) downhill gradient.
-        g_shots: (S, K) downhill gradient.
-        cost: what is minimised.
+    Information of the shared parameters H_shared (Q, Q), of every shot's own H_shots (S, K, K), of both H_cross (S, K,
+    Q); downhill gradients g_shared (Q,), g_shots (S, K).
     """
 
     H_shared: Array
@@ -254,16 +243,7 @@ def whiteners(observations: Observations, sigma_px: float) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _Near(Record):
-    """The problem near a state.
-
-    Attributes:
-        state: the state.
-        residuals_px: (N, 2) detection minus projection.
-        J: (N, 2, ...) as :func:`~armsight.vision.pose.projection.derivatives` returns it.
-        white: (N, 2) whitened residuals.
-        squares: (N,) their squares.
-        cost: what is minimised; infinite where a detection is impossible.
-    """
+    """The problem near a state: derivatives, whitened residuals, cost; infinite where a detection is impossible."""
 
     state: BundleState
     residuals_px: Array
@@ -362,11 +342,11 @@ def minimise(
     damping: float = DAMPING,
     covariance: bool = True,
 ) -> BundleSolution:
-    """Find the minimum next to ``start`` for a given noise.
+    """Find the minimum next to ``start``, where every observation lies in front of its camera, and its covariance.
 
     Args:
         model: the body and what is held fixed.
-        start: where to begin; every observation must lie in front of its camera.
+        start: where to begin.
         observations: N detections.
         sigma_px: standard deviation of a detection beyond its image covariance, px.
         robust: Cauchy loss, else plain least squares.
@@ -375,9 +355,6 @@ def minimise(
         least_decrease: a step that lowers the cost by less than this share of it is the last.
         damping: Marquardt's damping to begin with, NEAR where the start is a neighbouring problem's minimum.
         covariance: whether it is needed; without, ``cov_shared`` and ``cov_motions`` are empty.
-
-    Returns:
-        The minimum with its covariance.
 
     Raises:
         CalibrationError: the start puts a detection behind its camera, or a shot has no detections.

@@ -50,15 +50,9 @@ def collinear(points: Array) -> bool:
 def implausible(
     rig: StereoRig, body: Body, points: Points, fit: PoseFit, used: PixelObservations, rigid: Array
 ) -> str | None:
-    """Return the reason why a fit is not a plausible measurement of the body, or None.
+    """Return the reason why a fit to ``used`` observations is not a plausible measurement of the body, or None.
 
-    Args:
-        rig: the calibrated pair.
-        body: the body's points, m.
-        points: triangulated points, three or more, not all on one line.
-        fit: the pose's plain fit.
-        used: the observations that were fitted, all of the points' or fewer.
-        rigid: (4, 4) T_left_body of the rigid fit to all points.
+    ``points`` are three or more, not all on one line; ``rigid`` (4, 4) is T_left_body of the rigid fit to all of them.
     """
     everything = len(used.point) == np.count_nonzero(points.seen.seen)
     count = np.bincount(used.point, minlength=len(body.points))
@@ -163,16 +157,10 @@ _SUSPECT, _TRIPLES, _TRIED = 4.0, 60, 3
 
 
 def locate(rig: StereoRig, body: Body, points: Points) -> PoseEstimate | Missed:
-    """Estimate the pose of a body in one shot.
+    """Estimate the pose of a body, left camera's frame, from the triangulated points of one shot, or why there is none.
 
-    Args:
-        rig: the calibrated pair.
-        body: the body's points, m.
-        points: the shot's triangulated points, with the correspondences they came from.
-
-    Returns:
-        The pose of the body in the left camera's frame, or why there is none: fewer than three points, points on one
-        line, no pose that most detections agree with, or detections that do not look like the body.
+    There is none of fewer than three points, points on one line, without a pose that most detections agree with, or
+    where the detections do not look like the body.
     """
     reason = _unlocatable(body, points)
     if reason is not None:
@@ -343,15 +331,9 @@ def _chosen(observations: PixelObservations, good: NDArray[np.bool_]) -> PixelOb
 
 
 def _misfit(residuals: Array, by_rig: Array, cov_rig: Array) -> float:
-    """Return how many times the variance of a fit's residuals exceeds what pixel noise and calibration explain.
+    """Return by how much the variance of a fit's residuals exceeds what pixel noise and calibration explain; 1 by chance.
 
-    Args:
-        residuals: (M,) whitened residuals of a fit of six parameters.
-        by_rig: (M, P) their derivative by the rig's parameters.
-        cov_rig: (P, P) covariance of the rig's parameters.
-
-    Returns:
-        The ratio, 1 where chance explains it: residuals weighted by the inverse of I + by_rig cov_rig by_rig^T (Woodbury).
+    (M,) whitened residuals of six parameters, weighted by the inverse of I + by_rig cov_rig by_rig^T (Woodbury).
     """
     freedom, v = len(residuals) - 6, by_rig.T @ residuals
     explained = v @ np.linalg.solve(np.eye(len(cov_rig)) + cov_rig @ (by_rig.T @ by_rig), cov_rig @ v)

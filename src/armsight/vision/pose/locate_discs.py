@@ -31,19 +31,10 @@ def locate_composite(
     *,
     symmetries: tuple[Ids, ...] = (),
 ) -> PoseEstimate | Missed:
-    """Locate a body from both cameras' detections of its coded parts and of its discs.
+    """Locate a body, its discs last in ``body``, from both cameras' detections of its coded parts and of its discs.
 
-    Args:
-        rig: the calibrated pair.
-        body: all points; those of the discs come last.
-        target: the discs.
-        coded: each camera's detections of the coded parts, by rows of ``body``.
-        discs: the discs each camera saw.
-        symmetries: as in :func:`~armsight.vision.match.match`.
-
-    Returns:
-        The pose. The coded parts identify the discs where they determine a pose by themselves; else the discs are
-        identified by their distances.
+    The coded parts identify the discs where they determine a pose by themselves; else the discs are identified by their
+    distances. ``symmetries`` as in :func:`~armsight.vision.match.match`.
     """
     names = match(rig, body, *coded, symmetries=symmetries)
     by_code = locate(rig, body, triangulate(rig, body, names)) if len(names.ids) else None
@@ -67,15 +58,9 @@ def locate_composite(
 def locate_discs(
     rig: StereoRig, body: Body, target: DiscTarget, coded: Correspondences, seen: Correspondences, T_left_body: Array
 ) -> PoseEstimate | Missed:
-    """Locate a body from named discs and coded points, the perspective bias of the discs subtracted.
+    """Locate a body near T_left_body from named discs and coded points, the perspective bias of the discs subtracted.
 
-    Args:
-        rig: the calibrated pair.
-        body: all points; those of the discs come last.
-        target: the discs.
-        coded: detections of coded points, by rows of ``body``; may be empty.
-        seen: ellipse centres by rows of ``target.body``.
-        T_left_body: (4, 4) approximate pose of the body.
+    ``coded`` are by rows of ``body``, and may be empty; ``seen`` ellipse centres by rows of ``target.body``.
     """
     first = len(body.points) - len(target.body.points)
     before: Array | None = None

@@ -1,11 +1,10 @@
 """How far a camera's disc centres are off, over what each image says of it: measured from the shots of a moving body.
 
 In: poses of a body of discs. Out: a :class:`~armsight.vision.rig.CameraNoise` for each camera, for the rig's file.
-
-An image shows the noise along its rims, from few discs. What it does not show (a colour mosaic, the blocks of JPEG, light
-that slopes) moves centres by as much again, in another direction wherever the body is. The residuals of many poses have all
-of it: their squares over their degrees of freedom are the factor. A body that deviates from its file has residuals that
-move with it; the offsets of its points are estimated from all shots together, the poses' own adjustment eliminated.
+An image shows the noise along its rims, from few discs. What it does not show (a colour mosaic, the blocks of JPEG,
+light that slopes) moves centres by as much again. The residuals of many poses have all of it: their squares over their
+degrees of freedom are the factor. A body that deviates from its file has residuals that move with it; the offsets of
+its points are estimated from all shots together, the poses' own adjustment eliminated.
 """
 
 from __future__ import annotations

@@ -20,16 +20,10 @@ MIN_POINTS = 4
 
 
 def body_poses(points: Array, camera: Camera, uv: Array) -> list[tuple[Array, float]]:
-    """Solve for the pose of a body in one camera.
+    """Solve for the poses of a body, points (N, 3), m, N >= 4, from where one camera saw them, uv (N, 2), raw pixels.
 
-    Args:
-        points: (N, 3) points of the body, m, N >= 4; planar or not.
-        camera: the camera.
-        uv: (N, 2) where it saw them, raw pixels.
-
-    Returns:
-        Candidate poses T_camera_body (4, 4) with their reprojection RMS, px, best first: both solutions of a plane;
-        none where the points do not determine one.
+    Return candidates T_camera_body (4, 4) with their reprojection RMS, px, best first: both solutions of a plane; none
+    where the points do not determine one.
     """
     rays = camera.unproject(uv)
     ahead = np.isfinite(rays).all(axis=1) & (rays[:, 2] > 0.1)
@@ -66,13 +60,7 @@ def _poses(rotations: Sequence[NDArray[Any]], translations: Sequence[NDArray[Any
 
 @dataclass(frozen=True, eq=False)
 class Candidate(Record):
-    """A pose that some of one camera's detections agree on.
-
-    Attributes:
-        T_camera_body: (4, 4) the pose.
-        rows: (K,) the detections that agree, each of another point.
-        rms_px: their RMS distance from the projections.
-    """
+    """A pose T_camera_body that some of one camera's detections, ``rows`` (K,), each of another point, agree on."""
 
     T_camera_body: Array
     rows: Ids
@@ -89,20 +77,12 @@ _POLISH_STEPS = 20
 
 
 def consensus_poses(points: Array, camera: Camera, ids: Ids, uv: Array) -> list[Candidate]:
-    """Find every pose of a body that three or more detections of one camera agree on.
+    """Find every pose of a body, points (M, 3), m, that three or more detections of one camera agree on.
 
     Every triple of differently named detections (600 seeded ones where there are more) gives up to four poses; those
     that most detections agree with are polished. Several bodies of one kind, wrong names and mirror solutions all come
-    out as candidates; other views decide.
-
-    Args:
-        points: (M, 3) points of the body, m.
-        camera: the camera.
-        ids: (N,) rows of the points that were detected; one may stand more than once.
-        uv: (N, 2) where, raw pixels.
-
-    Returns:
-        Candidates, most agreeing detections first, then the smallest distance.
+    out as candidates; other views decide. ``ids`` (N,) may name a point more than once; uv (N, 2) raw pixels. Most
+    agreeing detections come first, then the smallest distance.
     """
     rays = camera.unproject(uv)
     ahead = np.flatnonzero(np.isfinite(rays).all(axis=1) & (rays[:, 2] > 0.1))

@@ -55,15 +55,10 @@ class PredictedView(Record):
 
 
 def look_direction(points: Array, normals: Array) -> Array:
-    """Return the unit vector (3,), body frame, from which most of a body's faces are seen.
+    """Return the unit vector (3,), body frame, to the viewer from which most of a body's faces are seen.
 
-    Args:
-        points: (M, 3) points, m.
-        normals: (M, 3) out of their faces; NaN where unknown.
-
-    Returns:
-        The direction from the body to who looks at it; where no normal is known, perpendicular to the flattest plane
-        through the points, on the side of -z.
+    ``normals`` (M, 3) are NaN where unknown; where none is known, perpendicular to the flattest plane through the
+    points, on the side of -z.
     """
     known = normals[np.isfinite(normals).all(axis=1)]
     if not len(known):
@@ -185,13 +180,7 @@ class PoseDerivatives(Record):
 
 
 def pose_derivatives(rig: StereoRig, points: Array, seen: PredictedView) -> PoseDerivatives | None:
-    """Differentiate the pose that two cameras measure; None where the visible points do not determine one.
-
-    Args:
-        rig: the cameras.
-        points: (M, 3) points, m.
-        seen: the body's pose and which points are visible.
-    """
+    """Differentiate the pose that two cameras measure; None where the visible points do not determine one."""
     rows, sides = np.nonzero(seen.seen)
     if len(seen.paired) < 3:
         return None
@@ -214,14 +203,8 @@ def pose_derivatives(rig: StereoRig, points: Array, seen: PredictedView) -> Pose
 def pose_covariance(rig: StereoRig, points: Array, seen: PredictedView, sigma_px: float) -> Array | None:
     """Predict the covariance (6, 6) of a body's pose, [translation m; rotation rad], perturbation on the right.
 
-    Args:
-        rig: the cameras; the share of their calibration is included where the rig's covariance is known.
-        points: (M, 3) points, m.
-        seen: the body's pose and which points are visible.
-        sigma_px: standard deviation of a measured pixel position, px.
-
-    Returns:
-        The covariance, or None where the visible points do not determine a pose.
+    ``sigma_px``: of a measured pixel position; the share of the rig's calibration is included where its covariance is
+    known. None where the visible points do not determine a pose.
     """
     found = pose_derivatives(rig, points, seen)
     return None if found is None else found.noise(sigma_px) + found.by_rig @ rig.cov @ found.by_rig.T
@@ -238,18 +221,10 @@ def separation(
 ) -> float:
     """Return the least separation of a wrong naming of the discs from the true one, sigmas, over five rotations.
 
-    Args:
-        rig: the cameras.
-        points: (M, 3) positions of the discs, m.
-        normals: (M, 3) out of their faces; NaN where unknown.
-        symmetry: the wrong naming: which discs are taken for which.
-        distance_m: of the body.
-        sigma_px: standard deviation of a disc's measured centre, px.
-        hidden: a disc that something hides; none where below zero.
-
-    Returns:
-        The root of the weighted sum of squares of the wrong naming's residuals; infinity where its discs would always
-        be seen from behind, NaN where there is no rotation at which the discs in view are visible and no others.
+    The root of the weighted sum of squares of the wrong naming's residuals; infinity where its discs would always be
+    seen from behind, NaN without a rotation at which the discs in view are visible and no others. ``symmetry``: which
+    discs are taken for which; ``sigma_px``: of a disc's measured centre; ``hidden``: a disc that something hides, none
+    below zero.
     """
     seen, taken = symmetry.seen, symmetry.taken_for
     others = np.setdiff1d(np.arange(len(points)), [*seen, hidden])

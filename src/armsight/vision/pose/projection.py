@@ -23,15 +23,10 @@ from armsight.vision.discs.bias import project_discs
 
 
 def without_gauge(points: Array, modes: Array) -> Array:
-    """Remove rigid motion and size from shape modes.
+    """Remove rigid motion and size from shape modes (K, M, 3) of points (M, 3), m.
 
-    Args:
-        points: (M, 3) points of the body, m.
-        modes: (K, M, 3) displacement fields.
-
-    Returns:
-        (L, M, 3) orthogonal modes of an RMS displacement of one over all points; where the given modes held the seven
-        freedoms, L is K - 7 or, if they were not independent, less.
+    Return (L, M, 3) orthogonal modes of an RMS displacement of one over all points; where the given modes held the
+    seven freedoms, L is K - 7 or, if they were not independent, less.
     """
     centred = points - points.mean(axis=0)
     generators = [np.tile(axis, (len(points), 1)) for axis in np.eye(3)]
@@ -192,14 +187,10 @@ def _fill(
 ) -> None:
     """Write one camera's rows of :func:`derivatives`, zero before: the chain rule, row by row.
 
-    Args:
-        rows: (n,) which rows.
-        ends: columns of a camera's parameters; whether this camera is the right one.
-        Js: derivatives by the point (n, 2, 3), by the camera's parameters (n, 2, c), by the disc's normal (n or 0, 2, 3).
-        ps: the point in the camera's frame (n, 3), in the body's frame (n, 3) and from its middle (n, 3), m.
-        Rs: (n, 3, 3) rotations to the camera's frame of the body as it stood, and as it has moved; right Jacobians of
-            its motion; (0, 3, 3) where it stood still.
-        J: to be written.
+    ``ends``: columns of a camera's parameters, and whether it is the right one. Js: derivatives by the point (n, 2, 3),
+    by the camera's parameters (n, 2, c), by the disc's normal (n or 0, 2, 3). ps: the point in the camera's frame, in
+    the body's and from its middle (n, 3), m. Rs (n, 3, 3): rotations to the camera's frame of the body as it stood, and
+    as it has moved; right Jacobians of its motion; (0, 3, 3) where it stood still.
     """
     cameras, right = ends
     J_p, J_k, J_normal = Js
@@ -230,17 +221,11 @@ def _fill(
 
 
 def derivatives(model: BundleModel, state: BundleState, observations: Observations) -> tuple[Array, Array]:
-    """Project every observation and differentiate by what it depends on.
+    """Project every observation, (N, 2) pixels, and differentiate by what it depends on, (N, 2, c + 6 + k + 3).
 
-    Args:
-        model: the body and its modes.
-        state: cameras, poses and shape.
-        observations: N rows.
-
-    Returns:
-        (N, 2) pixels; (N, 2, c + 6 + k + 3) derivative by the parameters of its own camera (c of the camera that has more),
-        by the tangent of the relative pose, by that of its shot's pose (perturbation on the right) and the shot's motion (k
-        is 6, or 12 with motions), and by its point of the body.
+    By the parameters of its own camera (c of the camera that has more), by the tangent of the relative pose, by that of
+    its shot's pose (perturbation on the right) and the shot's motion (k is 6, or 12 with motions), and by its point of
+    the body.
     """
     most = max(camera.parameters.size for camera in state.cameras)
     uv = np.empty((len(observations.shot), 2))
@@ -270,11 +255,6 @@ def derivatives(model: BundleModel, state: BundleState, observations: Observatio
 def predict(model: BundleModel, state: BundleState, observations: Observations) -> tuple[Array, Array, Array]:
     """Project every observation and differentiate by all that is shared.
 
-    Args:
-        model: the body and its modes.
-        state: cameras, poses and shape.
-        observations: N rows.
-
     Returns:
         (N, 2) pixels; (N, 2, Q) derivative by the shared parameters; (N, 2, 6) derivative by the tangent of the shot's
         pose (perturbation on the right), or (N, 2, 12) by that and the shot's motion.
@@ -294,13 +274,8 @@ def _ellipses(
 ) -> tuple[Array, Array, Array]:
     """Project discs instead of their middles: centres of the ellipses (N, 2), derivatives by p and by normals (N, 2, 3).
 
-    Args:
-        camera: the camera.
-        p: (N, 3) middles, m, camera's frame.
-        normals: (N, 3) unit normals.
-        radius_m: radius, m.
-        uv: (N, 2) images of the middles, which stay where a disc has no ellipse.
-        J_p: (N, 2, 3) their derivative.
+    p (N, 3): middles, m, camera's frame; uv (N, 2): their images, which stay where a disc has no ellipse; J_p:
+    derivative.
     """
     centres, _, J_disc, J_normal = project_discs(camera, p, np.ascontiguousarray(normals), np.full(len(p), radius_m))
     seen = np.isfinite(centres[:, 0])

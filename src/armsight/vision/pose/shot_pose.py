@@ -167,14 +167,7 @@ class ShotPose(SeenPose):
 
 
 def shot_pose(name: str, t_s: float | None, body: Body, result: PoseEstimate | Missed) -> ShotPose:
-    """Return the record of one shot.
-
-    Args:
-        name: of the shot.
-        t_s: its time, s.
-        body: what was measured; names of its points.
-        result: of the measurement.
-    """
+    """Return the record of one shot at t_s, s, of a body."""
     if isinstance(result, Missed):
         return ShotPose(name, t_s, result.reason)
     T = result.T_left_body
@@ -281,11 +274,7 @@ class ShotPoses:
         }
 
     def write_csv(self, path: str | Path) -> None:
-        """Write the file that ``armsight measure -o`` writes.
-
-        Raises:
-            InputError: it cannot be written; then nothing is.
-        """
+        """Write the file that ``armsight measure -o`` writes, or nothing where it cannot be written (InputError)."""
         write_text(Path(path), csv_text(self.poses))
 
     def __arrow_c_stream__(self, requested_schema: object | None = None) -> object:
@@ -295,11 +284,7 @@ class ShotPoses:
         return pyarrow.table(self.columns()).__arrow_c_stream__(requested_schema)
 
     def to_pandas(self) -> Any:  # noqa: ANN401 - pandas is no dependency
-        """Return pandas' DataFrame of the columns.
-
-        Raises:
-            InputError: pandas is not installed.
-        """
+        """Return pandas' DataFrame of the columns; InputError where pandas is not installed."""
         try:
             return importlib.import_module("pandas").DataFrame(self.columns())
         except ImportError:
@@ -308,8 +293,7 @@ class ShotPoses:
     def plot(self) -> Any:  # noqa: ANN401 - matplotlib is no dependency
         """Draw position, mm, and angles, degrees, over time or shots, with two sigmas; return matplotlib's figure.
 
-        Raises:
-            InputError: matplotlib is not installed, or no shot was measured.
+        InputError: matplotlib is not installed, or no shot was measured.
         """
         figure, axes = new_figure(3, 2, sharex=True)
         good = [each for each in self.poses if each.ok]

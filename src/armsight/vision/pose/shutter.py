@@ -86,12 +86,9 @@ class Motion(Record):
 
 
 def motions(t_s: Array, Ts: Array, covs: Array) -> list[Motion | None]:
-    """Fit the motion about each of N poses to those around it; None where there are fewer than three.
+    """Fit the motion about each of N poses, T_left_body, to those around it; None where there are fewer than three.
 
-    Args:
-        t_s: (N,) rising times, s.
-        Ts: (N, 4, 4) T_left_body.
-        covs: (N, 6, 6) covariance of each, perturbation on the right.
+    Times (N,) rise, s; covs (N, 6, 6), perturbation on the right.
     """
     found: list[Motion | None] = [None] * len(t_s)
     widest = _GAP * float(np.median(np.diff(t_s))) if len(t_s) > 1 else 0.0
@@ -131,7 +128,7 @@ def estimate_shutters(
     Args:
         rig: the calibrated pair.
         body: what moves.
-        shots: in the order of their time.
+        shots: in the order of their time; InputError where their times do not rise.
         known: the readout that is given, and where to begin; nothing by default.
         readout: estimate the readout too.
         sigma_most: largest sigma that counts as found, as a share of the median time between shots.
@@ -140,9 +137,6 @@ def estimate_shutters(
 
     Returns:
         Both with covariance, or why they cannot be found: too few shots that move, or too slow.
-
-    Raises:
-        InputError: the times do not rise.
     """
     start = known or Shutters(0.0, 0.0, np.zeros((2, 2)))
     t_s = _times(shots)
@@ -556,17 +550,7 @@ class Alignment(Record):
 
 
 def aligned(rig: StereoRig, body: Body, shots: Sequence[TimedShot], shutters: Shutters) -> list[Alignment]:
-    """Find pose, motion and, where the skew varies, the skew of every shot.
-
-    Args:
-        rig: the calibrated pair.
-        body: what moves.
-        shots: in the order of their time.
-        shutters: when the cameras expose.
-
-    Raises:
-        InputError: the times do not rise.
-    """
+    """Find pose, motion and, where the skew varies, the skew of every shot; InputError where the times do not rise."""
     t_s, theta, jitter2 = _times(shots), np.array([shutters.skew_s, shutters.readout_s]), shutters.jitter_s**2
     observed = [PixelObservations.of(shot.seen, rig.sigma_px) for shot in shots]
     Ts, covs = _poses(rig, body, observed, np.array([shot.T_left_body for shot in shots]), [None] * len(shots))
@@ -602,21 +586,11 @@ def at_one_time(
 def measure_moving(
     rig: StereoRig, body: Body, shots: Sequence[TimedShot], shutters: Shutters
 ) -> list[tuple[PoseEstimate | Missed, bool]]:
-    """Measure a moving body with every observation moved to its shot's time.
+    """Measure a moving body with every observation of shots in time moved to its shot's time.
 
-    Args:
-        rig: the calibrated pair.
-        body: what moves.
-        shots: in the order of their time.
-        shutters: when the cameras expose.
-
-    Returns:
-        Of each shot the pose at its own time, or why there is none, and whether its observations were moved: not where
-        too few neighbours show the motion. The covariance holds that of the shutters, common to all shots, and of the
-        motion.
-
-    Raises:
-        InputError: the times do not rise.
+    Of each shot the pose at its own time, or why there is none, and whether its observations were moved: not where too
+    few neighbours show the motion. The covariance holds that of the shutters, common to all shots, and of the motion.
+    InputError: the times do not rise.
     """
     return [
         (_measured(rig, body, shot.seen, alignment, shutters), alignment.motion is not None)
@@ -627,17 +601,9 @@ def measure_moving(
 def measure_with_motion(
     rig: StereoRig, body: Body, shot: TimedShot, motion: Motion, shutters: Shutters
 ) -> PoseEstimate | Missed:
-    """Measure one shot of a body whose motion is known otherwise, such as from an arm's joints.
+    """Measure one shot of a body whose motion is known otherwise, such as from an arm's joints, at the shot's time.
 
-    Args:
-        rig: the calibrated pair.
-        body: what moves.
-        shot: of the body.
-        motion: of the body at the shot's time.
-        shutters: when the cameras expose.
-
-    Returns:
-        The pose at the shot's time, with the covariance of shutters and motion in its own, or why there is none.
+    The covariance of shutters and motion is in that of the pose.
     """
     observed = PixelObservations.of(shot.seen, rig.sigma_px)
     jitter2 = shutters.jitter_s**2

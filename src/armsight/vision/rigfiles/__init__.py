@@ -28,11 +28,7 @@ ASSUMED_SIGMA_PX = 0.2
 
 
 def open_format(name: str) -> RigFormat:
-    """Return a format by its name.
-
-    Raises:
-        InputError: an unknown name.
-    """
+    """Return a format by its name; InputError where it is unknown."""
     if name not in FORMATS:
         raise InputError(f"unknown rig format {name!r}; known are {', '.join(FORMATS)}")
     module = importlib.import_module(f"{__name__}.{FORMATS[name]}")
@@ -105,11 +101,7 @@ def recognised(documents: Sequence[Mapping[str, object]]) -> str | None:
 
 
 def export_rig(rig: StereoRig, name: str, paths: Sequence[str | Path]) -> tuple[str, ...]:
-    """Write a rig for another program and return what its files cannot hold, a line each.
-
-    Raises:
-        InputError: unknown format, one that is only read, a rig that does not fit it, or a file that cannot be written.
-    """
+    """Write a rig for another program and return what its files cannot hold, a line each."""
     module = open_format(name)
     if name not in EXPORTED:
         raise InputError(f"{name} is read, not written; written are {', '.join(EXPORTED)}")

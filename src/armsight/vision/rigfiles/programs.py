@@ -69,13 +69,7 @@ from armsight.vision.rigfiles.ros import rig_of
 
 
 class ReadFormat(NamedTuple):
-    """A format that is only read, as :class:`~.rigfile.RigFormat` has it.
-
-    Attributes:
-        TITLE: what its files are.
-        recognises: says by their content whether files are of it.
-        read: reads a rig.
-    """
+    """A format that is only read, as :class:`~.rigfile.RigFormat` has it."""
 
     TITLE: str
     recognises: Callable[[Sequence[Document]], bool]

@@ -74,19 +74,11 @@ class RigFormat(Protocol):
         ...
 
     def read(self, documents: Sequence[Document], paths: Sequence[Path], options: ImportOptions) -> StereoRig:
-        """Read a rig; its provenance says what was assumed and what was left behind.
-
-        Raises:
-            InputError: a file is damaged, misses a key, or holds what armsight cannot; the message names the file.
-        """
+        """Read a rig; its provenance says what was assumed and what was left behind. InputError names the file."""
         ...
 
     def write(self, rig: StereoRig, paths: Sequence[Path]) -> tuple[str, ...]:
-        """Write a rig and return what the format cannot hold, a line each.
-
-        Raises:
-            InputError: the rig does not fit the format, or a file cannot be written; no file is left half-written.
-        """
+        """Write a rig and return what the format cannot hold, a line each; InputError if it does not fit."""
         ...
 
 
@@ -104,14 +96,8 @@ def posed_rig(
 ) -> StereoRig:
     """Return the rig of two of several cameras whose poses in a third frame are known.
 
-    Args:
-        entries: each camera's entry by its name, in the order of the file.
-        pose_of: returns (4, 4) T_camera_reference of a camera, in the file's unit, and notes.
-        options: what the user added; ``pair`` chooses the two.
-        paths: the files.
-
-    Raises:
-        InputError: fewer than two, an unknown name in ``pair``, or a camera that cannot be read.
+    ``pose_of`` returns (4, 4) T_camera_reference of a camera, in the file's unit, and notes; ``options.pair`` chooses
+    the two.
     """
     names = list(entries)
     if len(names) < 2:
@@ -201,16 +187,8 @@ def imported(
 ) -> StereoRig:
     """Assemble an imported rig, its uncertainty unknown, with a provenance that says so.
 
-    Args:
-        cameras: left and right.
-        T_left_right: (4, 4), its translation in the file's unit.
-        options: what the user added.
-        paths: the files.
-        notes: what was assumed and left behind.
-        unit_m: of the file, where the user gave none, m.
-
-    Raises:
-        InputError: both cameras at one position, or a baseline that cannot be.
+    ``T_left_right`` is in the file's unit, unit_m where the user gave none; ``notes``: what was assumed and left
+    behind. InputError: both cameras at one position, or a baseline that cannot be.
     """
     left, right = cameras
     notes = [*notes]

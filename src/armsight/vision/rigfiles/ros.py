@@ -66,15 +66,9 @@ def read(documents: Sequence[Document], paths: Sequence[Path], options: ImportOp
 
 
 def rig_of(documents: Sequence[Document], paths: Sequence[Path], options: ImportOptions) -> StereoRig:
-    """Return the rig of a left and a right camera_info.
+    """Return the rig of a left and a right camera_info, with the keys of the files; ``paths`` are for messages.
 
-    Args:
-        documents: both, with the keys of the files.
-        paths: where they come from, for messages.
-        options: what the user added.
-
-    Raises:
-        InputError: one is damaged, or they are no stereo pair.
+    InputError: one is damaged, or they are no stereo pair.
     """
     cameras, Ts, notes = [], [], []
     for path, document in zip(paths, documents, strict=True):

@@ -29,11 +29,7 @@ class FolderSource(StoredSource):
 
     @staticmethod
     def open(directory: str | Path) -> FolderSource:
-        """Read the index or match the names.
-
-        Raises:
-            InputError: no such folder, no shots in it, a damaged index, or images that do not pair up.
-        """
+        """Read the index or match the names; InputError where there are no shots, or images that do not pair up."""
         folder = Path(directory).expanduser()
         if not folder.is_dir():
             raise InputError(f"{directory}: no such folder")

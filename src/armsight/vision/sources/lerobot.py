@@ -77,14 +77,7 @@ def _parquet_files(folder: Path, part: str) -> Iterator[tuple[Path, _Parquet]]:
 
 
 class LeRobotDataset:
-    """A dataset's description and its table of frames.
-
-    Args:
-        folder: of the dataset.
-
-    Raises:
-        InputError: no dataset, one of an unknown format, or a table that is missing or damaged.
-    """
+    """A dataset's description and its table of frames; InputError where it is none, unknown or damaged."""
 
     def __init__(self, folder: str | Path) -> None:
         self.folder = Path(folder).expanduser()
@@ -155,11 +148,7 @@ class LeRobotDataset:
         return LeRobotJoints(tuple(map(str, listed)), stamps, values, episodes)
 
     def video(self, key: str, episode: int) -> tuple[Path, float]:
-        """Return the file that holds an episode of a camera, and when the episode begins in it, s.
-
-        Raises:
-            InputError: the file is missing.
-        """
+        """Return an episode's file of a camera, and when the episode begins in it, s; InputError if it is missing."""
         if self.version.startswith("v2"):
             chunk = episode // int(self.info.get("chunks_size", 1000))
             names: dict[str, Any] = {"episode_chunk": chunk, "video_key": key, "episode_index": episode}
@@ -194,11 +183,7 @@ class LeRobotDataset:
 
 
 class LeRobotSource(Source):
-    """Two cameras of a dataset; a frame that cannot be decoded is a shot with a problem.
-
-    Attributes:
-        notes: what was left out: episodes without a video.
-    """
+    """Two cameras of a dataset; a frame that cannot be decoded is a shot with a problem. ``notes``: what was left out."""
 
     timed = True
 
@@ -329,8 +314,7 @@ _View: TypeAlias = _TableView | _VideoView
 def open_lerobot(rest: str) -> LeRobotSource:
     """Open ``DIR[,left=KEY,right=KEY][,episode=N]``.
 
-    Raises:
-        InputError: no dataset, fewer than two cameras, or all videos are missing.
+    InputError: no dataset, fewer than two cameras, or all videos are missing.
     """
     path, *options = rest.split(",")
     named = dict(option.partition("=")[::2] for option in options)

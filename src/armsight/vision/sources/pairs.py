@@ -56,11 +56,7 @@ class StoredPair:
 
 
 def halves(file: Path) -> tuple[Image, Image]:
-    """Return the left and the right half of an image file.
-
-    Raises:
-        InputError: it cannot be read, or is too narrow for two images.
-    """
+    """Return the left and the right half of an image file; InputError if it cannot be read or is too narrow for two."""
     image = read_image(file)
     height, width = image.shape[:2]
     if width % 2 or width < 2 * height:
@@ -72,11 +68,7 @@ def halves(file: Path) -> tuple[Image, Image]:
 
 
 class StoredSource(Source):
-    """A source over pairs of image files, read one by one.
-
-    Attributes:
-        pairs: all of them, in the order they are read.
-    """
+    """A source over ``pairs`` of image files, read one by one."""
 
     def __init__(self, pairs: Sequence[StoredPair]) -> None:
         self.pairs = tuple(pairs)
@@ -124,11 +116,7 @@ class PairsSource(StoredSource):
 
     @staticmethod
     def open(left_glob: str, right_glob: str) -> PairsSource:
-        """Find the files and pair them.
-
-        Raises:
-            InputError: no files, or files that do not pair up.
-        """
+        """Find the files and pair them; InputError where there are none, or they do not pair up."""
         pairs = match(image_files(left_glob), image_files(right_glob), left_glob, right_glob)
         video = next((file for pair in pairs if (file := pair.left) and file.suffix.lower() in VIDEOS), None)
         if video is not None:
@@ -137,20 +125,12 @@ class PairsSource(StoredSource):
 
     @staticmethod
     def of(text: str) -> PairsSource:
-        """Open LEFT,RIGHT, as :func:`two_globs` reads it.
-
-        Raises:
-            InputError: not two globs, no files, or files that do not pair up.
-        """
+        """Open LEFT,RIGHT, as :func:`two_globs` reads it; errors as :meth:`open`."""
         return PairsSource.open(*two_globs(text))
 
 
 def two_globs(text: str) -> tuple[str, str]:
-    """Return the globs of LEFT,RIGHT.
-
-    Raises:
-        InputError: not two globs.
-    """
+    """Return the globs of LEFT,RIGHT; else InputError."""
     if (found := split_names(text, lambda each: bool(glob.glob(os.path.expanduser(each))))) is None:
         raise InputError(f"pairs:{text}: two globs are needed: --source 'pairs:DIR/left*.png,DIR/right*.png'")
     return found
@@ -166,16 +146,9 @@ def split_names(text: str, is_there: Callable[[str], bool]) -> tuple[str, str] |
 
 
 def match(lefts: Iterable[Path], rights: Iterable[Path], said_left: str, said_right: str) -> tuple[StoredPair, ...]:
-    """Pair left and right files by sorted name.
+    """Pair left and right files by sorted name; ``said_left`` and ``said_right`` are the user's texts, for messages.
 
-    Args:
-        lefts: the left files.
-        rights: the right files.
-        said_left: the user's text for the left files, for the messages.
-        said_right: the same for the right files.
-
-    Raises:
-        InputError: no file, unequal counts, a file without a partner, or a file that is on both sides.
+    InputError: no file, unequal counts, a file without a partner, or a file that is on both sides.
     """
     left, right = (sorted(files, key=natural_key) for files in (lefts, rights))
     for files, said in ((left, said_left), (right, said_right)):

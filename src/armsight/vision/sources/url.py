@@ -61,11 +61,7 @@ class MjpegStream:
         self._stop = threading.Event()
 
     def frames(self) -> Iterator[tuple[float, bytes]]:
-        """Connect, and yield time of arrival, s, and JPEG file of each part.
-
-        Raises:
-            DeviceError: no connection, an HTTP error, something else than an MJPEG stream, a stall, or the end.
-        """
+        """Connect, and yield time of arrival, s, and JPEG file of each part; DeviceError where it stalls or ends."""
         with self._named_errors(), contextlib.ExitStack() as stack:
             response = self._connect(stack)
             boundary = self._boundary(response)
@@ -146,11 +142,7 @@ class RtspStream:
         self._stop = threading.Event()
 
     def frames(self) -> Iterator[tuple[float, Image | None]]:
-        """Connect, and yield time of arrival, s, and image; None for a frame that cannot be decoded.
-
-        Raises:
-            DeviceError: no such stream, a stall, or the end.
-        """
+        """Connect, and yield time of arrival, s, and image, None where it cannot be decoded; DeviceError at its end."""
         limit_ms = int(self._timeout_s * 1000)
         limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, limit_ms, cv2.CAP_PROP_READ_TIMEOUT_MSEC, limit_ms]
         capture = open_capture(self._address, cv2.CAP_FFMPEG, limits)

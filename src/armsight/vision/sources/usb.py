@@ -57,11 +57,7 @@ class UsbCamera:
 
     @staticmethod
     def set_up(device: str, settings: Settings, capture: QuietCapture) -> UsbCamera:
-        """Set all properties requested, and read them back.
-
-        Raises:
-            DeviceError: the camera did not take a value.
-        """
+        """Set all properties requested, and read them back; DeviceError where the camera did not take one."""
         for key, (_, value) in settings.items():
             capture.set(key, value)
         for key, (name, value) in settings.items():
@@ -78,11 +74,7 @@ class UsbCamera:
         return UsbCamera(device, capture, shape)
 
     def grab(self, stall_s: float) -> None:
-        """Take the newest frame and its time stamp, and leave it undecoded.
-
-        Raises:
-            DeviceError: the camera is gone, or no frame came for ``stall_s``.
-        """
+        """Take the newest frame and its stamp, undecoded; DeviceError if the camera is gone or silent for ``stall_s``."""
         for _ in range(_QUEUE + 1):
             age_s = self._grab(stall_s)
             period_s = self.rhythm.period_s
@@ -107,13 +99,9 @@ class UsbCamera:
         return now - self.t_s
 
     def image(self) -> tuple[Image, bytes | None] | None:
-        """Decode the grabbed frame; None if that fails.
+        """Decode the grabbed frame: the image and the JPEG that the camera sent, if any; None if it cannot be decoded.
 
-        Returns:
-            The image, and the JPEG that the camera sent; None where it sent none.
-
-        Raises:
-            DeviceError: it is not of the size agreed on.
+        DeviceError: it is not of the size agreed on.
         """
         ok, image = self.capture.retrieve()
         if not ok or image is None or image.size == 0:
@@ -173,15 +161,10 @@ class UsbSource(Source):
 
 
 def open_usb(rest: str, capture: Callable[[str], QuietCapture] | None = None) -> UsbSource:
-    """Open ``LEFT,RIGHT[@WIDTHxHEIGHT][@FPS][,exposure=5ms|auto][,gain=20][,format=MJPG]``.
+    """Open ``LEFT,RIGHT[@WIDTHxHEIGHT][@FPS][,exposure=5ms|auto][,gain=20][,format=MJPG]``, numbers or paths.
 
-    Args:
-        rest: two devices, a number N for /dev/videoN or a path, and the settings for both.
-        capture: opens a device; None is OpenCV's V4L2.
-
-    Raises:
-        InputError: the text is not of that form.
-        DeviceError: a device is missing, busy, or does not take a setting.
+    ``capture`` opens a device, by default by OpenCV's V4L2. InputError: the text is not of that form. DeviceError: a
+    device is missing, busy, or does not take a setting.
     """
     devices, settings = parsed_usb(rest)
     cameras: list[UsbCamera] = []

@@ -103,11 +103,7 @@ class VideoSource(Source):
 
     @staticmethod
     def open(left: str | Path, right: str | Path | None = None) -> VideoSource:
-        """Open the files.
-
-        Args:
-            left: the left camera's file, or with no ``right`` the side-by-side file.
-            right: the right camera's file.
+        """Open a file for each camera, or with no ``right`` one of both images side by side.
 
         Raises:
             InputError: a file is missing or not a video, both are the same, or a side-by-side frame has an odd width.
@@ -175,13 +171,7 @@ class VideoSource(Source):
 
 
 class Film:
-    """An open video file and its current frame.
-
-    Args:
-        path: the file.
-
-    Raises:
-        InputError: it is missing, not a video, or of a codec that this PyAV does not decode.
+    """An open video file and its current frame; InputError where it is missing, no video or of an unknown codec.
 
     Attributes:
         path: the file.

@@ -71,14 +71,7 @@ ABILITIES = Abilities(
 
 
 class Ar4Board(PolledBoard):
-    """The joints of an AR4; :meth:`connect` makes one.
-
-    Args:
-        link: the wire.
-        name: what errors call it, such as its port.
-        model: which AR4.
-        now: the clock that passes while the link is read, s.
-    """
+    """The joints of an AR4; :meth:`connect` makes one."""
 
     def __init__(self, link: Link, name: str, model: Ar4Model, now: Callable[[], float] = time.monotonic) -> None:
         abilities = replace(ABILITIES, steps_rad=tuple(np.radians(1 / model.steps_per_deg).tolist()))
@@ -97,17 +90,10 @@ class Ar4Board(PolledBoard):
     def connect(
         cls, link: Link, *, name: str = "the AR4", model: str = "mk3", now: Callable[[], float] = time.monotonic
     ) -> Self:
-        """Start the conversation and read the joints; nothing moves.
+        """Read the joints behind a link, which is closed where this raises; nothing moves.
 
-        Args:
-            link: the wire to the Teensy; closed where this raises.
-            name: what errors call it, such as its port.
-            model: mk1, mk2 or mk3.
-            now: the clock that passes while the link is read, s.
-
-        Raises:
-            InputError: there is no such model.
-            DeviceError: nothing answers, or a firmware of another kind.
+        ``now``: the clock that passes while the link is read, s; ``model``: mk1, mk2 or mk3, else InputError.
+        DeviceError: nothing answers, or a firmware of another kind.
         """
         try:
             board = cls(link, name, ar4_model(model), now)
@@ -148,9 +134,7 @@ class Ar4Board(PolledBoard):
     def send(self, command: JointCommand) -> int:
         """Send goals, at most ``RATE_HZ`` times a second: the newest counts; duration and duty are not used.
 
-        Raises:
-            InputError: the arm is not homed, a goal is outside the limits, or more than 20 degrees away.
-            DeviceError: the port is gone.
+        InputError: the arm is not homed, a goal is outside the limits, or more than 20 degrees away.
         """
         self._require_homed()
         self._goal, self._goal_speed = self._checked_goal(command, f"the AR4 {self.model.name}")
@@ -159,12 +143,7 @@ class Ar4Board(PolledBoard):
         return self._count()
 
     def command(self, command: Command) -> int:
-        """Take the arm over, or reset the emergency stop.
-
-        Raises:
-            InputError: the AR4 has no such command.
-            DeviceError: the emergency stop is pressed.
-        """
+        """Take the arm over, or reset the emergency stop, DeviceError while it is pressed; InputError for others."""
         if command in (Command.ENABLE, Command.ENABLE_INWARD):
             self._take_over()
         elif command is Command.CLEAR_STOP:
@@ -186,14 +165,9 @@ class Ar4Board(PolledBoard):
         self._enabled = False
 
     def home(self, *, at_once: int = JOINTS) -> None:
-        """Drive the joints to their limit switches, set the encoders there, and go to the rest position.
+        """Drive 1, 2, 3 or 6 joints at a time to their limit switches, set the encoders, and go to the rest position.
 
-        Args:
-            at_once: how many joints at a time: 1, 2, 3 or 6.
-
-        Raises:
-            InputError: another number.
-            DeviceError: a switch was not reached; the Teensy's words.
+        DeviceError: a switch was not reached; the Teensy's words.
         """
         if at_once not in HOMING_GROUPS:
             raise InputError(f"{at_once} joints at once are not possible; 1, 2, 3 or 6 are")
@@ -323,11 +297,7 @@ class Ar4Board(PolledBoard):
         tries: int = _TRIES,
         heading: Heading | None = None,
     ) -> _Answer:
-        """Ask and return the answer of this kind; what else comes meanwhile is taken.
-
-        Raises:
-            DeviceError: none comes, or an error.
-        """
+        """Ask and return the answer of this kind; what else comes meanwhile is taken. DeviceError: none, or an error."""
         heard = 0
         for _ in range(tries):
             self._link.write(question)

@@ -110,11 +110,7 @@ def read_line(line: str) -> Ar4Answer | None:
 
 
 class LineReader:
-    """Cuts a stream of bytes into lines of text.
-
-    Attributes:
-        broken: lines that were no text, or longer than any line is.
-    """
+    """Cuts a stream of bytes into lines of text; ``broken`` counts those that were none, or too long."""
 
     def __init__(self) -> None:
         self._data = bytearray()

@@ -68,11 +68,7 @@ MODELS = {
 
 
 def ar4_model(name: str) -> Ar4Model:
-    """Return a model by its name.
-
-    Raises:
-        InputError: there is none of this name.
-    """
+    """Return a model by its name, or InputError."""
     if name not in MODELS:
         raise InputError(f"no AR4 {name!r}; there are {', '.join(MODELS)}")
     return MODELS[name]

@@ -61,14 +61,7 @@ ABILITIES = Abilities(
 
 
 class FeetechBoard(PolledBoard):
-    """The joints of an arm on a servo bus; :meth:`connect` makes one.
-
-    Args:
-        bus: the servos, each of which answers.
-        calibration: which counts are which angles.
-        enabled: whether the torque of all is on.
-        begin_s: when its own time begins, on the bus's clock, s; now by default.
-    """
+    """The joints of an arm on a servo bus; :meth:`connect` makes one."""
 
     def __init__(
         self, bus: ServoBus, calibration: ServoCalibration, *, enabled: bool, begin_s: float | None = None
@@ -86,12 +79,10 @@ class FeetechBoard(PolledBoard):
     def connect(
         cls, bus: ServoBus, calibration: ServoCalibration | None = None, *, begin_s: float | None = None
     ) -> Self:
-        """Meet the servos of an arm; nothing is written.
+        """Meet the servos of an arm; nothing is written. The bus is closed where this raises.
 
-        Args:
-            bus: closed where this raises.
-            calibration: which counts are which angles; without, 0 rad is count 2048.
-            begin_s: when its own time begins, on the bus's clock, s; now by default.
+        Without calibration 0 rad is count 2048; ``begin_s``: when its own time begins, on the bus's clock, s, by
+        default now.
 
         Raises:
             DeviceError: one does not answer, is of another model, is not a position servo, or has another homing offset
@@ -143,9 +134,7 @@ class FeetechBoard(PolledBoard):
     def send(self, command: JointCommand) -> int:
         """Send goals; the servos go there at once, the command's duration and duty are not used.
 
-        Raises:
-            InputError: a goal outside the limits, or more than 20 degrees from where the joint is; nothing was sent.
-            DeviceError: the bus is gone.
+        InputError: a goal outside the limits, or more than 20 degrees from where the joint is; nothing was sent.
         """
         # The margin is what rounds to a count that is allowed.
         goal = self._checked_goal(command, "its servo", self.calibration.names, margin_rad=RAD_PER_COUNT / 2)
@@ -154,11 +143,7 @@ class FeetechBoard(PolledBoard):
         return self._count()
 
     def command(self, command: Command) -> int:
-        """Switch the torque on or off, or read whether an alarm still stands.
-
-        Raises:
-            InputError: servos have no such command.
-        """
+        """Switch the torque on or off, or read whether an alarm still stands; InputError for other commands."""
         if command in (Command.ENABLE, Command.ENABLE_INWARD):
             self._switch_on()
         elif command is Command.DISABLE:

@@ -35,16 +35,9 @@ LOOKED_FOR = range(1, 13)  # ids that are looked for where an expected one does 
 
 
 class ServoBus:
-    """The servos on a wire.
+    """The servos on a wire, which :meth:`close` closes; ``name`` and ``baud`` are for errors.
 
-    Args:
-        link: the wire; :meth:`close` closes it.
-        name: what errors call it, such as its port.
-        baud: bits a second on it, for errors.
-        now: the clock that passes while the link is read, s.
-
-    Attributes:
-        lost: answers that did not come whole.
+    ``now``: the clock that passes while the link is read, s; ``lost`` counts answers that did not come whole.
     """
 
     def __init__(self, link: Link, name: str, baud: int = BAUD, now: Callable[[], float] = time.monotonic) -> None:
@@ -90,11 +83,7 @@ class ServoBus:
         self._link.write(sync_write(register.address, values))
 
     def meet(self, ids: Sequence[int]) -> None:
-        """Check that each id answers, alone and as an STS3215.
-
-        Raises:
-            DeviceError: one does not, or two servos share an id, or nothing answers at all.
-        """
+        """Check that each id answers, alone and as an STS3215; else DeviceError."""
         silent = [id for id in ids if not self.ping(id)]
         if silent:
             self._explain(silent)
@@ -104,12 +93,7 @@ class ServoBus:
                 raise DeviceError(f"{self.name}: id {id} is of model {model}; an STS3215 is {STS3215}")
 
     def unlocked_write(self, id: int, register: Register, value: int) -> None:
-        """Write a stored register of a servo whose torque is off, and read it back.
-
-        Raises:
-            InputError: the torque is on.
-            DeviceError: it does not answer, or does not keep the value.
-        """
+        """Write a stored register of a servo whose torque is off (or InputError), and read it back (or DeviceError)."""
         if self.read(id, TORQUE):
             raise InputError(f"{self.name}: the torque of id {id} is on; switch it off first, the arm will sink")
         self.write(id, LOCK, 0)

@@ -56,11 +56,7 @@ def uncalibrated(lowest: Array, highest: Array) -> ServoCalibration:
 
 
 def read_calibration(path: str | Path) -> ServoCalibration:
-    """Read LeRobot's calibration file.
-
-    Raises:
-        InputError: it is not one; the message says which joint and which number.
-    """
+    """Read LeRobot's calibration file; InputError says which joint and which number."""
     entries = _entries(path)
     names = tuple(name for name in entries if name != GRIPPER)
     rows = [_row(path, name, entries[name]) for name in names]
@@ -84,15 +80,9 @@ def read_calibration(path: str | Path) -> ServoCalibration:
 
 
 def write_offsets(path: str | Path, source: str | Path, offsets: dict[int, int]) -> None:
-    """Write a calibration file with other homing offsets, everything else as in another one.
+    """Write a calibration file with other homing offsets, by id of the servo, everything else as in LeRobot's ``source``.
 
-    Args:
-        path: to be written.
-        source: LeRobot's file.
-        offsets: by id of the servo.
-
-    Raises:
-        InputError: the source is none, an offset is none that a servo holds, or the file cannot be written.
+    InputError: the source is none, an offset is none that a servo holds, or the file cannot be written.
     """
     read_calibration(source)
     entries = _entries(source)

@@ -1,6 +1,5 @@
 """Plain discs: a grey image goes in, the ellipses' centres with their covariance come out, raw pixels.
 
-``search.py``: where
-in the image discs may be, and the start of each fit. ``fit.py``: the model fit of one disc, its covariance, and the
-tests that reject what is not a disc. Which disc of the body each one is: :mod:`armsight.vision.discs`.
+``search.py``: where discs may be, and the start of each fit. ``fit.py``: the fit of one disc, its covariance, and tests
+that reject what is not a disc. Which disc of the body each one is: :mod:`armsight.vision.discs`.
 """

@@ -136,16 +136,10 @@ def workspace() -> FitBuffers:
 
 @kernel(fastmath=True)
 def linearise(n: int, slope: int, texture: float, work: FitBuffers) -> float:
-    """Fill whitened residual, J and share of disc of the first n pixels at ``work.at``.
+    """Fill whitened residual, J and share of disc of the first n pixels at ``work.at``; return the sum of squares.
 
-    Args:
-        n: number of pixels.
-        slope: kind of gradient: LIGHT, SURROUND, GLARE.
-        texture: variance of the surround beyond the noise's, over that; below zero: that of the disc, for shot noise.
-        work: the pixels, and buffers.
-
-    Returns:
-        The sum of the squared residuals.
+    ``slope``: LIGHT, SURROUND or GLARE; ``texture``: variance of the surround beyond the noise's, over that; below
+    zero: that of the disc, for shot noise.
     """
     px, py, level, J, residual, inside = work.px, work.py, work.level, work.J, work.residual, work.inside
     cx, cy, m11, m12, m22, blur, contrast, base, gx, gy = work.at
@@ -295,16 +289,10 @@ def _append(image: NDArray[np.uint8], y: int, first: int, end: int, x0: int, y0:
 
 @kernel
 def gather(image: NDArray[np.uint8], theta: Array, work: FitBuffers) -> tuple[int, int]:
-    """Collect the pixels that depend on a disc: px, py relative to the nearest pixel of the centre, and their grey.
+    """Collect the pixels of a disc, theta (10,): px, py from the nearest pixel of the centre, and their grey.
 
-    Args:
-        image: (H, W) grey.
-        theta: (10,) parameters of the disc as far as they are known.
-        work: buffers; px, py and level are filled.
-
-    Returns:
-        Their number, -1 where the disc and its rim are not completely inside the image; and how many of them, the
-        first, are of every third row, enough for a first step.
+    Return their number, -1 where the disc and its rim are not completely inside the image; and how many of them, the
+    first, are of every third row, enough for a first step.
     """
     height, width = image.shape
     x0, y0 = int(np.rint(theta[0])), int(np.rint(theta[1]))
@@ -421,14 +409,9 @@ def rim(n: int, theta: Array, x0: float, y0: float, work: FitBuffers, sectors: A
 
 @kernel
 def off_ellipse(variance: float, work: FitBuffers) -> tuple[float, float, int]:
-    """Compare the deviations of the rim's sectors, as :func:`rim` fills them, with white noise.
+    """Compare the deviations of the rim's sectors, as :func:`rim` fills them, with white noise of a variance.
 
-    Args:
-        variance: of the noise, as the residuals have it.
-        work: buffers.
-
-    Returns:
-        Sum of the squared deviations beyond white noise, px^2; its variance; number of sectors.
+    Return the sum of the squared deviations beyond white noise, px^2; its variance; number of sectors.
     """
     sectors, off, chance, count = work.sectors, 0.0, 0.0, 0
     for k in range(SECTORS):
@@ -529,14 +512,9 @@ def of_centre(work: FitBuffers, cov: Array) -> None:
 
 @kernel(fastmath=True)
 def _inside_products(n: int, cx: np.float32, cy: np.float32, work: FitBuffers, out: Array) -> None:
-    """Fill the products of the columns of a gradient inside the disc, u and v times its share.
+    """Fill the products of the columns of a gradient inside the disc, u and v times its share, about (cx, cy).
 
-    Args:
-        n: pixels.
-        cx: the centre, in the pixels' coordinates.
-        cy: see cx.
-        work: the pixels, linearised.
-        out: (2, 13) filled: with each column of J, with the residual, with u and with v.
+    out (2, 13): with each column of J, with the residual, with u and with v.
     """
     px, py, J, residual = work.px, work.py, work.J, work.residual
     uu, uv, vv, ru, rv = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
@@ -568,16 +546,8 @@ def slope_inside(n: int, theta: Array, x0: float, y0: float, variance: float, wo
     """Estimate a gradient inside the disc beside the ten unknowns, and what it would do to the centre.
 
     One step of the twelve unknowns, in which the model is nearly linear (Schur complement of the two that are new).
-    ``work.shown`` is filled from 3 on: the gradient over the disc's level, 1/px (2); its information, px^2, as
-    elements 00, 01, 11 (3); by how much the fitted centre is off for each of it, px^2 (2, 2). Without information: zeros.
-
-    Args:
-        n: pixels.
-        theta: (10,) the converged parameters.
-        x0: the pixels' origin.
-        y0: see x0.
-        variance: of the noise, as the residuals have it.
-        work: the pixels, linearised, with the last step in ``work.x``.
+    ``work.shown`` is filled from 3 on: the gradient over the disc's level, 1/px (2); its information, px^2, as elements
+    00, 01, 11 (3); by how much the fitted centre is off for each of it, px^2 (2, 2). Without information: zeros.
     """
     g, L, scale, x, out, shown = work.g, work.L, work.scale, work.x, work.products, work.shown
     _inside_products(n, F(theta[0] - x0), F(theta[1] - y0), work, out)
@@ -644,11 +614,6 @@ def skewed_edge(n: int, variance: float, work: FitBuffers) -> None:
     order (Edgeworth) the profile Phi(z) then has -k (z^2 - 1) phi(z) besides, with k the part of a vector along the rim's
     normal. One step of the twelve unknowns, as in :func:`slope_inside`. ``work.shown`` is filled from SKEWED on: the
     centre's shift, px (2); by how much chi-square falls, in the noise's variance.
-
-    Args:
-        n: pixels.
-        variance: of the noise, as the residuals have it.
-        work: the pixels, linearised, with what is left of the residuals in ``work.left``; their grey is overwritten.
     """
     g, L, scale, x, out, shown = work.g, work.L, work.scale, work.x, work.products, work.shown
     _skew_products(n, work)
@@ -678,11 +643,6 @@ def levelled(theta: Array, variance: float, work: FitBuffers) -> None:
     Centre and gradient have errors in common, V_cg: the centre of the eight other unknowns alone is c - V_cg V_gg^-1 g.
     ``work.shown`` is filled from LEVELLED on: chi-square of g in the noise's variance; V_cg V_gg^-1 g, px (2); by how much
     the centre's covariance falls, V_cg V_gg^-1 V_gc, px^2, as elements 00, 01, 11 (3).
-
-    Args:
-        theta: (10,) the converged parameters.
-        variance: of the noise, grey levels^2.
-        work: buffers, with the factor of the normal matrix.
     """
     g, L, scale, x, out = work.g, work.L, work.scale, work.x, work.shown[LEVELLED:]
     # The last corner of the factor is that of the last two unknowns' information, the others marginalised.
@@ -829,18 +789,10 @@ def minimise(
 
 @kernel
 def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, work: FitBuffers) -> int:
-    """Fit one disc.
+    """Fit one disc from theta (10,): centre (raw px), M (1/px^2), blur (px), contrast, base, gradient (1/px), replaced.
 
-    Args:
-        image: (H, W) grey.
-        noise_sigma: the image's noise as far as it is known beforehand, grey levels; used to reject what is not a disc.
-        theta: (10,) start: centre (raw px), M (1/px^2), blur (px), contrast, base, gradient (1/px); replaced by the
-            result.
-        cov: (2, 2) covariance of the centre, px^2; filled.
-        work: what :func:`workspace` returns; ``work.shown`` is filled.
-
-    Returns:
-        0, or the reason why it is not a disc (REASONS).
+    cov (2, 2), px^2, and ``work.shown`` are filled. ``noise_sigma``, grey levels, as far as it is known beforehand,
+    rejects what is not a disc. Return 0, or the reason why it is not a disc (REASONS).
     """
     sectors = work.sectors
     n, sample = gather(image, theta, work)

@@ -63,10 +63,7 @@ Room: TypeAlias = tuple[Array, Array, Array, Array, Array, Array]
 
 @kernel
 def _walk(image: Grey, x: int, y: int, dx: int, dy: int, half: int, sign: int, reach: int) -> int:
-    """Return how many pixels from (x, y) along (dx, dy) are on the disc's side of ``half``; -1 where there is no end.
-
-    A chord is at most twice ``reach`` long.
-    """
+    """Count pixels from (x, y) along (dx, dy) on the disc's side of ``half``; -1 where there is no end in 2 ``reach``."""
     height, width = image.shape
     end = x if dx < 0 else width - 1 - x if dx > 0 else y if dy < 0 else height - 1 - y
     for k in range(1, min(2 * reach - 1, end) + 1):
@@ -110,10 +107,7 @@ def _beyond(image: Grey, x: int, y: int, across: int, down: int, sign: int) -> i
 
 @kernel
 def _ray(image: Grey, x: int, y: int, k: int, first: int, reach: int, half: int, sign: int) -> float:
-    """Return how far from (x, y), beyond ``first`` px, ray k is on the disc's side of ``half``.
-
-    A ray without an end is -1 long; one that the image's border cuts -2.
-    """
+    """How far from (x, y), beyond ``first`` px, ray k is on the disc's side of ``half``; -1: no end, -2: image border."""
     height, width = image.shape
     c, s = _COS[k], _SIN[k]
     before = np.float64(image[y, x])  # pixels nearer than the first step are on the disc
@@ -136,11 +130,10 @@ def _ray(image: Grey, x: int, y: int, k: int, first: int, reach: int, half: int,
 def _chords(
     image: Grey, x: int, y: int, low: int, sign: int, reach: int
 ) -> tuple[int, int, int, int, int, int]:  # fmt: skip
-    """Centre a pixel in its chords along the row and the column.
+    """Centre a pixel in its chords along the row and the column; ``low`` is the surround's level.
 
-    Returns:
-        The pixel's column and row; the level half-way between disc and surround; how long the chords along the row and
-        the column are, -1 where one has no end, and the shortest of their four parts, px.
+    Return column and row; the level half-way between disc and surround; the lengths of both chords, -1 where one has no
+    end, and the shortest of their four parts, px.
     """
     half, across, down, shortest = 0, -1, -1, 0
     for round_ in range(_ROUNDS):
@@ -244,21 +237,11 @@ def _hilly(image: Grey, noise: float, theta: Array) -> bool:
 def outline(
     image: Grey, x: int, y: int, low: int, sign: int, theta: Array, room: Room, reach: int, least: float
 ) -> int:
-    """Estimate a disc's ellipse around one of its pixels, as the start of its fit.
+    """Estimate a disc's ellipse around one of its pixels (x, y), as the start of its fit: theta (10,) is filled.
 
-    Args:
-        image: (H, W) grey.
-        x: column of a pixel that is on the disc.
-        y: its row.
-        low: grey level of the surround.
-        sign: 1 for a bright disc, -1 for a dark one.
-        theta: (10,) filled: centre, M, blur, contrast, base, gradient.
-        room: what :func:`workspace` returns.
-        reach: longest half chord, px.
-        least: mean contrast across the rim, at least, grey levels.
-
-    Returns:
-        0, or the reason why there is no disc (``fit.REASONS``); for those of OUTLINED, too, ``theta`` is filled.
+    ``low``: grey of the surround; ``sign``: 1 for a bright disc, -1 for a dark one; ``reach``: longest half chord, px;
+    ``least``: mean contrast across the rim, grey levels. Return 0, or the reason why there is no disc
+    (``fit.REASONS``); for those of OUTLINED, too, theta is filled.
     """
     height, width = image.shape
     x, y = _uphill(image, x, y, sign)
@@ -389,8 +372,7 @@ def _halves(word: np.uint64) -> np.uint64:
 def any_differs(words: Words64, y: int, t: np.uint64, sums: Words64) -> bool:
     """Return whether any two pixels of the eight searched rows from y differ as in :func:`differs`.
 
-    One row at a time waits for each of its cache lines, eight at a time wait for eight at once. ``sums`` (W / 8,)
-    are filled with those of the 64 pixels of a cell.
+    All eight rows' cache lines are waited for at once. ``sums`` (W / 8,): of the 64 pixels of a cell, filled.
     """
     every = _EMPTY
     a, b, c, d = words[y], words[y + _ROW_STEP], words[y + 2 * _ROW_STEP], words[y + 3 * _ROW_STEP]
@@ -468,21 +450,11 @@ def search(
     image: Grey, words: Words64, noise: float, bright: bool, dark: bool, starts: Array, codes: NDArray[np.int64],
     signs: NDArray[np.int64], room: Room,
 ) -> tuple[int, bool]:  # fmt: skip
-    """Look for discs in a whole image.
+    """Look for discs in a grey image (H, W), W a multiple of eight; ``words`` (H, W / 8) are its memory as 64-bit words.
 
-    Args:
-        image: (H, W) grey, W a multiple of eight.
-        words: (H, W / 8) the same memory as 64-bit words.
-        noise: standard deviation of the image's noise, grey levels.
-        bright: whether bright discs are looked for.
-        dark: whether dark ones are.
-        starts: (N, 10) filled with starts for the fit; where there is no disc, with the pixel that was examined.
-        codes: (N,) filled with 0 or the reason why there is no disc.
-        signs: (N,) filled with 1 for bright discs, -1 for dark ones.
-        room: what :func:`workspace` returns.
-
-    Returns:
-        The number of candidates examined, at most N; whether there may be a disc that is too large.
+    starts (N, 10), codes (N,), 0 or the reason why there is no disc, and signs (N,), 1 for bright ones, -1 for dark
+    ones, are filled; ``noise`` in grey levels. Return the number of candidates examined, at most N; whether there may
+    be a disc that is too large.
     """
     height, width = image.shape
     contrast = max(LEAST_CONTRAST, _CONTRAST_SIGMAS * 1.4142 * noise)
@@ -543,10 +515,7 @@ def outlines(
 
 @kernel
 def _again(n: int, starts: Array, signs: NDArray[np.int64], cells: NDArray[np.int16]) -> bool:
-    """Whether disc n repeats one of those in the cells of 8 px.
-
-    Two discs in one cell are not checked for repeats: they are smaller than 5 px then.
-    """
+    """Whether disc n repeats one in the cells of 8 px; two in one cell, smaller than 5 px, are not checked."""
     x, y = int(starts[n, 0]) >> 3, int(starts[n, 1]) >> 3
     for j in range(max(y - 1, 0), min(y + 2, cells.shape[0])):
         for i in range(max(x - 1, 0), min(x + 2, cells.shape[1])):
@@ -568,12 +537,10 @@ def find(
 ) -> tuple[int, int, bool]:  # fmt: skip
     """Search an image as :func:`search` does and fit every candidate; or fit further candidates, which are given.
 
-    The first ``good`` of ``starts``, ``codes``, ``signs`` are fitted discs already, those from ``first`` to ``n`` are not;
-    with ``n`` 0 the image is searched for them. In the end the discs come first, then the rejected candidates; ``cov`` (N,
-    2, 2) are the covariances of the discs' centres, px^2, and ``shape`` (N, 3) their ellipses, px^2.
-
-    Returns:
-        The number of discs, and of candidates in all; whether the search found that there may be a disc too large for it.
+    The first ``good`` of ``starts``, ``codes``, ``signs`` are fitted already, those from ``first`` to ``n`` are not;
+    with ``n`` 0 the image is searched. Discs come first in the end; ``cov`` (N, 2, 2), of centres, and ``shape`` (N,
+    3), ellipses, in px^2. Return the number of discs, and of candidates; whether there may be a disc too large for the
+    search.
     """
     noise, large = noise_of(image), False
     if n == 0:
@@ -604,16 +571,7 @@ def find(
 
 @kernel("const u1[:, ::1], i8, f8[:, ::1], f8[:, :, ::1], f8[::1], FitBuffers")
 def correct_all(image: Grey, good: int, starts: Array, cov: Array, shared: Array, work: FitBuffers) -> None:
-    """Find what the discs of an image have in common, and correct each one by it.
-
-    Args:
-        image: (H, W) grey.
-        good: how many discs there are.
-        starts: (N, 10) as :func:`find` leaves them; corrected.
-        cov: (N, 2, 2) covariances of their centres, px^2; corrected.
-        shared: (SHARED,) filled with what they have in common, see :func:`~armsight.vision.markers.disc.common.common`.
-        work: buffers for fits, as :func:`find` leaves them.
-    """
+    """Find what the ``good`` discs of an image have in common, ``shared`` (SHARED,), and correct starts and cov by it."""
     noise = noise_of(image)
     common(image, good, work, shared)
     for i in range(good):

@@ -26,14 +26,9 @@ _MODELS = {"": "plumb_bob", "kannala_brandt": "equidistant"}
 
 
 def bag_rig(bag: Bag, named: dict[str, str] | None = None) -> StereoRig:
-    """Return the rig of a recording.
+    """Return the rig of a recording; InputError without camera_info of a stereo pair.
 
-    Args:
-        bag: the recording.
-        named: image topics by side, where the user named them: their camera_info are beside them.
-
-    Raises:
-        InputError: no camera_info, of one camera only, or not of a stereo pair.
+    ``named``: image topics by side, where the user named them: their camera_info are beside them.
     """
     if RIG in bag.metadata.get(METADATA, {}):
         return StereoRig.from_text(bag.metadata[METADATA][RIG], f"{bag.path}: {RIG}")

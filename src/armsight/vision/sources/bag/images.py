@@ -170,8 +170,7 @@ def _shot(name: str, t_s: float, pair_: Sequence[BagMessage]) -> Shot:
 def decoded_image(kind: str, message: Decoded) -> tuple[Image, bytes | None]:
     """Return the image of a message, (H, W) or (H, W, 3) BGR, and the file it was, where it was one.
 
-    Raises:
-        InputError: an unknown encoding, or data that do not fit its size.
+    InputError: an unknown encoding, or data that do not fit its size.
     """
     if "Compressed" in kind:
         if "compresseddepth" in str(message.format).lower():
@@ -212,11 +211,7 @@ def decoded_image(kind: str, message: Decoded) -> tuple[Image, bytes | None]:
 
 
 def open_bag_source(rest: str) -> BagSource:
-    """Open ``FILE[,left=TOPIC][,right=TOPIC]``.
-
-    Raises:
-        InputError: not a recording, no images, one camera only, or topics that are ambiguous.
-    """
+    """Open ``FILE[,left=TOPIC][,right=TOPIC]``; InputError without images of both, or where topics are ambiguous."""
     path, named = parsed(rest)
     bag = Bag(path)
     topics = image_topics(bag, named)
@@ -270,11 +265,7 @@ def image_topics(bag: Bag, named: dict[str, str]) -> tuple[str, str]:
 
 
 def two_topics(bag: Bag, named: dict[str, str], bag_topics: list[str], what: str) -> tuple[str, str]:
-    """Return the left and the right one of a recording's topics of one sort.
-
-    Raises:
-        InputError: none, only one, or it is not clear which they are.
-    """
+    """Return the left and the right one of a recording's topics of one sort; InputError where it is not clear."""
     if named:
         for topic in named.values():
             if topic not in bag_topics:

@@ -64,13 +64,9 @@ def _period_ns(t: _Times) -> float:
 def stamps_of(
     topic: str, header_ns: Sequence[int], arrival_ns: Sequence[int], contents: Sequence[int] | None = None
 ) -> Stamps:
-    """Return the stamps of a topic, checked.
+    """Return the stamps of a topic, checked: of the headers and of the recorder's arrival, ns.
 
-    Args:
-        topic: its name.
-        header_ns: stamps of the headers, ns.
-        arrival_ns: the recorder's times of arrival, ns.
-        contents: a hash of each message's content, by which one that was recorded twice is found.
+    ``contents`` are hashes of the messages, by which one that was recorded twice is found.
     """
     t, arrival, notes = np.array(header_ns, np.int64), np.array(arrival_ns, np.int64), []
     seen: set[tuple[int, int]] = set()
@@ -162,15 +158,9 @@ class Pairing:
 
 
 def pair(left: Stamps, right: Stamps, allowed_s: float | None = None) -> Pairing:
-    """Pair two topics.
+    """Pair two topics, no further apart than ``allowed_s``, by default half the period of the faster one.
 
-    Args:
-        left: of the left camera.
-        right: of the right camera.
-        allowed_s: how far apart a pair may be, s; by default half the period of the faster topic.
-
-    Raises:
-        InputError: no two messages are close enough.
+    InputError: no two messages are close enough.
     """
     if allowed_s is None:
         allowed_s = min(_APART_S, left.period_s / 2, right.period_s / 2)

@@ -44,13 +44,7 @@ _INSTALL = 'pip install "armsight[ros]"'
 
 @dataclass(frozen=True)
 class Topic:
-    """One topic of a recording.
-
-    Attributes:
-        name: such as /stereo/left/image_raw.
-        kind: type of its messages without ROS 2's ``/msg/``: sensor_msgs/Image, foxglove.CompressedImage.
-        count: how many messages there are.
-    """
+    """One topic of a recording, its ``kind`` without ROS 2's ``/msg/``: sensor_msgs/Image; ``count`` messages."""
 
     name: str
     kind: str
@@ -111,11 +105,7 @@ class Bag:
         self.topics = {topic.name: topic for topic in self._container.topics()}
 
     def messages(self, topics: Collection[str]) -> Iterator[BagMessage]:
-        """Yield the messages of some topics in the order they were recorded.
-
-        Raises:
-            InputError: the file is damaged where nothing more can be read.
-        """
+        """Yield the messages of some topics in the order they were recorded; InputError where no more can be read."""
         if not topics:
             return
         counts = dict.fromkeys(topics, 0)
@@ -137,8 +127,7 @@ class Bag:
 def _files(path: str | Path, notes: list[str]) -> list[Path]:
     """Return the files of a recording in the order of its metadata.yaml; or a folder, of one that is compressed as a whole.
 
-    Raises:
-        InputError: nothing is there, or a folder holds no bag.
+    InputError: nothing is there, or a folder holds no bag.
     """
     given = Path(path).expanduser()
     if not given.is_dir():

@@ -44,12 +44,7 @@ class JointStream(Record):
 
 @dataclass(frozen=True, eq=False)
 class PoseTrack(Record):
-    """Poses of one frame in another over time.
-
-    Attributes:
-        t_s: (N,) rising times, s.
-        Ts: (N, 4, 4) poses, m.
-    """
+    """Poses Ts (N, 4, 4), m, of one frame in another at rising times (N,), s."""
 
     t_s: Array
     Ts: Array
@@ -67,15 +62,10 @@ class PoseTrack(Record):
 
 
 def read_joints(bag: Bag, names: tuple[str, ...] | None = None) -> JointStream | None:
-    """Read the joint angles of a recording; None where it holds none.
+    """Read the joint angles of a recording; None where it holds none, InputError where one of ``names`` is never in it.
 
-    Args:
-        bag: the recording.
-        names: the joints to read, in this order; by default all of the first message. ``elbow`` is ``elbow_joint`` too, and
-            ``left_elbow_joint`` where only one joint is called so.
-
-    Raises:
-        InputError: a joint of ``names`` is never in it.
+    By default all of the first message. ``elbow`` is ``elbow_joint`` too, and ``left_elbow_joint`` where only one joint
+    is called so.
     """
     topics = [topic.name for topic in bag.of_kind(*JOINTS)]
     rows: list[tuple[float, list[float]]] = []
@@ -162,11 +152,7 @@ def _transforms(message: Decoded) -> Iterator[tuple[int, str, str, Array]]:
 
 
 def read_track(bag: Bag, frame: str, of: str) -> PoseTrack:
-    """Return the poses of frame ``of`` in ``frame`` over time.
-
-    Raises:
-        InputError: a frame is not in the recording, or they are not connected.
-    """
+    """Return the poses of frame ``of`` in ``frame`` over time; InputError where they are missing or not connected."""
     tree = read_transforms(bag)
     chains = [_chain(tree, each) for each in (frame, of)]
     known = sorted({*tree, *(parent for parent, _ in tree.values())})

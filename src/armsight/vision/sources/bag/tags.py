@@ -39,17 +39,10 @@ _WITHOUT_CORNERS = ("apriltag_ros/AprilTagDetectionArray", "apriltag_ros_msgs/Ap
 
 
 def read_tags(spec: str, target: Target | Body) -> tuple[list[SeenShot], tuple[str, ...]]:
-    """Read the detected tags of a recording.
+    """Read the detected tags of a body in ``bag:FILE[,left=TOPIC,right=TOPIC]``, and what was left out.
 
-    Args:
-        spec: ``bag:FILE[,left=TOPIC,right=TOPIC]``.
-        target: the body that carries the tags.
-
-    Returns:
-        One record a pair of messages, and one with a problem a message without a partner; and what was left out.
-
-    Raises:
-        InputError: not a recording, no tags in it, of one camera only, or none of the body's.
+    One record a pair of messages, and one with a problem a message without a partner. InputError: not a recording, no
+    tags in it, of one camera only, or none of the body's.
     """
     path, named = parsed(spec.removeprefix("bag:"))
     bag = Bag(path)
