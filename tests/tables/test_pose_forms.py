@@ -565,6 +565,10 @@ def test_each_program_gives_the_same_joints(tmp_path, form):
                 ("p.py", "a.set_position(1,2,3,4,5,6)\na.set_tool_position(0,0,9,0,0,0)", "set_tool_position"),
                 ("p.script", "movel(p[1,2,3,0,0,0])\nmovel(pose_trans(p1, p[0,0,0.1,0,0,0]))", "pose_trans"),
                 ("p.script", "movel(p[1,2,3,0,0,0])\nmovel(pose_trans(get(),\n  p[0,0,0.1,0,0,0]))", "pose_trans"),
+                ("p.src", "PTP {X 1,Y 2,Z 3,A 4,B 5,C 6}\nLIN P1:{X 0,Y 0,Z 9,A 0,B 0,C 0}", "P1:.X 0"),
+                ("p.as", "POINT p1 = TRANS(1,2,3,4,5,6)\nLMOVE p1+TRANS(0,0,9,0,0,0)", "LMOVE p1"),
+                ("p.prg", "Go XY(1,2,3,4,5,6)\nMove P1 +X(50)", "X"),
+                ("p.prg", "P1=(1,2,3,4,5,6)(7,0)\nMvs P1*P2", "P1.P2"),
                 (
                     "p.LS",
                     "/MN\n 1:L P[1] 100mm/sec FINE INC ;\n/POS\n" + rows(LS, MM, FIXED),

@@ -160,7 +160,11 @@ _RELATIVE = re.compile(
     r"\bMove(?:LinRel[TW]rf|JointsRel)\s*\(|\b\w+_REL\s*\{|\bDR_MV_MOD_REL\b|\brelative\s*=\s*True\b|"
     rf"\bpose_(?:trans|add|sub)\s*\({_ARGUMENTS}?\bp\[|\b(?:trans|addto)\s*\({_ARGUMENTS}?\bpos[xj]\s*\(|"
     rf"\ba?move[a-z]{{1,2}}\s*\({_ARGUMENTS}?,\s*(?:mod\s*=\s*1|ref\s*=\s*(?:1|DR_TOOL))\b|"
-    r"\b(?:RelTool|Offs)\s*\(\s*\[\s*\[|\bP\[\d+.*\bINC\b|\bset_tool_position\s*\(",
+    r"\b(?:RelTool|Offs)\s*\(\s*\[\s*\[|\bP\[\d+.*\bINC\b|\bset_tool_position\s*\(|"
+    # operators between poses: KUKA's P1:{X 5,..}, Kawasaki's p1+TRANS(..), Epson's P1 +X(5), Mitsubishi's P1*P2
+    r"\w+[ \t]*:[ \t]*\{\s*(?:\w+\s*:\s*)?[XYZABC]\s+[-+.\d]|\}[ \t]*:[ \t]*[\w{]|[+*]\s*TRANS\s*\(|"
+    r"\bTRANS\s*\([^()]*\)\s*[+*]|\b[A-Z]MOVE\s+\w+\s*\+|[\w)][ \t]*[+-][ \t]*(?:XY|[XYZUVW])\s*\(\s*[-+.\d]|"
+    r"\bP\d+\s*\*\s*P\d+\b",
     re.IGNORECASE,
 )
 
