@@ -67,23 +67,20 @@ from armsight.tables.poses import PoseTable
 
 #: Poses that the fit comes from at most, and the variances, evenly spread; half: less is known, double: twice the time.
 MAX_FIT, MAX_VARIANCE = 1000, 120
-#: Poses that sources over time are chosen from at most, and everything where something walks: each step of it is an
-#: unknown; half: walks are seen badly, double: eight times the time.
+#: Poses that sources over time are chosen from at most; half: walks are seen badly, double: eight times the time.
 MAX_WALK = 60
 MIN_SHARED = 12  # fewest poses for errors that poses share
 #: Rotation about a second axis must exceed the noise of rotations by this factor, and this angle, rad.
 CLEARLY_ROTATED, LEAST_ROTATION = 3.0, np.radians(0.5)
 #: Rotations of half of the poses that differ by more than this, rad, are not of one motion.
 CONTRADICTS = np.radians(10.0)
-#: A sigma of a transform beyond this (m, rad) is no answer; beyond that, it is none to close a loop with: as much at a
-#: reach of half a metre. half: mountings from few small rotations are rejected, double: a tool 40 mm off may be driven.
+#: A sigma (m, rad) that is no answer. half: few small rotations are rejected, double: a tool 40 mm off may be driven.
 OPEN_M, OPEN_RAD = 0.5, 0.5
 TRUSTED_M, TRUSTED_RAD = 0.02, 0.04
 #: What a further pose is uncertain by at least, m and rad: where hardly anything scattered, one would determine all.
 LEAST_M, LEAST_RAD = 1e-5, 1e-5
-#: What an arm may be off by, beside its joints' scatter: mean sigma of each of its links, and of the smooth error that all
-#: make together, m and rad; and how probable that is before any residual. half: an arm a few mm longer than its model is
-#: not allowed for, double: few poses claim too little.
+#: Mean sigma of an arm's links, and of the smooth error all make, m and rad; and how probable that is. half: an arm a
+#: few mm longer is not allowed for, double: few poses claim too little.
 LINK, DRIFT_SIZE, ARM_OFF = (1e-3, 1e-3), (1e-3, 1e-3), 0.5
 #: Sigma of rotations that have hardly any weight, rad; by how many sigmas, and by which factor, errors of positions left
 #: out must be lower without them. half: chance weights positions alone, double: contradictions spoil the nominal arm's use.
@@ -91,11 +88,9 @@ HARDLY, SURELY_LOWER, CLEARLY = 0.005, 3.0, 1.1
 DECISIVE = 5.0  # times a sigma grows without one pose; half: every tenth pose of few is named, double: hardly any
 UNDETERMINED = 100.0  # times; half, double: another word from there on
 FREEDOM = 4.0  # degrees of freedom of Student's t in the robust start
-#: A scale must be off by this many sigmas to be taken, and has settled where a step is below this share of one: where the
-#: flange hardly moves it runs away.
+#: A scale must be off by so many sigmas to be taken, and has settled where a step is below this share of one.
 SURELY, SETTLED = 5.0, 0.1
-#: Times the error of a position that the flange's must spread for a scale. half: noise is taken for a motion; double:
-#: recordings of a few cm are rejected.
+#: Times a position's error that the flange must spread for a scale. half: noise counts, double: a few cm are rejected.
 STILL = 3.0
 _TIMED = {name for pair in OVER_TIME for name in pair}  # sources that change over time
 ROUNDS = 6  # rounds of least squares and of leaving out
@@ -264,7 +259,6 @@ class _Guess(Record):
     """Transforms, scale, what is left of the time offset, and errors that vision shares between poses, in sigmas.
 
     Lengths are in the unit of the measured body, in which a scale that is fitted is not drawn to small values by the
-    body's noise: ``per_m`` of them make one metre.
     """
 
     Z: Array
@@ -307,8 +301,8 @@ class _Problem(Record):
     def linear(self, guess: _Guess, arm: bool = False, times: bool = False) -> Linear:
         """Return the residuals at a guess, with the sources of their error.
 
-        Vision's shared errors are unknowns where the guess has them; ``arm``: with what is the arm's own in all poses;
-        ``times``: with what changes over time.
+        Vision's shared errors are unknowns where the guess has them; ``arm``, ``times``: with what the arm, or time,
+        changes.
         """
         poses = self.scaled(guess)
         e, J, carry = residuals(poses, guess.Z, guess.X)
@@ -421,18 +415,13 @@ def calibrate_poses(
 ) -> HandEye:
     """Calibrate hand and eye.
 
-    Args:
-        poses: four or more.
-        t_s: (N,) times of the poses, s, where they are known: what drifts over time, or walks, needs them.
-        speed: (N, 6) twist of the flange, right tangent, m/s and rad/s, of streams: the rest of the time offset is fitted.
-        links: (N, L, 4, 4) T_link_flange of every link, m, where the joints and a model are known.
-        scale: whether the size of the target may be wrong (one camera that moves has none): fitted, and kept where it is
-            surely not 1.
-        quick: as in :func:`calibrate_handeye`.
-        progress: called with the name of each step as it begins.
+    ``poses``: four or more. ``t_s``: (N,) times of the poses, s, where they are known: what drifts over time, or walks,
+    needs them. ``speed``: (N, 6) twist of the flange, right tangent, m/s and rad/s, of streams: the rest of the time
+    offset is fitted. ``links``: (N, L, 4, 4) T_link_flange of every link, m, where the joints and a model are known.
+    ``scale``: whether the size of the target may be wrong (one camera that moves has none): fitted, and kept where it
+    is surely not 1.
 
     Raises:
-        InputError: fewer than four poses.
         CalibrationError: the motions leave a direction open.
     """
     n = len(poses.A)
@@ -581,11 +570,7 @@ def rotations_of(poses: Poses, e: Array) -> tuple[Array, Array, float, float]:
 
 
 def require_rotations(poses: Poses, e: Array) -> None:
-    """Reject motions whose rotations are about one axis only, as far as the noise in the residuals e (N, 6) shows.
-
-    Raises:
-        CalibrationError: the open direction, by name.
-    """
+    """Reject motions whose rotations are about one axis only, as far as the noise in the residuals e (N, 6) shows."""
     spread, axes, noise, least = rotations_of(poses, e)
     held = "flange-rig" if poses.in_hand else "flange-body"
     if noise > CONTRADICTS and spread[0] > LEAST_ROTATION:
@@ -623,11 +608,7 @@ def known_where_seen(found: HandEye, Ts_rig_body: Array) -> dict[str, tuple[Arra
 
 
 def require_known(found: HandEye, Ts_rig_body: Array, most_m: float, most_rad: float) -> None:
-    """Reject a result one of whose directions is known worse, where the body was seen, than by these sigmas, m and rad.
-
-    Raises:
-        CalibrationError: the open direction, by name.
-    """
+    """Reject a result one of whose directions is known worse, where the body was seen, than by these sigmas, m and rad."""
     for name, (T, block) in known_where_seen(found, Ts_rig_body).items():
         for kind, part, most, unit, times in (
             ("translation", block[:3, :3], most_m, "mm", 1e3),
@@ -680,11 +661,7 @@ def _taken_up(problem: _Problem, guess: _Guess, quick: bool) -> dict[str, float]
 def _settled(
     whole: _Problem, guess: _Guess, used: NDArray[np.bool_], quick: bool
 ) -> tuple[_Guess, NDArray[np.bool_], dict[str, float], int]:
-    """Alternate variances, transforms and blunders until they stay.
-
-    Returns:
-        Guess, used rows, variances of the sources taken up, and of how many poses what is shared comes at most.
-    """
+    """Alternate variances, transforms and blunders until they stay."""
     few = whole.rows(_spread(np.flatnonzero(used), MAX_VARIANCE if whole.t_s is None else MAX_WALK))
     variances = _taken_up(few, guess, quick)
     most = MAX_WALK if any("walk" in name for name in variances) else MAX_FIT
@@ -780,10 +757,7 @@ def _leverage(found: HandEye, poses: Poses) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _Model(Record):
-    """One choice of sources: its residuals, most probable variances and the solution at these, and what integrating gives.
-
-    That is the step (P,), its covariance, and the log evidence.
-    """
+    """One choice of sources: residuals, most probable variances, the step (P,), its covariance, the log evidence."""
 
     linear: Linear
     variances: dict[str, float]
@@ -833,7 +807,6 @@ def _suiting(whole: _Problem, guess: _Guess, nominal: _Model) -> tuple[Array, Ar
     """Return the step (P,) to the mounting that suits the arm's model best, and its residuals (N, 6) of poses left out.
 
     Where rotations and positions contradict each other by more than either scatters, that is the one of positions alone:
-    where it predicts positions left out clearly and surely better.
     """
     linear, own = nominal.linear, nominal.linear.own
     middle = {"seen_m": np.concatenate([own["lateral_m"], own["depth_m"]], axis=2)}

@@ -80,11 +80,9 @@ def residuals(poses: Poses, Z: Array, X: Array) -> tuple[Array, Array, Array]:
 
 PART = 6  # parts of this many poses are tried too, so that some of them are free of gross errors
 PARTS = 24  # how many parts: with 20 % gross errors all of them would hold one with a chance of (1 - 0.8^6)^24, 0.1 %
-#: Share of the poses that must be good: the scale of residuals is that of the best so many. A median breaks down where half
-#: are blunders.
+#: Share of the poses that must be good: the scale of residuals is that of the best so many.
 MIDDLE = 0.4
-#: Share of the pairs of rows that count as agreeing: where half of the rows are good, a quarter does. With more rows than
-#: this none are looked for.
+#: Share of the pairs of rows that count as agreeing; with more rows than this none are looked for.
 AGREE, MOST_AGREEING = 0.15, 300
 #: Weight of a rotation in the score, m/rad: 1 mrad counts as 0.3 mm, as it does at a tool 0.3 m from the wrist.
 LEVER_M = 0.3
@@ -93,10 +91,7 @@ LEVER_M = 0.3
 def starts(A: Array, B: Array, seed: int = 0) -> list[tuple[Array, Array]]:
     """Return candidates for X and Z of ``A_i X = Z B_i``, smallest median residual first.
 
-    Args:
-        A: (N, 4, 4) poses, N >= 3.
-        B: (N, 4, 4) poses.
-        seed: of the choice of parts.
+    ``A``: (N, 4, 4) poses, N >= 3.
     """
     rng = np.random.default_rng(seed)
     found = [kronecker(A, B)]
@@ -114,10 +109,7 @@ def starts(A: Array, B: Array, seed: int = 0) -> list[tuple[Array, Array]]:
 
 
 def _agreeing(A: Array, B: Array) -> NDArray[np.int64]:
-    """Return the rows that agree with that with which most do: between two rows both sides rotate by one angle.
-
-    Blunders hardly agree with anything, so these are good ones even where half of the rows are not.
-    """
+    """Return the rows that agree with that with which most do: between two rows both sides rotate by one angle."""
     if len(A) > MOST_AGREEING:
         return np.zeros(0, np.int64)
     cosines = (np.einsum("iab,jab->ij", T[:, :3, :3], T[:, :3, :3]) for T in (A, B))
@@ -198,11 +190,7 @@ class HeldOut(Record):
 
 
 def checked_poses(A: ArrayLike, B: ArrayLike, covs: ArrayLike | None, eye: Eye, centre: ArrayLike) -> Poses:
-    """Return poses as given, checked.
-
-    Raises:
-        InputError: wrong shapes, NaN, no rigid motions, an unknown eye.
-    """
+    """Return poses as given, checked."""
     if eye not in ("to_hand", "in_hand"):
         raise InputError(f"eye is {eye!r}; known are to_hand, in_hand")
     Ts_base_flange = checked(A, (None, 4, 4), "Ts_base_flange")

@@ -31,8 +31,7 @@ LATE_S, MOVING_M = 0.02, 1e-3
 STILL_M, STILL_RAD = 1e-4, 1e-3
 #: So many rows of one very pose are a log that stopped, where the target was seen this far apart, m.
 STOPPED, STOPPED_M = 3, 0.01
-#: Poses of one TCP agree within this, m and rad, with a constant transform from the model's flange; half: arms whose table
-#: is off by a degree have no TCP, double: other tools count as one.
+#: Poses of one TCP agree within this, m and rad, with a constant transform from the model's flange.
 TCP_M, TCP_RAD = 5e-3, 0.02
 STEP_RAD = 1e-6  # step of a joint for differences, rad
 
@@ -87,13 +86,7 @@ def recording_of(robot: Path) -> Path | None:
 def robot_in_recording(path: Path, frames: str | None, arm: Arm | None) -> PoseTable:
     """Read the poses of the flange that a recording holds, a row for each of its messages.
 
-    Args:
-        path: a ROS 1 or ROS 2 bag, or MCAP.
-        frames: BASE:FLANGE, of its transforms; None: the poses are those of the joints.
-        arm: the model whose joints are read, by their names.
-
-    Raises:
-        InputError: no such recording, frames that it does not have, or joints of other names.
+    ``frames``: BASE:FLANGE, of its transforms; None: the poses are those of the joints.
     """
     bag = Bag(path)
     joints = None if arm is None else read_joints(bag, arm.joint_names)
@@ -136,11 +129,7 @@ def robot_in_recording(path: Path, frames: str | None, arm: Arm | None) -> PoseT
 
 
 def at_shots(robot: PoseTable, seen: Seen) -> PoseTable:
-    """Return the poses of a recording at the times of the shots, interpolated; shots beside it, or in a gap, get no row.
-
-    Raises:
-        InputError: the shots have no times, or none is within the recording.
-    """
+    """Return the poses of a recording at the times of the shots, interpolated; no row beside it or in a gap."""
     assert robot.t_s is not None
     if seen.t_s is None:
         raise InputError(f"{robot.path}: pairs by time, and the images have none: --source bag:FILE reads its own")
@@ -181,11 +170,7 @@ def at_shots(robot: PoseTable, seen: Seen) -> PoseTable:
 
 
 def paired(robot: PoseTable, seen: Seen, in_hand: bool, arm: Arm | None) -> PairedPoses:
-    """Bring the rows together: by name where the robot's table has names that were seen, else by order.
-
-    Raises:
-        InputError: rows and images do not pair up, or hardly one shows the target.
-    """
+    """Bring the rows together: by name where the robot's table has names that were seen, else by order."""
     rows, matched = matched_rows(robot, seen.names)
     notes = [*robot.notes, *seen.notes, *_alone(robot, seen, rows, matched)]
     rows, matched = _once(robot, seen, rows, matched, notes)
@@ -219,10 +204,8 @@ def paired(robot: PoseTable, seen: Seen, in_hand: bool, arm: Arm | None) -> Pair
 def upright(A: Array, B: Array, symmetries: Sequence[Array]) -> tuple[Array, Rows]:
     """Decide which way up a board was that looks the same rotated: angles between poses are the same on both sides.
 
-    Args:
-        A: (N, 4, 4) poses of the flange.
-        B: (N, 4, 4) poses of the body, some of them rotated by a symmetry.
-        symmetries: the motions of the body that change nothing to see.
+    ``B``: (N, 4, 4) poses of the body, some of them rotated by a symmetry. ``symmetries``: the motions of the body that
+    change nothing to see.
 
     Returns:
         B with the rotated ones rotated back to agree with the first, and which symmetry was used, -1 for none.
@@ -274,15 +257,7 @@ def _alike(Ts: Array) -> Rows:
 
 
 def matched_rows(robot: PoseTable, seen: Sequence[str]) -> tuple[Rows, Rows]:
-    """Return the rows of both sides that belong together: by name where the robot's table has names, else by order.
-
-    Args:
-        robot: the robot's table.
-        seen: names of what was seen, one a row.
-
-    Raises:
-        InputError: no name is among those seen, or other numbers of rows.
-    """
+    """Return the rows of both sides that belong together: by name where the robot's table has names, else by order."""
     if robot.names is not None:
         there = {name: k for k, name in enumerate(seen)} | {Path(name).stem: k for k, name in enumerate(seen)}
         keys = [
@@ -362,10 +337,7 @@ def links_of(robot: PoseTable, arm: Arm | None, at: Array) -> Callable[[Array], 
 
     The joints are taken to give the table's very poses: such as scatter against them would be explained by errors of links.
 
-    Args:
-        robot: the table, N rows.
-        arm: the model.
-        at: (N,) what is called with, of each row: its number, or its time.
+    ``at``: (N,) what is called with, of each row: its number, or its time.
     """
     if arm is None or robot.q is None:
         return None
@@ -392,13 +364,8 @@ def of_streams(
 ) -> PairedPoses:
     """Return the rows of two streams that belong together.
 
-    Args:
-        robot: the flange's stream.
-        seen: the eye's.
-        sides: (M, 4, 4) the flange, interpolated, and (M, 4, 4) the target at the eye's times.
-        t_s: (M,) these times, eye's clock, s.
-        offset_s: added to them, they are the flange's.
-        in_hand: whether the arm carries the eye.
+    ``sides``: (M, 4, 4) the flange, interpolated, and (M, 4, 4) the target at the eye's times. ``t_s``: (M,) these
+    times, eye's clock, s. ``offset_s``: added to them, they are the flange's.
     """
     assert robot.t_s is not None
     assert seen.t_s is not None

@@ -76,13 +76,7 @@ class Measurements:
 
 
 class Moved(NamedTuple):
-    """A motion of the rig: what was measured is exp(xi) times the true pose of the tool, in the base's frame.
-
-    Attributes:
-        xi: (6,) tangent [m; rad].
-        cov: (6, 6) its covariance.
-        Ts_base_tool: poses (4, 4) of the tool that the arm visited, the newest last.
-    """
+    """A motion of the rig: what was measured is exp(xi) times the true pose of the tool, in the base's frame."""
 
     xi: Array
     cov: Array
@@ -101,14 +95,7 @@ class Moved(NamedTuple):
 
 
 class BaseMotion:
-    """Estimates a motion of the rig.
-
-    Args:
-        estimator: of the arm.
-        known: what it knew before the motion, and when, s.
-        begin_s: when the motion began, s.
-        slow: whether it goes on, else it was a jump.
-    """
+    """Estimates a motion of the rig from ``begin_s`` on, which goes on where it is ``slow``; ``known``: from before it."""
 
     def __init__(
         self, estimator: KalmanEstimator, known: tuple[float, Remembered], begin_s: float, *, slow: bool
@@ -174,8 +161,8 @@ class BaseMotion:
     def put_right(self, at_s: float) -> None:
         """Go on with measurements after a time, s, that are corrected by the motion as it was found.
 
-        Those before it, which are not, are not used. The arm's filter goes on from what it knew before: where the links are
-        in their backlash is not known any more.
+        Those before it are not used. The arm's filter goes on from what it knew before: where the links are is not
+        known any more.
         """
         n, d, self._right_s = self._n, slice(self._n, self._n + 6), at_s
         across = self._P[:n, n:].copy()

@@ -1,8 +1,6 @@
 """Changes of rig, body, joints and clock as hypotheses: their likelihoods, what they do to poses, and how they are said.
 
-In: hypotheses that the tests of :mod:`armsight.loop.health.fixed` and :mod:`armsight.loop.health.closure` fitted to what
-the estimator did. Out: pose measurements widened by what they may be off, and the record that names the best hypothesis
-and those that explain nearly as much.
+Hypotheses that the tests of ``fixed`` and ``closure`` fitted: what they may do to a pose widens it; the best is named.
 """
 
 from __future__ import annotations
@@ -30,11 +28,10 @@ LATER_S = 3.0
 DATED_S = 0.7
 #: The errors of an arm have longer tails than Gaussian ones: chi-squares count by this factor less.
 MARGIN = 1.4
-#: The estimate of a drift is off by about this share of it, in any direction: seen in simulated drifts of constant rate,
-#: whose beginning is not known exactly; real ones do not keep their rate.
+#: The estimate of a drift is off by about this share of it, in any direction (simulated drifts of constant rate).
 _OTHERWISE = 0.08
-#: Chi-square (5) below which a motion of the cameras may be one along their optical axis alone: beyond it by chance once in
-#: a hundred.
+#: Chi-square (5) below which a motion of the cameras may be one along their optical axis alone: beyond it once in a
+#: hundred.
 _ALONG = chi_square_limit(5, 0.01)
 #: What the pair alone cannot distinguish from that.
 FOCAL = "; both focal lengths that changed alike look the same to the pair"
@@ -56,12 +53,7 @@ _CAUSES: dict[Kind, Cause] = {
 
 @dataclass(frozen=True, eq=False)
 class ToolView(Record):
-    """Who sees the tool.
-
-    Attributes:
-        T_base_rig: (4, 4) the rig in the base, m.
-        points: (N, 3) those of the body, in the tool's frame, m.
-    """
+    """Who sees the tool: T_base_rig (4, 4), m, and points (N, 3) of the body in the tool's frame, m."""
 
     T_base_rig: Array
     points: Array
@@ -71,10 +63,6 @@ class ToolView(Record):
 
         Points appear nearer along the optical axis by that share of their depth; the body is fitted to them. With A the
         scatter of its points and a the axis, it rotates by -(tr A - A)^-1 (A a x a) about their mean.
-
-        Args:
-            R: (..., 3, 3) rotation of the tool in the base.
-            p: (..., 3) its position, m.
         """
         origin, axis, middle = self.T_base_rig[:3, 3], self.T_base_rig[:3, 2], self.points.mean(axis=0)
         A = (self.points - middle).T @ (self.points - middle)
@@ -107,12 +95,9 @@ def changing(parts: ErrorLayout, H: Array, seen: ToolView | None = None) -> Arra
 
 
 def bending(down: Array) -> Array:
-    """Return what (..., 6, 4) a body does that bends under gravity: its tangent by a beam's (3), rad, and a shift, m.
+    """Return what (..., 6, 4) gravity does: a body's tangent by a beam's (3), rad, and a shift, m; ``down`` (..., 3) unit.
 
     A beam along an axis a of the tool, which bends by an angle where it is level, rotates its end by that times a x down.
-
-    Args:
-        down: (..., 3) unit vector downwards in the tool's axes.
     """
     by = np.zeros((*down.shape[:-1], 6, 4))
     by[..., :3, 3], by[..., 3:, :3] = down, np.cross(np.eye(3), down[..., None, :]).swapaxes(-1, -2)
@@ -156,10 +141,7 @@ class Suspect:
 
     @property
     def freedom(self) -> int:
-        """How many numbers it counts as.
-
-        A zoom, and a shift by gravity, as many as a motion of the rig: they look like one, and are rarer.
-        """
+        """Return as how many numbers it counts: a zoom and a shift by gravity as the motion of the rig they look like."""
         return 6 if self.kind in ("zoom", "bend") else self.columns.stop - self.columns.start
 
 
@@ -265,7 +247,6 @@ def suspected(measurement: PoseMeasurement, changes: Sequence[Change]) -> Array 
     """Return the covariance (6, 6) of what hypotheses do to a pose measurement of the tool; None where they do nothing.
 
     It is that of their mixture: of each the square of what it does, and its covariance; what happened besides adds to it.
-    Those that were put right before say nothing.
     """
     shaken = [each for each in changes if each.suspect.kind == "shake"]
     changes = [each for each in changes if each.suspect.kind != "shake"]
@@ -323,11 +304,6 @@ def along_axis(motion: Array, cov: Array, axis: Array) -> bool:
 
     Both focal lengths that are longer by the same share displace all points along the optical axis, in proportion to their
     depth, and rotate nothing: at one depth that is such a motion of the cameras.
-
-    Args:
-        motion: (6,) tangent [m; rad].
-        cov: (6, 6) its covariance.
-        axis: (3,) unit vector in the same frame.
     """
     across = np.zeros((5, 6))
     across[:2, :3], across[2:, 3:] = np.linalg.svd(axis[None])[2][1:], np.eye(3)
@@ -337,12 +313,7 @@ def along_axis(motion: Array, cov: Array, axis: Array) -> bool:
 
 
 def finding(changes: Sequence[Change], names: Sequence[str]) -> HealthFinding:
-    """Return the finding of hypotheses that cannot be distinguished, the best first.
-
-    Args:
-        changes: they.
-        names: of the joints.
-    """
+    """Return the finding of hypotheses that cannot be distinguished, the best first."""
     best, kind, joint = changes[0], changes[0].suspect.kind, changes[0].suspect.joint
     others = [each for each in changes[1:] if {each.suspect.kind, kind} not in ({"rig", "drift"}, {"time", "rate"})]
     unsure = ""

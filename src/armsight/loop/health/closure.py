@@ -1,16 +1,8 @@
 """What changed since the arm was first watched: rig, body on the tool, a joint; by closure over a whole run.
 
-In: what the estimator did with each pose measurement. Out: the change that explains the measurements best. It is one of
-these: the rig jumped or drifts against the arm's base, both focal lengths changed alike, the body slipped on the tool, the
-zero of a joint's potentiometer jumped, the backlash of a joint grew.
-
-A filter follows what changes slowly. Here nothing is followed: the errors x of the arm's model are constants of the run.
-The residuals e are those of the measurements against the model as it was at the beginning,
-
-    e = H x + h f(t - s) d + n:
-
-a change d at a time s of some of the model's own parameters (h: their columns of H; f: a
-step, or a ramp). Residuals are averaged over blocks of time and travel. The covariance of the blocks' errors n is
+Nothing is followed: the errors x of the arm's model are constants of the run. Against the model as it was at the beginning
+the residuals are e = H x + h f(t - s) d + n: a change d at a time s of some of the model's own parameters (h; f: a step, or
+a ramp). Residuals are averaged over blocks of time and travel. The covariance of the blocks' errors n is
 estimated from the blocks, as the errors of an arm that no model explains are larger than the noise of a measurement. x is
 eliminated, and the chi-square of d against zero is the test. A pose that is visited again says the most: x cancels. Jumps
 of linear models: Willsky and Jones, "A generalized likelihood ratio approach to the detection and estimation of jumps in
@@ -41,8 +33,8 @@ from armsight.loop.health.change import (
     suspects,
 )
 
-#: A block lasts so long, s, and until all joints together have travelled so far, rad, but at most so long, s: an arm that
-#: stands says the same thing again and again.
+#: A block lasts so long, s, and until all joints have travelled so far, rad, but at most so long, s: arms at rest
+#: repeat.
 BLOCK_S, TRAVEL_RAD, MOST_S = 0.7, 0.1, 10.0
 #: Travel in which the filter forgets what no joint explains, rad.
 _POSE_TRAVEL_RAD = 1.0
@@ -50,15 +42,14 @@ _POSE_TRAVEL_RAD = 1.0
 _LEAST_BLOCKS, _AGAIN, _MOST_BLOCKS = 12, 4, 64
 #: Beginnings that are tried; the newer, the closer.
 _BEGINS = 12
-#: Blocks that are kept: then the older half is merged in pairs, and so on. half: an old beginning is known half as closely,
-#: double: 2 MB more.
+#: Blocks that are kept, older ones merged in pairs. half: an old beginning is known half as closely, double: 2 MB more.
 _MOST_KEPT = 160
 #: Errors of a block before any is seen (m, rad), and how many blocks that counts.
 _BLOCK_SIGMA, _BLOCKS = np.repeat([1.2e-4, np.radians(0.012)], 3), 8.0
 #: Priors so wide that they decide nothing: of a motion (m, rad), of a time, s, and of an angle, rad.
 _WIDE, _WIDE_S, _WIDE_RAD = np.repeat([0.05, 0.1], 3), 0.05, 0.1
-#: A motion of rig or body that displaces the tool by less than this, m, is not reported, nor a smaller angle, rad.
-#: What a link does within its backlash looks like a slip of a tenth of a degree.
+#: A motion that displaces the tool by less than this, m, is not reported, nor a smaller angle, rad (links in their
+#: backlash).
 _LEAST_M, _LEAST_RAD = 2e-4, float(np.radians(0.3))
 #: By so much the chi-square of a drift must exceed that of a jump.
 _RARER = 5.0
@@ -68,10 +59,7 @@ _FINE, _NEAR = 8, 0.5
 
 @lru_cache
 def _limits(joints: int) -> dict[int, float]:
-    """Return chi-square beyond which a change of so many parameters is reported, of an arm of n joints.
-
-    All suspects and the beginnings that are tried share the probability of a false alarm.
-    """
+    """Return chi-square beyond which a change of so many parameters is reported; all suspects share the false alarms."""
     hypotheses = len(suspects(joints)) * _BEGINS
     return {freedom: MARGIN * alarm_limit(freedom, 1.0 / BLOCK_S, hypotheses) for freedom in (1, 4, 6, 7, 10, 12)}
 
@@ -80,9 +68,8 @@ def _limits(joints: int) -> dict[int, float]:
 def _unsure(joints: int, blocks: int) -> dict[int, float]:
     """Return by how much chi-square must exceed its limit before a change of so many parameters is reported at first.
 
-    A side of a backlash that is wrongly known displaces some blocks along one joint, and the covariance of the blocks'
-    errors is estimated from so many of them: what one number explains has the tails of Student's t. Six numbers are not
-    mimicked by one joint.
+    A side of a backlash that is wrongly known displaces some blocks along one joint: what one number explains has the
+    tails of Student's t.
     """
     hypotheses = len(suspects(joints)) * _BEGINS
     single = MARGIN * alarm_limit(1, 1.0 / BLOCK_S, hypotheses, blocks)
@@ -90,10 +77,7 @@ def _unsure(joints: int, blocks: int) -> dict[int, float]:
 
 
 class _Tested(NamedTuple):
-    """A hypothesis at its best beginning, a block; size, covariance, chi-square, how far that is above its limit.
-
-    And what it leaves unexplained, over what the blocks leave where nothing changed.
-    """
+    """A hypothesis at its best beginning, a block; what it leaves unexplained, over what the blocks leave without it."""
 
     suspect: Suspect
     begin: int
@@ -113,10 +97,7 @@ class _Block:
 
 
 class _RunningSums:
-    """Running sums over blocks: what steps and ramps of the parameters that may change need, one row a block.
-
-    A column holds the moments with 1, t and t^2, flat; the sum from a beginning on is the last row less the one before it.
-    """
+    """Running sums over blocks: what steps and ramps of the parameters that may change need, one row a block."""
 
     def __init__(self) -> None:
         self.rows: list[tuple[Array, ...]] = []
@@ -153,16 +134,10 @@ class _RunningSums:
 class ClosureWatch:
     """Watches a whole run for changes.
 
-    Args:
-        sigmas: (K,) standard deviations of the filter's state before anything was measured.
-        joints: how many the arm has.
-        seen: who sees the tool; None where that is not known.
-
     Attributes:
         changes: the hypotheses that explain best what was found, the best first; empty while all is well.
         explained: the same by the newest test, also where it is smaller than is reported: what another test reports.
         certain: of these what is as certain as what is reported at first: poses are widened by it.
-        strongest: of all tests the largest chi-square over its limit.
     """
 
     def __init__(self, sigmas: Array, joints: int, seen: ToolView | None = None) -> None:
@@ -315,8 +290,6 @@ class ClosureWatch:
         """Return all hypotheses at beginnings between the neighbours of those at which some come near their limits.
 
         The block into which a change falls has an error that no beginning explains, beside which the others look small:
-        without it a change may be clear that was not with it. A jump between two beginnings looks like a drift. Nothing is
-        returned where no hypothesis comes near.
         """
         limits = _limits(self._parts.joints)
         near = [each for each in found if each.above > -_NEAR * limits[each.suspect.freedom]]
@@ -408,11 +381,8 @@ class ClosureWatch:
     ) -> list[_Tested]:
         """Test hypotheses at beginnings (S,); return each at the one of largest chi-square.
 
-        Args:
-            begins: blocks.
-            hypotheses: to test.
-            without: a block that is left out, as the change fell into it, and what the model leaves unexplained with it;
-                what leaving it out explains counts for the beginning.
+        ``without``: a block that is left out, as the change fell into it, and what the model leaves unexplained with
+        it; what leaving it out explains counts for the beginning.
         """
         t = np.array(self._t)
         N, b, square, gained = self._N, self._b, self._square, 0.0

@@ -15,8 +15,7 @@ which of them is named.
 
 What moves to and fro within a second: a mount that nods, a stand that shakes; it averages out where a mean is tested.
 
-In: values with the covariance that their noise explains, of single shots. Out: the covariance of what they scatter beyond
-that. Of each second a parabola is removed, as calibrations and arms are off by what changes slowly with the pose. The rest
+Of each second a parabola is removed (calibrations and arms are off by what changes slowly with the pose). The rest
 is compared with its expectation in the axes of the noise (principal axes of one covariance relative to another); an axis
 counts where chance does not explain its variance. Moments of a component of variance: Searle, Casella, McCulloch,
 "Variance Components", 1992.
@@ -68,15 +67,7 @@ class _Fitted(NamedTuple):
 
 
 class FixedWatch:
-    """Watches whether rig, body, potentiometers and clock stay as they are.
-
-    Args:
-        joints: how many the arm has.
-
-    Attributes:
-        changes: the hypotheses of the test that found the clearest change, the best first; empty where none was found.
-        reopened: how many times the estimator dropped what it had learned, and when it first did, s.
-    """
+    """Watches whether rig, body, potentiometers and clock stay as they are."""
 
     def __init__(self, joints: int) -> None:
         at = self._parts = layout(joints)
@@ -141,15 +132,7 @@ class FixedWatch:
         self._last_s, self._newest = t_s, innovation
 
     def _sum(self) -> None:
-        """Add the measurements since the newest beginning to the sums of all beginnings.
-
-        All are linear in F as it was before them, which is large and is passed over once: with G of all of them stacked,
-
-            (I + L) G = A F + Q,    F = kept F - U G + R
-
-        where L holds what the gains of earlier ones do to later ones (block triangular), and Q and R what the ramps add,
-        for all beginnings the same. A, Q, L and G are whitened.
-        """
+        """Add the measurements since the newest beginning to the sums of all: (I + L) G = A F + Q, G stacked, whitened."""
         shots, self._shots = self._shots, []
         if not shots:
             return
@@ -257,13 +240,13 @@ def _reopened_finding(count: int, first_s: float) -> HealthFinding:
     )
 
 
-#: Terms of the polynomial that is removed of each window; half: the arm's own errors count as shaking, double: shaking
-#: below 4 Hz does not.
+#: Terms of the polynomial that is removed of each window; half: arms' errors count as shaking, double: below 4 Hz does
+#: not.
 _TERMS = 3
 #: Shots of a window at the least; half: the polynomial takes most of what they show, double: slow cameras are not watched.
 _LEAST = 8
-#: Newest windows that count, without the share of them that varies most: a jump is in one of them, what shakes in all; and
-#: how many there must be. Half: a jump counts for as long as a window does, double: shaking is found after twice the time.
+#: Newest windows that count, without the share that varies most (a jump), and how many there must be.
+#: Half: a jump counts for as long as a window does, double: shaking is found after twice the time.
 _NEWEST, _ODD, _FEWEST = 20, 0.25, 4
 
 #: Length of a window of innovations, s; half: shaking below 4 Hz is taken for the arm, double: the arm for shaking.
@@ -285,11 +268,8 @@ class Unrest:
     def take(self, t_s: Array, values: Array, covs: Array, excess: float = 1.0) -> None:
         """Take a window.
 
-        Args:
-            t_s: (N,) times, s.
-            values: (N, D) of its shots.
-            covs: (N, D, D) covariances of their noise.
-            excess: by how much the variance of the noise is larger than they say.
+        ``values``: (N, D) of its shots. ``covs``: (N, D, D) covariances of their noise. ``excess``: by how much the
+        variance of the noise is larger than they say.
         """
         if len(t_s) < _LEAST or not np.ptp(t_s) > 0.0:
             return
@@ -328,11 +308,7 @@ class Unrest:
 
 
 class ShakeWatch:
-    """Watches whether rig and arm shake against each other, by what the estimator leaves of poses within a second.
-
-    Attributes:
-        change: what it adds to poses; None while nothing shakes.
-    """
+    """Watches whether rig and arm shake against each other, by what the estimator leaves of poses within a second."""
 
     def __init__(self) -> None:
         self._unrest, self._window = Unrest(6), list[tuple[float, Array, Array]]()

@@ -46,8 +46,7 @@ MOST_SIGMA_M, MOST_APART_M = 2e-4, 2e-4
 _MOST_BY_ARM_M = 4e-4
 #: It is refined where its sigma fell to such a share, until it is so small, m.
 _REFINED, _KNOWN_M = 0.85, 1e-4
-#: It is refined, too, where what is left of it displaces the tool by more than this, squared sigmas of three numbers
-#: (chance of 1e-3): a drift goes on.
+#: Refined where what is left displaces the tool by more than this, squared sigmas of three numbers (chance of 1e-3).
 _MORE = 16.3
 #: A motion that began so much earlier or later than was thought is estimated anew, s.
 _SAME_S = 0.3
@@ -145,10 +144,6 @@ def correction_lines(corrections: Sequence[RigCorrection], rejected: str | None)
 class RigFollower:
     """Decides when a rig can be put right, and by how much.
 
-    Args:
-        rig: as it was calibrated; it must have a covariance.
-        body: what is measured.
-
     Attributes:
         rejected: why what was found is not put right yet; None where nothing was found, or all was put right.
     """
@@ -166,11 +161,7 @@ class RigFollower:
     ) -> Callable[[], RigCorrection | None] | None:
         """Return what computes a correction, or why there is none; None where nothing is found to have moved.
 
-        Args:
-            monitor: what was found.
-            poses: returns time, s, and pose of the newest shots, measured with the rig as it is, in order of time.
-            T_base_rig: (4, 4) the rig in the base as it is taken to be, m.
-            at_s: the time, s.
+        ``poses``: returns time, s, and pose of the newest shots, measured with the rig as it is, in order of time.
         """
         again = monitor.changes or monitor.rig_moved() is not None or monitor.cameras_moved() is not None
         if self._put_right is not None and again:
@@ -230,12 +221,9 @@ class RigFollower:
     ) -> RigCorrection | None:
         """Return the cameras put right; None where the poses do not suffice, as ``rejected`` says.
 
-        Args:
-            since_s: since when the cameras are found to have moved, s.
-            poses: time, s, and pose of shots measured with the rig as it is, in order of time.
-            at_s: the time, s.
-            settle_s: so long after ``since_s`` shots may still be from before, s.
-            mounted: whether hand-eye stands on the poses before: then only the change may be estimated, which needs them.
+        ``poses``: time, s, and pose of shots measured with the rig as it is, in order of time. ``settle_s``: so long
+        after ``since_s`` shots may still be from before, s. ``mounted``: whether hand-eye stands on the poses before:
+        then only the change may be estimated, which needs them.
         """
         used = _differing([pose for t_s, pose in poses if t_s >= since_s + settle_s])
         before = _differing([pose for t_s, pose in poses if t_s < since_s - settle_s])
@@ -271,11 +259,8 @@ class RigFollower:
     ) -> RigCorrection | None:
         """Return the rig put right by what fixed bodies show; None where that does not suffice, as ``rejected`` says.
 
-        Args:
-            since_s: since when the cameras are found to have moved, s.
-            motion: (6,) of the cameras, right tangent in the left one's frame, [m; rad], and its covariance.
-            at_s: the time, s.
-            p_left: (3,) where the body on the tool is, in the left camera's frame, m.
+        ``motion``: (6,) of the cameras, right tangent in the left one's frame, [m; rad], and its covariance.
+        ``p_left``: (3,) where the body on the tool is, in the left camera's frame, m.
         """
         at_body = np.hstack([np.eye(3), -skew(p_left)])
         sigma_m = float(np.sqrt(np.linalg.eigvalsh(at_body @ motion[1] @ at_body.T)[-1]))
@@ -293,11 +278,8 @@ class RigFollower:
     ) -> RigCorrection | None:
         """Return the rig put right by what the arm's poses show; None where they do not suffice, as ``rejected`` says.
 
-        Args:
-            changes: the hypotheses that explain them, the best first.
-            T_base_rig: (4, 4) the rig as it was calibrated, m.
-            at_s: the time, s.
-            moved: the motion of the rig, if it is one; None where nothing was measured after it.
+        ``T_base_rig``: (4, 4) the rig as it was calibrated, m. ``moved``: the motion of the rig, if it is one; None
+        where nothing was measured after it.
         """
         best = changes[0]
         others = [each for each in changes[1:] if each.suspect.cause != "fixed" and not each.besides]
@@ -328,11 +310,7 @@ class RigFollower:
     ) -> RigCorrection | None:
         """Return a correction by the arm's poses that replaces an earlier one; None where they hardly say more of it.
 
-        Args:
-            right: the earlier one.
-            T_base_rig: (4, 4) the rig as it was put right, m.
-            at_s: the time, s.
-            moved: what is left of the motion.
+        ``moved``: what is left of the motion.
         """
         assert right.tool_m is not None
         if moved is None:

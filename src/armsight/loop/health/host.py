@@ -1,8 +1,7 @@
 """The computer: images that it delivers twice, and stalls of the control loop.
 
-In: measured poses with their detections, and how late the periods of the loop begin. Out: a finding once so many shots
-repeat the one before to the last digit (the noise of a camera differs from image to image, so two images never have the
-same detections by chance), and once periods began so late that commands were missed.
+Images that repeat the one before to the last digit (noise differs), and periods that began so late that commands were
+missed.
 """
 
 from __future__ import annotations

@@ -38,8 +38,6 @@ class _Landmark:
     """A fixed body.
 
     Attributes:
-        name: of the body.
-        T_left_body: its first pose; None before it was seen.
         reference: (6,) mean tangent of the first poses from that; None before there are enough.
         tangents: those of the mean that is being made, and when the first of them was seen, s.
         newest: (6,) tangent of the newest mean from the reference, its covariance (6, 6), and since when it is, s.
@@ -84,9 +82,6 @@ _PATIENCE = 4
 
 class LandmarkWatch:
     """Watches the poses of fixed bodies.
-
-    Args:
-        names: of the bodies.
 
     Attributes:
         cameras_moved: whether the cameras were found to have moved.

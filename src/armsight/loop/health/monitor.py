@@ -31,15 +31,14 @@ if TYPE_CHECKING:
 
 #: So long after measurements contradicted what was learned the cause is open, s: the tests need some shots to find it.
 DOUBT_S = 2.0
-#: What the estimator knows is kept every so often, s, to go on from there once something was put right: all of the newest
-#: seconds, and of what is older each time whose age is by this factor less than that of the one before. half of what the
-#: factor exceeds 1 by: 5 MB more, double: what was learned just before an old change is lost.
+#: Knowledge is kept every so often, s, to go on from: all of the newest seconds, older ones each older by this factor.
+#: half of what the factor exceeds 1 by: 5 MB more, double: what was learned just before an old change is lost.
 _KEEP_S, _ALL_S, _RATIO = 1.0, 20.0, 1.2
-#: Stamps that ran fast are put right to about so much, s; half: joints are blamed for the rest, double: poses in motion are
-#: given too wide for some seconds.
+#: Stamps that ran fast are put right to so much, s; half: joints are blamed for the rest, double: moving poses are too
+#: wide.
 _RIGHT_S = 3e-3
-#: While a clock that is followed is known no better than to this, s, the arm's tests wait; half: they may wait for long,
-#: double: joints are blamed for what is not known of it.
+#: While a clock is known no better than this, s, the arm's tests wait; half: they may wait for long, double: joints are
+#: blamed.
 _KNOWN_S = 6e-4
 #: Rate and offset of a clock are said beyond so many sigmas.
 _CLOCK_SIGMAS = 4.0
@@ -53,9 +52,6 @@ class HealthMonitor:
         body: the body that is measured.
         sync_s: standard deviation of the time between the two exposures of a shot, s.
         printed: whether the body is a print whose shape a calibration found: its points are not tested.
-
-    Attributes:
-        stamps: what makes the times of the shots from their stamps; None where nothing does.
     """
 
     def __init__(self, rig: StereoRig, body: Body, sync_s: float, *, printed: bool = False) -> None:
@@ -90,10 +86,7 @@ class HealthMonitor:
         self._past: tuple[Change, ...] = ()
 
     def received(self, pose: PoseEstimate, t_s: float | None) -> PoseEstimate:
-        """Do as :meth:`measured` without the tests, which :meth:`work` makes: a command is waiting for the pose.
-
-        What is suspected is that of the shots before.
-        """
+        """Do as :meth:`measured` with what was suspected of the shots before; :meth:`work` makes the tests."""
         self._poses.append((pose, t_s))
         return self._widened(pose)
 
@@ -117,12 +110,7 @@ class HealthMonitor:
             self._cameras_s = min(begins, default=-np.inf) - TEST_S
 
     def measured(self, pose: PoseEstimate, t_s: float | None) -> PoseEstimate:
-        """Take a measured pose, in order of time; return it with what is suspected added to its covariance.
-
-        Args:
-            pose: as it was measured.
-            t_s: time of its shot, s; None where it has none.
-        """
+        """Take a measured pose, in order of time (s, None without); return it with what is suspected in its covariance."""
         self._take(pose, t_s)
         return self._widened(pose)
 
@@ -168,13 +156,7 @@ class HealthMonitor:
         return () if self._landmarks is None else self._landmarks.never_seen
 
     def follow(self, estimator: KalmanEstimator, arm: Arm, mounting: Mounting | None = None) -> None:
-        """Watch from now on, by what an estimator makes of the poses, whether rig, body and joints stay as they are.
-
-        Args:
-            estimator: it.
-            arm: the arm.
-            mounting: of rig and body; None where it is not known.
-        """
+        """Watch from now on, by what an estimator makes of the poses, whether rig, body and joints stay as they are."""
         from armsight.loop.health.base_motion import Measurements  # not above: what measures a pair needs no filter
 
         self._estimator, self._arm = estimator, arm
@@ -226,10 +208,7 @@ class HealthMonitor:
         return cameras.since_s, *motion
 
     def recalibrated(self, correction: RigCorrection) -> None:
-        """Begin the tests of cameras and bodies anew, for cameras that were put right before anything relied on them.
-
-        Of what these tests found what began before the cameras moved, or is of another cause, stays found.
-        """
+        """Begin the tests of cameras and bodies anew, once cameras were put right; what has another cause stays found."""
         self._kept += self._left(correction)
         self._renew(correction)
 
@@ -240,11 +219,7 @@ class HealthMonitor:
             self._watch_cameras(self._rig.rig)
 
     def put_right(self, correction: RigCorrection) -> Remembered | None:
-        """Begin anew after a correction; what was found stays found.
-
-        Returns:
-            What the estimator knew before the change, with which it goes on; None without one.
-        """
+        """Begin anew after a correction; what was found stays. Return what the estimator goes on with, if there is one."""
         at_s, since_s = correction.at_s, correction.since_s
         self.work()
         right = [each for each in self._tested(correction) if self._explained(each, correction)]
@@ -292,7 +267,6 @@ class HealthMonitor:
         """Return what else they found: that goes on though its test does not know of it any more.
 
         Cameras that moved against each other displace all poses, which arm and bodies then seem to explain: of what began
-        with them, or later, only joints count, which may be meant as well. The tests find again what is still wrong.
         """
         left, cause = list[HealthFinding](), correction.cause
         for each in self._tested(correction):
@@ -425,11 +399,7 @@ class HealthMonitor:
         return changes if self._shakes.change is None else (*changes, self._shakes.change)
 
     def findings(self, *, ends: bool = True) -> tuple[HealthFinding, ...]:
-        """Return what was found so far; nothing while all is well.
-
-        Args:
-            ends: whether the shots of the newest second count, too, for which their test is made at once.
-        """
+        """Return what was found so far; where it ``ends``, the newest second is tested at once."""
         self.work()
         sigma_s = 0.0 if self._estimator is None else self._estimator.settings[1].sigma_s
         late = () if self._clock is None else _clock_findings(self._clock, self._newest_s, sigma_s)

@@ -43,13 +43,13 @@ from armsight.loop.health.residuals import UNKNOWN_SHARE, ExposedShot, ResidualS
 
 #: Standard deviations that are tried of the times that each shot has of its own, s, and that of the times that all share.
 _APART_S, _SHARED_S = (0.0, *(1e-3 * 2.0**k for k in range(-2, 7))), 0.03
-#: Standard deviations that are tried of what is anew in each shot: rotations about an axis, rad, a focal length's share.
+#: Standard deviations that are tried of each shot's rotation about an axis, rad, or a focal length's share.
 #: Half: a nod of 0.1 deg counts for less against times, double: one of 0.3 deg counts, too, in which poses are not linear.
 _NOD_RAD = tuple(1e-5 * 2.0**k for k in range(9))
 #: Log-evidence by which a hypothesis must be ahead of all others to be taken; half: chance takes one of 100 tests for it.
 _AHEAD = math.log(1e4)
-#: And by this share of the log-evidence of what stays: its residuals are linear, and those of the test in which it began
-#: are of both times. Half: a camera that rotates by 0.2 deg is a lens that breathes, double: slow breathing is a rotation.
+#: And by this share of the log-evidence of what stays: the test in which it began is of both times.
+#: Half: a camera that rotates by 0.2 deg is a lens that breathes, double: slow breathing is a rotation.
 _MODELLED = 0.05
 #: Hypotheses whose log-evidence is nearer than this are not distinguished: 12 of chi-square.
 _ALIKE = 6.0
@@ -64,16 +64,13 @@ _TIMES = [0, 7, 8, 9]
 #: Standard deviation of the focal length of a test, as a share: so wide that it decides nothing beside the column's own.
 #: It stands so many rows after the parameters; against what stays its variance is this share of that.
 _FOCAL, _FOCAL_ROW, _FOCAL_VARIANCE = 0.05, 7, 0.01
-#: So many newest doubtful tests are explained together; half: slow breathing is taken for a change that stays, double: more
-#: time and memory.
+#: Newest doubtful tests explained together; half: slow breathing is taken for a change that stays, double: more time.
 TOGETHER = 12
-#: Newest tests in which something passed that are listed, to size it; half: hours of it are sized a little worse, double:
-#: 0.3 MB more.
+#: Newest tests listed in which something passed; half: hours of it are sized a little worse, double: 0.3 MB more.
 _LISTED = 300
 #: Standard deviations of coefficients that are tried, px; 0 is none.
 _TAU_PX = np.array([0.0, *(1e-3 * 2.0**k for k in range(7))])
-#: Before anything is seen none is so much more probable than any other; half: fine noise counts as it, double: what some
-#: webcams leave is known later.
+#: None is at first so much more probable than any other; half: fine noise counts, double: webcams' is known later.
 _NONE = 30.0
 #: This share of tests says nothing of it: what changed within them looks alike. half: one counts by 0.7 more, double: less.
 _ODD = 0.02
@@ -117,11 +114,7 @@ def _normal(shots: Sequence[tuple[Array, Array, float]]) -> tuple[Array, Array, 
 
 
 def apart(shots: Sequence[tuple[Array, Array, float]]) -> Apart:
-    """Return the times of exposure that explain residuals (n,) of shots best.
-
-    Args:
-        shots: residuals, what times of exposure do to them (n, 10), and weights.
-    """
+    """Return the times of exposure that best explain shots: residuals (n,), what times do to them (n, 10), and weights."""
     W, b, weights = _normal(shots)
     found = [_apart(each, W, b, weights) for each in _APART_S]
     return max(found, key=lambda each: each.gained - each.occam)
@@ -129,10 +122,6 @@ def apart(shots: Sequence[tuple[Array, Array, float]]) -> Apart:
 
 def nodding(shots: Sequence[tuple[Array, Array, float]], known: Array | None) -> tuple[Array, float, float]:
     """Return the covariance (4, 4) of what is anew in each shot, a camera's rotation or focal length, that explains most.
-
-    Args:
-        shots: residuals (n,), their derivatives by these (n, 4), and weights.
-        known: the one that tests before have shown: a camera that nods goes on; None without.
 
     Returns:
         It; what it explains of the sum of squares, and twice the logarithm of what chance explains with it.
@@ -163,10 +152,7 @@ def _apart(apart_s: float, W: Array, b: Array, weights: Array) -> Apart:
 def eliminate(found: Apart, shots: Sequence[tuple[Array, Array, float]], sums: ResidualSums) -> Array:
     """Take what times of exposure explain out of sums; return the right sides (4, 1 + K) of the times that all shots share.
 
-    Args:
-        found: they.
-        shots: whitened rows (n, 1 + K), what times of exposure do to them (n, 10), and weights.
-        sums: those of the rows.
+    ``shots``: whitened rows (n, 1 + K), what times of exposure do to them (n, 10), and weights.
     """
     shared = np.zeros((len(_TIMES), len(sums.M)))
     for rows, B, weight in shots:
@@ -180,10 +166,7 @@ def eliminate(found: Apart, shots: Sequence[tuple[Array, Array, float]], sums: R
 
 
 class _Rest(NamedTuple):
-    """A test's sums with what passes eliminated, what that explains of the sum of squares, and by chance.
-
-    The latter is twice a logarithm, and does not count times that all shots share.
-    """
+    """A test's sums with what passes eliminated; what that explains, and twice the log of what chance explains with it."""
 
     sums: ResidualSums
     gained: float
@@ -212,8 +195,6 @@ class _Doubtful:
     """A test that something other than chance explains.
 
     Attributes:
-        every: its sums.
-        rests: these with what passes eliminated.
         times: of exposure; None where those are not known.
         focal_share: the focal length's change in it, as a share, everything else right.
         counted: what passes, as it was counted last; None where that is what stays.
@@ -242,10 +223,7 @@ class _Doubtful:
         return cls(every, rests, times, _FOCAL * float(M[0, row] / (M[row, row] + 1.0)))
 
     def shows(self, cause: Passes | None, excess: float) -> bool:
-        """Return whether a cause explains more than chance, of a noise whose variance is so many times larger.
-
-        A camera that nods does so in each test.
-        """
+        """Return whether a cause explains more than chance, of a noise whose variance is so many times larger."""
         return cause in self.rests and (cause == "rig" or self.rests[cause].shows(excess))
 
 
@@ -261,12 +239,6 @@ def _without(
 
     A focal length is another in each test, the times that shots share are the same in all: what differs, shots have of
     their own.
-
-    Args:
-        tests: they.
-        cause: it.
-        excess: variance of the noise.
-        shares: (N, 1 + K) what the parameters of the sums are in each test, as a share of what they are in the newest.
     """
     sums, occam, prior = tests[0].every.copied(), 0.0, np.eye(len(_TIMES)) / _SHARED_S**2
     sums.scale(0.0)
@@ -359,9 +331,8 @@ class Passing:
     """What was found that changes and does not stay; one of a watch.
 
     Attributes:
-        apart: of the tests in which the exposures were apart, when each began, s, and how.
-        focal: of those in which one focal length against the other explained most, when each began, s, and its change.
-        nods: of those in which another rotation of a camera in each shot did, when each began, s.
+        apart, focal, nods: the tests in which exposures were apart, a focal length or a camera's rotation changed:
+        when, s, and how.
         apart_s: standard deviation of the times in the newest test, those that its shots share included, s.
         focal_share: the focal length's change in it.
         unsure: causes that explained the newest doubtful test nearly as well as what was taken.
@@ -400,13 +371,9 @@ class Passing:
 
         What was decided of earlier ones of them is taken back where another cause explains all of them better.
 
-        Args:
-            every: the sums of the newest: parameters, seven numbers, candidates, the first of which is a focal length.
-            stays: see :data:`Staying`.
-            size: K, how many parameters there are.
-            times: of exposure that explain it; None without.
-            nods: its sums with another rotation of a camera in each shot eliminated, and twice the logarithm of what chance
-                explains with that; None without.
+        ``every``: the sums of the newest: parameters, seven numbers, candidates, the first of which is a focal length.
+        ``times``: of exposure that explain it; None without. ``nods``: its sums with another rotation of a camera in
+        each shot eliminated, and twice the logarithm of what chance explains with that; None without.
 
         Returns:
             What explains the newest test, None where it is something that stays; and when those tests began, s, that were
@@ -454,12 +421,7 @@ class Passing:
         self.focal_share = newest.focal_share if newest.counted == "lens" else 0.0
 
     def added(self, exposed: ExposedShot, by_focal: Array) -> Array:
-        """Return the covariance (6, 6) of a pose by what is passing now.
-
-        Args:
-            exposed: its shot.
-            by_focal: (6,) its response to a focal length, in units of ``_FOCAL``.
-        """
+        """Return the covariance (6, 6) of a pose by what passes now; by_focal: (6,) its response, per ``_FOCAL``."""
         added = np.zeros((6, 6))
         if self.apart_s:
             by = self.apart_s * exposed.response()
@@ -572,12 +534,10 @@ class Leftover:
     def seen(self, sums: ResidualSums, lens: int, points: int, seven: slice, share: float) -> tuple[float, Array]:
         """Return of a test the variance of its noise, kappa, and the log-evidence of each tau that is tried.
 
-        Args:
-            sums: of all that may have changed, in units of its priors, and of the coefficients, px, which stand last.
-            lens: how many coefficients there are.
-            points: how many numbers before them are of single points: these are as before for the evidence.
-            seven: which of the sums are the seven numbers: for the evidence they are those of the test before.
-            share: of the shots those that differ from each other.
+        ``sums``: of all that may have changed, in units of its priors, and of the coefficients, px, which stand last.
+        ``points``: how many numbers before them are of single points: these are as before for the evidence. ``seven``:
+        which of the sums are the seven numbers: for the evidence they are those of the test before. ``share``: of the
+        shots those that differ from each other.
         """
         first = len(sums.M) - lens
         H, most = sums.H[: first - 1, : first - 1], float(_TAU_PX[-1])

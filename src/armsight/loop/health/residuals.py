@@ -28,12 +28,10 @@ from armsight.vision.rig import StereoRig
 MOST_POINTS = 24
 #: A displacement may be so large, m: what is further off is another thing.
 FURTHEST_M = 5e-3
-#: Shots that differ less than this share their errors (where a point is within its pixels, how it is lit) and count as one:
-#: translation over distance, and rotation, rad.
+#: Shots that differ less than this share their errors and count as one: translation over distance, and rotation, rad.
 _SAME = 0.01
 _SAME_COSINE = float(np.cos(_SAME))
-#: A point that a pose was measured without is another thing also where its two detections disagree by more than chance
-#: explains once in so many shots.
+#: A point left out is another thing also where its two detections disagree by more than chance, once in so many shots.
 _PAIRED = chi_square_limit(1, 1e-4)
 #: Fewer points than this say nothing of these numbers; shots further apart in time than this give no speed, s.
 _LEAST_POINTS, _APART_S = 4, 0.5
@@ -41,15 +39,14 @@ _LEAST_POINTS, _APART_S = 4, 0.5
 _LINEAR = 0.005
 #: The body's motion at a shot is that of so many newest ones, if these are of so short a time, s.
 TRACK, _LONGEST_S = 5, 1.0
-#: The velocity of measured poses is off by this share of the speed in any direction; half: rig and body are blamed for what
-#: is left of late images, double: less of them is seen.
+#: The measured velocity is off by this share in any direction; half: late images blame rig and body, double: less is
+#: seen.
 UNKNOWN_SHARE = 0.2
 #: An acceleration moves the body like so many seconds of it, where times are of a second.
 _BENT_S = 0.1
-#: Newest tests that are kept; half: what a change is compared with is forgotten sooner, double: 2 MB more. Those that are
-#: not kept are forgotten with this time constant, in tests.
+#: Newest tests kept; half: the comparison is forgotten sooner, double: 2 MB more. Older ones fade so, in tests.
 KEPT, _SETTLED = 30, 30.0
-#: So many newest tests, together, may be those after a change, or all; one that goes on is looked for in more than STEPS.
+#: So many newest tests together may follow a change; one that goes on is looked for in more than STEPS.
 #: half: steps are taken for it, double: it is found later.
 _AFTER, STEPS = (1, 2, 4, 8, 16), 4
 #: Beginnings that are tried first, and then all between the best one's neighbours.
@@ -170,11 +167,6 @@ class ShotResiduals(NamedTuple):
 class ShotReader:
     """Reads what single shots say of the parameters of a rig, a body and their times.
 
-    Args:
-        rig: the calibrated pair.
-        body: the body that is measured.
-        sync_s: standard deviation of the time between the two exposures of a shot, s.
-
     Attributes:
         points: (M,) rows of the body's points that are used.
         size: K, count of the parameters: the rig's, size and points of the body, readout and skew.
@@ -238,10 +230,7 @@ class ShotReader:
         return ShotResiduals(now_s, found, response, with_all, response_with_all, both)
 
     def linear_about(self, estimate: PoseEstimate) -> tuple[float, Array]:
-        """Return the size of the body over that of its file, and the pose (4, 4), about which residuals are linear.
-
-        Those of the file and of the estimate, unless the triangulated points are of another size (Umeyama, 1991).
-        """
+        """Return the size of the body over that of its file, and the pose (4, 4), about which residuals are linear."""
         p_body, p_left = self._p_body[estimate.points.ids], estimate.points.p_left
         middle_body, middle_left = p_body.mean(axis=0), p_left.mean(axis=0)
         from_body, from_left = p_body - middle_body, p_left - middle_left
@@ -281,13 +270,7 @@ class ShotReader:
 
 
 class ResidualSums:
-    """What whitened residuals say of K parameters: sums over their rows, degrees of freedom, and when they began.
-
-    Attributes:
-        M: (1 + K, 1 + K) sum of the outer products of rows [residual; derivatives].
-        freedom: degrees of freedom.
-        begin_s: when the first shot was, s.
-    """
+    """What whitened residuals say of K parameters: sums over their rows, degrees of freedom, and when they began."""
 
     def __init__(self, size: int, begin_s: float) -> None:
         self.M, self.freedom, self.begin_s = np.zeros((1 + size, 1 + size)), 0.0, begin_s
@@ -383,12 +366,7 @@ def total(tests: Sequence[ResidualSums], size: int) -> ResidualSums:
 
 
 class Onset(NamedTuple):
-    """A change that grew from nothing to what it is.
-
-    Attributes:
-        begin_s: when it began, s.
-        end_s: when it ended, s: of a step when it began, infinite of what goes on.
-    """
+    """A change that grew from nothing to what it is."""
 
     begin_s: float
     end_s: float = np.inf
@@ -405,14 +383,6 @@ class History:
     A change grows from nothing at the time of one test to what it is at another one, and stays; a step does at once. What
     the tests before it say of the first parameters, which do not change, counts with those after it. The test just before
     it may be of both times: it is left out.
-
-    Args:
-        size: K, count of the first parameters.
-        columns: K + P, of all, in units of their priors.
-
-    Attributes:
-        kept: sums of the newest tests.
-        count: how many there were.
     """
 
     def __init__(self, size: int, columns: int) -> None:
@@ -458,10 +428,7 @@ class History:
         return Onset(self._settled.begin_s, self._settled.begin_s)
 
     def windows(self, *, every: bool) -> list[Onset]:
-        """Return when a change may have begun, and ended.
-
-        Unless ``every``, those that begin with this test anew: as many windows as tests are looked at twice.
-        """
+        """Return when a change may have begun, and ended."""
         tests = len(self.kept)
         counts = [*(count for count in _AFTER if count < tests), tests]
         due = [(count, self.kept[-count].begin_s) for count in counts if every or self.count % min(count, STEPS) == 0]
@@ -485,12 +452,7 @@ class History:
         return self._added
 
     def since(self, onset: Onset, count: int | None = None) -> ResidualSums:
-        """Return the sums since a change began; all but the first parameters are what they were when it ended.
-
-        Args:
-            onset: when it began.
-            count: of the parameters after the first, those after these are zero; all if None.
-        """
+        """Return the sums since a change began; all but the first parameters are what they were when it ended."""
         size = self._size + count if count is not None else len(self._settled.b)
         if onset.end_s <= self._settled.begin_s:
             return total([self._settled, *self.kept], size)
@@ -525,10 +487,6 @@ class History:
         """Return the least that a change of the next parameters leaves, and when that began and ended.
 
         The test before its beginning, which may be of both times, counts as noise.
-
-        Args:
-            count: of these parameters.
-            oldest_s: when it may have begun before all tests that are kept, s; before all tests if None.
         """
         settled_s, tests, times_s = self._settled.begin_s, len(self.kept), [each.begin_s for each in self.kept]
         times_s.insert(0, settled_s if oldest_s is None or oldest_s >= times_s[0] else oldest_s)

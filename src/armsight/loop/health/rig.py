@@ -24,10 +24,6 @@ length is compared within each second, and what it varies beyond the noise is a 
 second does not show whole is one where it explains the tests better than anything else (``passing``). Images
 that were seen before, to the bit, say nothing new. What images leave in all that is near each other, for a second, is in
 the noise of each test, as large as the rig itself shows it (:class:`~armsight.loop.health.passing.Leftover`).
-
-What changes and does not stay is a hypothesis of each single test (:mod:`~armsight.loop.health.passing`): each shot's own
-times of exposure, a focal length. Where its evidence is the largest the test is counted with that eliminated, so that
-cameras are not blamed for it.
 """
 
 from __future__ import annotations
@@ -148,16 +144,7 @@ class LensError(Record):
 
 
 class _Newest(NamedTuple):
-    """The newest test.
-
-    Attributes:
-        whole: sums of all that may have changed, and of the lenses' coefficients, of the points that fit.
-        noise: variance of the noise.
-        evidence: log-evidence of what the lenses leave.
-        fits: sums with the lenses' coefficients eliminated, of all shots, and without those that fit worst.
-        every: the same of every point; where all points fit it is ``fits`` itself.
-        passes: whether what each shot has of its own explains it.
-    """
+    """The newest test; ``every`` is of every point, also those that do not fit."""
 
     whole: ResidualSums
     noise: float
@@ -171,8 +158,6 @@ class RigWatch:
     """Watches the calibrated pose of the cameras and the size and shape of the body.
 
     Args:
-        rig: the calibrated pair; without a covariance nothing can be tested.
-        body: the body that is measured.
         sync_s: standard deviation of the time between the two exposures of a shot, s.
         printed: whether the body is a print whose shape a calibration found: its points are not tested.
 
@@ -214,15 +199,15 @@ class RigWatch:
             rigid=printed or many,
             strained=not printed,
         )
-        # (K, K + 7 + C) what the parameters, the seven numbers and the candidates of the shape change of the parameters, in
-        # units of their priors: a test has sums of these.
+        # (K, K + 7 + C) what parameters, seven numbers and the shape's candidates change of the parameters, in units of
+        # priors.
         self._scaled = np.hstack([self.prior, self._by_fault * _WIDE, self._shape.by_wide])
         # The same with the coefficients of what the camera models lack, px.
         self._with_lens = np.zeros((self._size + LENS, self._scaled.shape[1] + LENS))
         self._with_lens[: self._size, :-LENS] = self._scaled
         self._with_lens[self._size :, -LENS:] = np.eye(LENS)
-        # What moves to and fro of the parameters: the right camera's rotation (3), rad, a focal length against the other;
-        # and what a focal length does of the right camera alone, and of the left one.
+        # What moves to and fro: the right camera's rotation (3), rad, a focal length against the other, of the right,
+        # of the left.
         last, (apart_f, both_f) = rig.parameter_count, self._focal.T
         self._to_and_fro = np.column_stack([np.eye(self._size)[:, last - 3 : last], apart_f])
         self._alone = np.column_stack([apart_f - 0.5 * both_f, apart_f + 0.5 * both_f])
@@ -255,15 +240,7 @@ class RigWatch:
         self._images: dict[bytes, None] = {}  # detections of shots that were summed, the newest last
 
     def take(self, estimate: PoseEstimate, t_s: float | None) -> Array:
-        """Take a measured pose.
-
-        Args:
-            estimate: the pose.
-            t_s: time of its shot, s; None where it has none.
-
-        Returns:
-            (6, 6) what the suspected errors add to the pose's covariance; zero while nothing is suspected.
-        """
+        """Take a measured pose with its time, s; return (6, 6) what the suspected errors add to its covariance."""
         now_s, self._timed = (float(self._shots), False) if t_s is None else (t_s, True)
         self._shots += 1
         if estimate.exposures is not None:
@@ -305,10 +282,7 @@ class RigWatch:
         return not known
 
     def _nodding(self, response: Array, T: Array, cov: Array) -> Array:
-        """Return the covariance (6, 6) that a camera which nods or a lens that breathes adds to a pose (4, 4).
-
-        Either camera may be the one; by a rotation of the left one, in whose frame poses are, the body moves as well.
-        """
+        """Return the covariance (6, 6) that a camera which nods or a lens that breathes adds to a pose (4, 4)."""
         if not cov.any():
             return np.zeros((6, 6))
         by_rotation = response[:, : self._size] @ self._to_and_fro[:, :3]
@@ -453,14 +427,7 @@ class RigWatch:
         own: Apart | None = None,
         cov: Array | None = None,
     ) -> ResidualSums:
-        """Return the sums of stays, of each the mean of its shots.
-
-        Args:
-            stays: they.
-            every: with points that do not fit.
-            own: times of exposure that are eliminated.
-            cov: (4, 4) of what moves to and fro; what one second shows of it if None.
-        """
+        """Return the sums of stays, each the mean of its shots, without ``own`` times of exposure and what moves."""
         sums = ResidualSums(self._full, stays[0][0].t_s if stays else 0.0)
         for alone in (True, False):  # those of one shot are summed at once
             shots = [
@@ -821,10 +788,7 @@ class RigWatch:
         return ended
 
     def moved_since_s(self) -> float | None:
-        """Return since when the cameras alone are found to have moved, s.
-
-        None where nothing or more was found, or only the newest test shows it.
-        """
+        """Return since when the cameras alone are found to have moved, s; None where nothing, or more, was found."""
         if not (self.alarm and self._timed and self.suspected is not None) or self.lens is not None or self._shaped:
             return None
         return None if self.only_newest() or self._to_blame(self.suspected) != ["rig"] else self._since_s

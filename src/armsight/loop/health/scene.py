@@ -48,8 +48,8 @@ _HIDDEN = 0.4
 _LEAST, _MAJORITY = 10, 0.5
 #: Residuals beyond so many sigmas do not agree; rounds in which that settles.
 _AGREES, _ROUNDS = 4.0, 8
-#: A camera rotated by less is not said, standard deviation, rad: mounts breathe and images are compressed. Half: what
-#: processing leaves is said, double: half a millimetre is not.
+#: A smaller rotation is not said, standard deviation, rad: mounts breathe. Half: compression is said, double: 0.5 mm is
+#: not.
 _FLOOR_RAD = np.radians(0.001)
 #: Depths from this, m, on are tried for a spot, and patches of both cameras that correlate less are different ones.
 _NEAREST_M, _ALIKE = 0.25, 0.8
@@ -242,12 +242,7 @@ def _saliency(image: Grey) -> Array:
 def _fitted(
     A: Array, d: Array, cov: Array, *, robust: bool = True
 ) -> tuple[Array, Array, Array, NDArray[np.bool_]] | None:
-    """Fit displacements d (K, 2) by A (K, 2, P), by least trimmed then weighted squares.
-
-    Returns:
-        The fit (P,), its covariance by what the residuals scatter, all squared distances (K,), and which spots agree (K,);
-        None where no majority does.
-    """
+    """Fit displacements d (K, 2) by A (K, 2, P): fit, covariance, squares (K,), which agree; None without a majority."""
     half = np.linalg.inv(np.linalg.cholesky(cov))
     white, e = half @ A, (half @ d[..., None])[..., 0]
     good = np.ones(len(d), np.bool_)
@@ -270,11 +265,7 @@ def _fitted(
 
 
 class SceneWatch:
-    """Watches the background of a pair of cameras.
-
-    Args:
-        rig: the calibrated pair.
-    """
+    """Watches the background of a pair of cameras."""
 
     def __init__(self, rig: StereoRig) -> None:
         self._rig = rig

@@ -12,11 +12,6 @@ r^T S^-1 r of the sum of squares, with
 where H and b are the sums, J selects the point, and M has the standard deviations of everything else as its columns. The
 point that explains most is taken, then the next one besides it, while one explains more than chance: a body that is bent.
 
-A change is a step, or a ramp that ended or goes on: then what it did at a test is its share of what it does at the end.
-
-What the sums from before a change say of everything else (M) is added to those from after it: a body may be off by its
-tolerance, but by the same all the time, so a point that moves is found where it moved by less than that.
-
 What may have changed and is not distinguished yet widens the poses: of each hypothesis (the seven numbers, focal lengths,
 a point, all points a little) the evidence against none (MacKay, 1992), of the newest test and of some newest ones together.
 Where the hypotheses together are more probable than that nothing changed, the second moment of their mixture is what poses
@@ -63,11 +58,10 @@ _ALIKE, _NECESSARY = 12.0, 1e-4
 _BESIDES = chi_square_limit(3, _NECESSARY)
 #: Probability, before a test, that it is the first one after any change; that a body is strained or bent as a print is.
 _RARE, _PRINTED = 1e-4, 0.1
-#: A smooth deformation is said from this log-evidence on; chance exceeds it in one of a thousand bodies at most (Markov),
-#: as a body's shape is the same in all tests. Half: one of thirty, double: a shear of 0.3 % widens poses without a word.
+#: A smooth deformation is said from this log-evidence on: one of a thousand bodies by chance (Markov).
+#: Half: one of thirty, double: a shear of 0.3 % widens poses without a word.
 _CERTAIN = float(np.log(1e3))
-#: Strain, shear and what bending adds at the body's edge, as a share of its radius: widths of their priors; half: an
-#: elongation of 0.3 % is found later, double: one of 0.1 % is.
+#: Priors' widths of strain, shear, bending, as a share of the radius; half: 0.3 % is found later, double: 0.1 % is.
 _STRAINS = (1e-3, 4e-3)
 #: All points may be displaced by about so much, m.
 _BENT_M = (2e-4, 1e-3)
@@ -175,14 +169,9 @@ class ShapeWatch:
     """Watches the shape of the body, and the focal lengths of the cameras against each other.
 
     Args:
-        size: K, of the parameters.
         focal: (K, 2) what relative changes of the focal lengths change of these: of the left one by a half and of the right
             one by minus a half, and of both.
-        first: row of the first parameter of the points.
-        points: (N, 3) those that have parameters, m.
-        names: of them.
         tolerance_m: standard deviation of each of their coordinates, m.
-        test_s: how often it is tested, s.
         rigid: whether single points are not tested.
         strained: whether the body may be elongated, sheared or bent: not a print whose shape a calibration found.
 
@@ -210,8 +199,8 @@ class ShapeWatch:
     ) -> None:
         K, n = size, len(names)
         self._size, self._first, self._names = K, first, names
-        # (K, 2 + 3 N) what a unit of each candidate changes of the parameters: of the focal lengths against each other,
-        # of both together, of each coordinate of each point.
+        # (K, 2 + 3 N) what a unit of each candidate changes: focal lengths against each other, together, each
+        # coordinate.
         self._by_candidate = np.zeros((K, 2 + 3 * n))
         self._by_candidate[:, :2] = focal
         self._by_candidate[first : first + 3 * n, 2:] = np.eye(3 * n)
@@ -241,13 +230,8 @@ class ShapeWatch:
     def take(self, t_s: float, rows: Array, T: Array, response: Array, cov: Array, moved: bool) -> None:
         """Take a shot.
 
-        Args:
-            t_s: its time, s.
-            rows: (n, 1 + K) its residuals and their derivatives, all points included, its pose eliminated.
-            T: (4, 4) pose T_left_body.
-            response: (6, K) of a pose measured with all points to the parameters.
-            cov: (6, 6) covariance of the pose.
-            moved: whether its pose differs from the one before; single shots are asked only then.
+        ``rows``: (n, 1 + K) its residuals and their derivatives, all points included, its pose eliminated.
+        ``response``: (6, K) of a pose measured with all points to the parameters.
         """
         self._effects.append((response, cov))
         if not moved:
@@ -260,13 +244,7 @@ class ShapeWatch:
             self._view = view
 
     def decide(self, tests: History, usual: History, *, ends: bool) -> None:
-        """Test once more; the first test is enough by itself only where it ends all.
-
-        Args:
-            tests: of the K parameters, the seven numbers and the candidates, in units of their priors.
-            usual: the same without the shots that fit worst.
-            ends: whether it ends all.
-        """
+        """Test once more; the first test is enough by itself only where it ends all."""
         self._tests, self._usual, before = tests, usual, self._suspect
         doubted_s, self.doubt = self._doubted(every=ends or self.doubt is not None)
         # What is not doubtful is not certain.
@@ -297,10 +275,7 @@ class ShapeWatch:
         return shown
 
     def _doubted(self, *, every: bool) -> tuple[float, Array | None]:
-        """Return since when something may have changed, s, and its second moment (7 + C, 7 + C).
-
-        None where nothing did, more probably.
-        """
+        """Return since when something may have changed, s, and its second moment (7 + C, 7 + C); None where nothing."""
         if self.found is None:
             sums = [self._usual.reduced(each) for each in self._usual.windows(every=every)]
             mixtures = [self._mixture(each, self._hypotheses) for each in sums]
@@ -313,10 +288,7 @@ class ShapeWatch:
         return self.found.begin_s, self._mixture(self._usual.reduced(self.found.onset), self._hypotheses[:1])[1]
 
     def _tolerated(self) -> Array | None:
-        """Return the second moment (7 + C, 7 + C) of the body's shape within its tolerance, where it matters, else None.
-
-        A motion of all points is none of the body's shape: what has its axes is where its points are.
-        """
+        """Return the second moment (7 + C, 7 + C) of the body's shape in its tolerance, where it matters, else None."""
         K, points = self._size, slice(self._first, self._first + len(self._smooth))
         usual = self._usual.since(self._usual.always)
         cov = np.linalg.inv(usual.H[:K, :K] + np.eye(K))
@@ -329,10 +301,7 @@ class ShapeWatch:
         return moment
 
     def evidence(self, sums: ResidualSums, excess: float, skewed: bool) -> float:
-        """Return the log-evidence of the best hypothesis of what changed and stays, against none: 0 where none does.
-
-        Of sums whose noise has a variance so many times larger; ``skewed``: with a skew among the seven numbers.
-        """
+        """Return the log-evidence of the best hypothesis of what changed and stays against none; 0 where none does."""
         M = self._with_smooth.T @ eliminated(sums.M, slice(1, 1 + self._size)) @ self._with_smooth
         seven, *rest = self._hypotheses
         some = seven if skewed else seven._replace(rows=seven.rows[:, :-1])
@@ -346,10 +315,7 @@ class ShapeWatch:
         self.changed_s, self._alarms = np.inf, 0
 
     def _mixture(self, sums: ResidualSums, hypotheses: Sequence[_Hypotheses]) -> tuple[float, Array]:
-        """Return the log-evidence that anything changed before the tests of sums, and the second moment of what did.
-
-        Nothing is one of the hypotheses, and its evidence is 1.
-        """
+        """Return the log-evidence that anything changed before the tests, and the second moment of what did."""
         M, excess = self._whole(sums)
         every = self._with_smooth[1:, 1:]
         moment = np.zeros((every.shape[1], every.shape[1]))
@@ -365,10 +331,7 @@ class ShapeWatch:
         return evidence, every @ moment @ every.T
 
     def _whole(self, sums: ResidualSums) -> tuple[Array | None, float]:
-        """Return sums of everything that may have changed, smooth deformations included, and the Birge ratio they leave.
-
-        None where all together explain too little to matter.
-        """
+        """Return sums of everything that may have changed, and the Birge ratio they leave; None where too little."""
         M = sums.M
         gain = float(M[0, 1:] @ np.linalg.solve(M[1:, 1:] + np.eye(len(M) - 1), M[1:, 0]))
         if gain < 2.0:
@@ -389,10 +352,7 @@ class ShapeWatch:
         return self._deformed(sums, onset) or self._displaced(found, newest.whole, onset)
 
     def _deformed(self, sums: ResidualSums, onset: Onset) -> ShapeError | None:
-        """Return a smooth deformation of the body that tests show for certain, beside any change of the seven numbers.
-
-        And better than a single point does.
-        """
+        """Return a deformation that is certain, beside the seven numbers and better than a point; else None."""
         M, excess = self._whole(sums)
         smooth = [each for each in self._hypotheses if each.chance == _PRINTED]
         if M is None or not smooth:
@@ -598,7 +558,6 @@ def _smooth(points: Array) -> Array:
     """Return (3 N, 27) smooth deformations of points (N, 3), m: strains (9: by coordinate, direction) and bends (18).
 
     The former are motions of rows of a matrix that multiplies the points, the latter products of two coordinates; each is
-    a share of the body's radius at a point so far out.
     """
     from_middle = points - points.mean(axis=0)
     radius = float(np.linalg.norm(from_middle, axis=1).max())
@@ -610,10 +569,7 @@ def _smooth(points: Array) -> Array:
 
 
 def _hypotheses(points: int, smooth: int, *, strained: bool) -> tuple[_Hypotheses, ...]:
-    """Return what may have changed: the seven numbers, one focal length, both alike, a point, all points a little.
-
-    And smooth deformations, whose rows stand after those of all points (``smooth`` of them).
-    """
+    """Return what may have changed: the seven numbers, focal lengths, a point, all a little, and smooth deformations."""
     every, first = 9 + np.arange(3 * points), 9 + smooth
     strains, bends = (
         _Hypotheses(np.tile(first + np.arange(count), (len(_STRAINS), 1)), np.array(_STRAINS), _PRINTED)

@@ -112,17 +112,7 @@ class RigUpdate(Record):
 def updated_rig(
     rig: StereoRig, body: Body, shots: Sequence[SeenShot], before: Sequence[SeenShot] = ()
 ) -> RigUpdate | Missed:
-    """Estimate the relative pose of a rig's cameras again.
-
-    Args:
-        rig: as it was calibrated, with its covariance.
-        body: what is in view; its size gives the scale.
-        shots: detections of it, anywhere in view.
-        before: detections of it from before the change, anywhere in view.
-
-    Returns:
-        The new rig, or why the shots do not determine it.
-    """
+    """Estimate the relative pose of a rig's cameras again, by detections anywhere in view, before and after the change."""
     if not rig.cov.any():
         return Missed("the rig has no covariance: what is known of the cameras themselves must stand in its file")
     prior, count = _prior(rig), rig.parameter_count
@@ -160,14 +150,7 @@ def updated_rig(
 
 
 def contradiction(rig: StereoRig, body: Body, missed: Sequence[PoseEstimate], shots: tuple[int, int]) -> HealthFinding:
-    """Return what explains that most shots that show a body contradict the rig.
-
-    Args:
-        rig: as it was calibrated.
-        body: what is in view.
-        missed: poses of shots that contradict it, measured with a wide gate.
-        shots: how many do, and how many show the body.
-    """
+    """Return what explains that most shots that show a body contradict the rig."""
     moved, resized, found = RigWatch(rig, body, 0.0).explained(missed)
     seen = [each.points.seen for each in missed]
     again = [locate(moved, resized, triangulate(moved, resized, gate(moved, resized, each))) for each in seen]

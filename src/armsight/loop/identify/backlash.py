@@ -25,8 +25,7 @@ from armsight.loop.identify.fit import by_joints, joint_noise, with_joint_noise
 from armsight.loop.identify.identify import Identified
 from armsight.loop.identify.measured import Measured
 
-#: A joint is loose (case 3) where its scatter is more than this many times as large as the sigma of one pose's estimate,
-#: and more than this part of the fitted distance between its two sides: evenly anywhere between the stops it would be 0.29.
+#: A joint is loose (case 3) where its scatter exceeds this many sigmas of a pose, and this share of its backlash.
 LOOSE, LOOSE_SHARE = 2.0, 0.12
 #: Where gravity holds the joint on one of its sides at less than this part of the poses, they are too few to show it.
 BOTH_SIDES = 0.02
@@ -44,12 +43,7 @@ class JointBacklash(NamedTuple):
 
 
 def joint_backlashes(found: Identified, measured: Measured) -> tuple[JointBacklash, ...]:
-    """Return the backlash of every joint.
-
-    Args:
-        found: the identified arm.
-        measured: the poses that it was identified from.
-    """
+    """Return the backlash of every joint."""
     model, x, n = found.model, found.solution.x, found.model.arm.joints
     phi = model.feature_values(measured.q, measured.approach)
     off, left, by_fit = np.zeros((len(phi), n)), np.zeros((len(phi), n)), np.zeros((len(phi), n))
@@ -65,14 +59,9 @@ def _of_joint(
 ) -> JointBacklash:
     """Return the backlash of one joint, by the three cases above.
 
-    Args:
-        joint: from 0.
-        found: the identified arm.
-        measured: the poses.
-        phi: (N, F) what one unit of each error source adds to its joint's angle.
-        off: (N,) by how much the joint was off at each pose, rad, shrunk towards the model by its scatter.
-        left: (N,) sigma of that, rad.
-        by_fit: (N,) its variance by the fitted parameters, rad^2.
+    ``phi``: (N, F) what one unit of each error source adds to its joint's angle. ``off``: (N,) by how much the joint
+    was off at each pose, rad, shrunk towards the model by its scatter. ``left``: (N,) sigma of that, rad. ``by_fit``:
+    (N,) its variance by the fitted parameters, rad^2.
     """
     model, x = found.model, found.solution.x
     columns = [k for k, f in enumerate(model.features) if f.joint == joint and f.kind in _SHOWN_BY]
@@ -94,8 +83,6 @@ def _widened(fit: JointBacklash, sigma: float, pose_sigma: float, sides: tuple[i
     Where a link comes to rest scatters, because the shaft goes back a little when it stops and leaves the link behind. A
     link is never beyond its stops; so the furthest of the n poses at a stop is nearest to it. Its distance from the mean is
     that of the expected largest of n normal numbers (Blom, Statistical Estimates and Transformed Beta-Variables, 1958).
-    Only the scatter that single poses resolve is added. The truth may be anything from no widening to twice the widening
-    that all of the scatter would give; the sigma covers that.
     """
     furthest = sum(float(ndtri((n - 0.375) / (n + 0.25))) for n in sides if n > 1)
     short, most = furthest * float(np.sqrt(max(sigma**2 - pose_sigma**2, 0.0))), furthest * sigma

@@ -55,9 +55,7 @@ SIGMA: dict[str, float] = {
 def prior_sigma(model: Model, named: Mapping[str, float] | None = None) -> Array:
     """Return the prior sigma (P,) of every parameter.
 
-    Args:
-        model: the arm with its parameters.
-        named: sigma by name of a parameter ("a2") or a kind ("alpha"), instead of those of SIGMA; 0 keeps it as it is.
+    ``named``: sigma by name of a parameter ("a2") or a kind ("alpha"), instead of those of SIGMA; 0 keeps it as it is.
 
     Raises:
         InputError: an unknown name, or a sigma below zero.
@@ -104,13 +102,8 @@ class Solution(Record):
 def linear_of(model: Model, x: Array, measured: Measured, phi: Array, free: Mask, prior: Array) -> Linear:
     """Return the residuals of poses near a vector by the free parameters, with noise of position and of rotation.
 
-    Args:
-        model: the arm.
-        x: (P,) the vector.
-        measured: the poses.
-        phi: :meth:`Model.feature_values` of them.
-        free: (P,) what may be off.
-        prior: (P,) sigma about the nominal arm's values; infinite where nothing is known.
+    ``measured``: the poses. ``free``: (P,) what may be off. ``prior``: (P,) sigma about the nominal arm's values;
+    infinite where nothing is known.
     """
     e, J = model.linearised(x, measured, phi)
     each = np.broadcast_to(np.eye(measured.size), (len(e), measured.size, measured.size))
@@ -138,14 +131,9 @@ def fit(
 ) -> Solution:
     """Fit the free parameters.
 
-    Args:
-        model: the arm.
-        x: (P,) start.
-        measured: the poses.
-        free: (P,) what to fit; the rest stays as in ``x``.
-        prior: (P,) sigma about the nominal arm's values; infinite where nothing is known.
-        used: (N,) poses to use; None: outliers are found and left out.
-        noise: to start from; None: from the residuals at the start.
+    ``x``: (P,) start. ``free``: (P,) what to fit; the rest stays as in ``x``. ``prior``: (P,) sigma about the nominal
+    arm's values; infinite where nothing is known. ``used``: (N,) poses to use; None: outliers are found and left out.
+    ``noise``: to start from; None: from the residuals at the start.
     """
     phi = model.feature_values(measured.q, measured.approach)
     noise = _robust_noise(model.residuals(x, measured, phi)) if noise is None else noise
@@ -215,10 +203,7 @@ def _robust_noise(e: Array) -> tuple[float, float]:
 
 
 def _sane(model: Model, x: Array, measured: Measured, phi: Array, noise: tuple[float, float]) -> Mask:
-    """Return which poses (N,) are no outliers: by the scale of the median, or because their own covariance explains them.
-
-    With few degrees of freedom the parameters take residuals for themselves, and the median is below what was given.
-    """
+    """Return which poses (N,) are no outliers: by the scale of the median, or as their own covariance explains them."""
     linear = linear_of(model, x, measured, phi, np.zeros(len(x), bool), np.full(len(x), np.inf))
     variances = variances_of(linear, noise)
     far, given = ((whitened(linear, v)[0] ** 2).sum(axis=1) for v in (variances, 0.0 * variances))
@@ -239,11 +224,7 @@ class JointNoise(NamedTuple):
 def joint_noise(model: Model, solution: Solution, prior: Array, measured: Measured) -> JointNoise:
     """Attribute residuals beyond the instrument's covariance to the joints.
 
-    Args:
-        model: the arm.
-        solution: a fit of it.
-        prior: (P,) the prior sigmas of that fit.
-        measured: the poses, with the instrument's covariance alone.
+    ``solution``: a fit of it. ``prior``: (P,) the prior sigmas of that fit.
     """
     phi = model.feature_values(measured.q, measured.approach)
     with_sides = with_joint_noise(model, solution.x, measured, np.zeros(model.arm.joints))

@@ -33,8 +33,6 @@ class ArmRests(Carrier):
     """An arm at rests.
 
     Args:
-        arm: as its table says it is.
-        prior: how far it may be off.
         q: (N, n) readings of the joints at the rests, rad; the time of a rest is its row.
     """
 
@@ -63,11 +61,7 @@ class ArmRests(Carrier):
         return other
 
     def zeros(self, cov: Array) -> tuple[Array, Array]:
-        """Return how far the joints (n,) are beyond their readings, rad, the mean of the rests, and its covariance (n, n).
-
-        That is the zero with what linearity and compliance add to it where the arm rested: a wave of the one cannot be
-        distinguished from the other there.
-        """
+        """Return how far the joints (n,) are beyond their readings, rad, at the mean of the rests, and its covariance."""
         n, at = self._at.joints, self._at
         each = np.empty((len(self._q), n, at.size))
         for q, by in zip(self._q, each, strict=True):
@@ -107,12 +101,8 @@ def gravity_shows(
 ) -> tuple[list[Shown], ReferenceCalibration[Inertial]]:
     """Return the base's tilt about x and y and the zeros, by gravity at rests.
 
-    Args:
-        arm: as its table says it is.
-        sensor: calibrated; its ``cov`` says how far it may be off.
-        q: (N, n) readings of the joints at the rests, rad.
-        readings: N of the accelerometer, the mean of each rest; their times are the rests' rows.
-        prior: how far the arm may be off.
+    ``sensor``: calibrated; its ``cov`` says how far it may be off. ``q``: (N, n) readings of the joints at the rests,
+    rad. ``prior``: how far the arm may be off.
 
     Raises:
         InputError: too few rests.

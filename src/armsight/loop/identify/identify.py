@@ -319,10 +319,6 @@ def contributions(found: Identified, measured: Measured) -> dict[str, float]:
 
     The sources are taken in the order of their selection, each beyond what base and tool and the sources before it explain,
     so that what two could explain is counted once; the squares add up.
-
-    Args:
-        found: the identified arm.
-        measured: the poses.
     """
     model, s = found.model, found.solution
     _, J = model.linearised(s.x, measured, model.feature_values(measured.q, measured.approach))

@@ -66,12 +66,9 @@ class WireIdentified(NamedTuple):
 def unrounded(arm: Arm, q: Array, p_base: Array, sigma_rad: float, sigma_m: float) -> tuple[Array, Mask]:
     """Return joints (N, n) without rounding, rad, and which rows agree with the controller's position.
 
-    Args:
-        arm: as the controller has it: the nominal arm.
-        q: (N, n) rounded, rad.
-        p_base: (N, 3) the tool's origin as the controller computes it, m.
-        sigma_rad: of the joints' rounding: its step over the root of 12.
-        sigma_m: of the position's rounding.
+    ``arm``: as the controller has it: the nominal arm. ``q``: (N, n) rounded, rad. ``p_base``: (N, 3) the tool's origin
+    as the controller computes it, m. ``sigma_rad``: of the joints' rounding: its step over the root of 12. ``sigma_m``:
+    of the position's rounding.
     """
     model = Model(without_tool(arm), 1, False, ())
     measured = Measured(q, p_base[:, None])
@@ -95,14 +92,8 @@ def identify_wire(
 ) -> WireIdentified:
     """Identify an arm, the anchor and the tool's point by the lengths of one wire.
 
-    Args:
-        arm: the nominal arm.
-        q: (N, n) joints, rad.
-        length_m: (N,) of the wire, m.
-        p_base: (N, 3) the tool's origin as the controller computes it, m; None: not known.
-        step_rad: to what the joints are rounded.
-        step_m: to what the position is.
-        progress: called with the name of each step.
+    ``q``: (N, n) joints, rad. ``length_m``: (N,) of the wire, m. ``p_base``: (N, 3) the tool's origin as the controller
+    computes it, m; None: not known. ``step_rad``: to what the joints are rounded. ``step_m``: to what the position is.
 
     Raises:
         InputError: so many rows contradict the rest that no arm of this kind explains them.

@@ -127,11 +127,7 @@ class Read(NamedTuple):
 
 
 def measured_of(call: str, poses: Measured | Read) -> Measured:
-    """Return the poses of what was read.
-
-    Raises:
-        InputError: it is neither.
-    """
+    """Return the poses of what was read."""
     poses = poses.measured if isinstance(poses, Read) else poses
     require(call, "poses", poses, isinstance(poses, Measured), 'read_poses("poses.csv")')
     return poses

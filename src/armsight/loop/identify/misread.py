@@ -4,10 +4,7 @@ In: rows of a hand-eye recording (:func:`require_plausible`), poses to identify 
 table of an arm that a loop is to be closed with (:func:`require_fitting`). Out: nothing where they fit; else an error in
 one line that names the reading that makes the subject's own closed form fit, and what to do.
 
-Hand-eye: two quantiles of the residuals of :func:`~armsight.loop.handeye.poses.starts`. The median alone does not do: where
-an arm moves in equal steps, rows shifted by one fit another mounting but where the steps change, a third of the rows.
-Identification: the linear placement, which yields a scale and a handedness as well. Of readings that fit equally well the
-one with the fewest mistakes is named.
+Two quantiles of hand-eye residuals decide, or the linear placement; of equal readings the simplest is named.
 """
 
 from __future__ import annotations
@@ -41,15 +38,13 @@ from armsight.tables.poses import MIXED
 from armsight.tables.rotations import ROTATIONS, rotations_by
 
 Rows = NDArray[np.int64]
-#: Of hand-eye residuals: the median, and what nine of ten are below; data whose median is below this, m, are taken as they
-#: are, if nine of ten are plausible.
+#: Of hand-eye residuals: the median, and what nine of ten are below; below this median, m, data are taken as they are.
 QUANTILES, FITS_M = (0.5, 0.9), 2e-3
 BETTER, PLAUSIBLE_M = 4.0, 0.02  # another reading must fit better by this factor, and be below this, m
 #: A reading is preferred to those before it where its residual is smaller by this: xyz and ZYX are the same.
 SMALLER = 0.99
 EVALUATED = 60  # poses that a reading is evaluated by at most
-#: Rows that both sides have in common at least where they are shifted (half of them besides: few rows fit anything), and
-#: shifts that are tried: those for which both sides rotate alike.
+#: Rows in common at least where they are shifted, and shifts that are tried: those for which both sides rotate alike.
 COMMON, SHIFTS = 6, 4
 PART, TRIED = 6, 12  # rows at least on either side of where something may have been displaced, and rows that are tried
 ORDERS = 12  # orders of the joints that are looked at: the angles between poses do not distinguish parallel axes
@@ -74,12 +69,9 @@ def require_plausible(
 ) -> PairedPoses:
     """Reject rows that fit far better read in another way.
 
-    Args:
-        recording: the rows.
-        arm: the model, where the robot's poses come from joints.
-        detect_units: whether lengths in another unit are converted, with a note, in place of an error.
-        scale: whether the target's size is fitted, and may be anything.
-        streams: whether the rows are of streams whose clocks agree roughly only: they are not shifted then.
+    ``arm``: the model, where the robot's poses come from joints. ``detect_units``: whether lengths in another unit are
+    converted, with a note, in place of an error. ``scale``: whether the target's size is fitted, and may be anything.
+    ``streams``: whether the rows are of streams whose clocks agree roughly only: they are not shifted then.
 
     Raises:
         InputError: what is likely wrong, and what to do.
@@ -332,10 +324,7 @@ def _other_rows(recording: PairedPoses) -> Iterator[_Reading]:
 
 
 def _shifted(p: Poses, shift: int) -> tuple[Rows, Rows, int] | None:
-    """Return rows of robot and images that belong together where later rows are shifted, and how many rows are not.
-
-    None where those that are shifted do not fit better.
-    """
+    """Return rows of robot and images that belong together where later rows are shifted, and how many rows are not."""
     n, most = len(p.A), PLAUSIBLE_M
     hands = np.arange(max(shift, 0), n + min(shift, 0))
     whole = replace(p.rows(hands - shift), A=p.A[hands])
@@ -419,8 +408,8 @@ def _orders(p: Poses, arm: Arm, q: Array) -> list[Rows]:
 #: Errors of a cheap arm: a single mistake of the table is looked for beyond them. m and rad, RMS;
 #: half: ordinary arms are searched, double: a joint that is off by a few degrees is not.
 _USUAL = 0.015, float(np.radians(2.0))
-#: Nothing moves by a table that is off by more, whatever the mistake; m and rad. Half: an SO-101 whose zeros are off by
-#: three degrees is rejected; double: a wrist with a wrong sign passes.
+#: Nothing moves by a table that is off by more, m and rad. Half: an SO-101 with zeros off by 3 degrees is rejected;
+#: double: a wrist with a wrong sign passes.
 _GROSS = 0.04, float(np.radians(8.0))
 #: Mistakes that fit within this factor of the best are named, too; half: exact ties alone, double: weak ones as well.
 _ALIKE = 1.25
@@ -497,17 +486,14 @@ def _mistakes(arm: Arm) -> Iterator[tuple[str, Arm]]:
 #: Worse than this part of the space that the points span (RMS about their middle), and this many m, is another arm: a cheap
 #: one is off by 10 to 15 mm.
 BAD_SHARE, BAD_M = 0.08, 0.015
-#: Only what fits this many times better is preferred to something simpler. A wrong sign that hardly moves the tool can take
-#: up a part of the arm's own errors by chance; to halve them it must lie along them to a cosine of 0.87, which, as these
-#: errors have some 15 independent directions (zeros, lengths and angles), is 3.4 sigma.
+#: Only what fits this many times better is preferred to something simpler: by chance a wrong sign does at 3.4 sigma.
 CLEAR = 2.0
 #: Fits better than this, m and rad, are alike: files are rounded, instruments resolve hundredths of a degree.
 ALIKE_M, ALIKE_RAD = 1e-6, np.deg2rad(0.01)
 SCALE_OFF = 0.2  # a scale off by more than this is a unit
 #: Rotations off by more than this, rad, are not of this arm: twice the prior of zeros and twists of six joints.
 BAD_RAD = 2 * np.sqrt(6) * np.hypot(SIGMA["offset"], SIGMA["alpha"])
-#: Poses looked at, those that every order and sign is tried on, and the fewest of which rows that are shifted do not fit by
-#: chance.
+#: Poses looked at, those that every order and sign is tried on, and the fewest that shifted rows do not fit by chance.
 POSES, FEW, FEWEST = 80, 24, 12
 #: Poses on either side of a step, RMS of what is looked into, m, length of a body's axes, m, and step of differences, rad.
 FEWEST_A_PART, LEAST_M, AXES_M, STEP_RAD = 6, 2e-4, 0.1, 1e-6
@@ -623,10 +609,7 @@ def points_off(arm: Arm, q: Array, p_rig: Array) -> Off:
 
 
 def _readings_of(measured: Measured, rows: Rows) -> Iterator[tuple[Array, Array, str]]:
-    """Yield joints and points by other readings, and what each means: shifted rows, inverse poses, angles in another unit.
-
-    Some rows of them; ``OFF`` stands for how well they fit.
-    """
+    """Yield joints and points by other readings, and what each means: rows shifted, poses inverse, other units."""
     n, q = len(measured), measured.q[rows]
     for shift in (1, -1, 2, -2, 3, -3):
         if n - abs(shift) >= FEWEST:

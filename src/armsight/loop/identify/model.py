@@ -4,9 +4,6 @@ The vector x (P,) holds, in this order: the base in the rig (translation along t
 start), the tool's points or the body in the last frame, the 30 numbers of the table, and one coefficient per error source
 beyond the table.
 
-The file in order: forward kinematics of an arm that deviates from its table, with derivatives (:class:`TableMotion`); the
-error sources of single joints (:class:`Feature`); the vector and its predictions (:class:`Model`).
-
 A row of the table is Rz(theta) Tz(d) Tx(a) Rx(alpha) Ry(beta), modified Rx(alpha) Tx(a) Ry(beta) Rz(theta) Tz(d). Beta is
 Hayati's angle ("Robot arm geometric link parameter estimation", CDC 1983): between neighbouring axes that are parallel, d
 has no effect and only beta can tilt the second axis about the common normal's perpendicular. The derivative of a point p by
@@ -64,12 +61,8 @@ def nominal_table(arm: Arm) -> Array:
 def motion(table: Array, theta: Array, modified: bool, R_rig_0: Array, o_rig_0: Array) -> TableMotion:
     """Move frame 0, R_rig_0 (3, 3) and o_rig_0 (3,), along the chain, and note the axis of every number of the table.
 
-    Args:
-        table: (n, 5) by COLUMNS, m and rad.
-        theta: (N, n) rotation of each joint without its offset, rad.
-        modified: whether the table follows the modified convention.
-        R_rig_0: rotation of frame 0.
-        o_rig_0: its origin, m.
+    ``table``: (n, 5) by COLUMNS, m and rad. ``modified``: whether the table follows the modified convention.
+    ``o_rig_0``: its origin, m.
     """
     n = len(theta)
     R, o = np.broadcast_to(R_rig_0, (n, 3, 3)).copy(), np.broadcast_to(o_rig_0, (n, 3)).copy()
@@ -97,22 +90,19 @@ def _rotate(R: Array, k: int, angle: Array) -> None:
     R[:, :, (k + 2) % 3] = c * v - s * u
 
 
-#: Harmonics of one revolution of a joint's sensor: the slow ones that its mounting makes, those of its track and gears, and
-#: the fastest: the workcell's potentiometers oscillate up to nine times over their travel of about 270 degrees.
+#: Harmonics of one revolution of a sensor: by its mounting, by its track and gears, and the fastest (pots: up to nine).
 WAVES, RIPPLES, FAST = (1, 2), (3, 4, 5, 6, 7, 8), (9, 10, 11, 12)
 #: With fewer measured numbers than this the model has no ripples: chance alone would determine their one prior.
 ENOUGH = 100
 #: With so many measured numbers per parameter each harmonic and load is selected by itself, whatever its prior. The
 #: fastest are then left out: selected one by one, no prior would bound them where the arm was not measured.
 PLENTY = 10
-#: A bearing's friction holds a link inside its backlash against gravity with up to about this lever, m: some per cent of
-#: the lever of such arms' links, as a bearing's friction is some per cent of its load. Over half of it the backlash closes.
+#: A bearing's friction holds a link inside its backlash up to about this lever, m; over half of it the backlash closes.
 FRICTION_M = 2e-3
 UP = np.array([0.0, 0.0, 1.0])  # against gravity, of an arm that stands upright
 SENSOR = ("gain", "wave", "ripple")  # kinds that make up the curve of a joint's sensor: functions of its reading
-#: Beyond the range of readings that the poses have shown, a sensor's curve fades over so much, rad. Over more, a fast
-#: harmonic would swing where nothing was measured; over less, what holds a few degrees on would be lost (half of 0.2 mm at
-#: 6 degrees, of the synthetic worn arms).
+#: Beyond the readings seen, a sensor's curve fades over so much, rad. Double: a fast harmonic swings there; half: what
+#: holds a few degrees on is lost.
 FADE_RAD = np.deg2rad(20.0)
 
 
@@ -130,10 +120,8 @@ class Feature(NamedTuple):
 def all_features(joints: int, backlash: bool, ripples: tuple[int, ...]) -> tuple[Feature, ...]:
     """Return every error source.
 
-    Args:
-        joints: how many joints the arm has.
-        backlash: include backlash that friction holds, which needs known directions of approach.
-        ripples: harmonics beyond WAVES.
+    ``backlash``: include backlash that friction holds, which needs known directions of approach. ``ripples``: harmonics
+    beyond WAVES.
     """
     found = []
     for i in range(joints):
@@ -215,7 +203,6 @@ def _side(lever: Array, approach: Array | None, joint: int) -> Array:
     """Return on which side of its backlash a link lies (N,), -1 to 1: by gravity, or by friction where that is stronger.
 
     Where the two are about as strong it is the mean of both sides, weighted by how likely each is. Where the direction of
-    approach is unknown, that transition covers both signs of the lever.
     """
     if np.abs(lever).max(initial=0.0) < FRICTION_M:
         return np.zeros(len(lever))  # gravity does not load it: its backlash is of kind ``backlash``

@@ -25,10 +25,6 @@ from armsight.loop.identify.model import Model
 def with_placement(model: Model, measured: Measured) -> tuple[Model, Array]:
     """Return the model and vector of the nominal arm with base and tool estimated from the poses.
 
-    Args:
-        model: the arm with every parameter.
-        measured: the poses.
-
     Returns:
         The model with the placement's rotations as its ``R_start`` and ``R_tool``, and the vector x (P,).
     """

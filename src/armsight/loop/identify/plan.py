@@ -45,12 +45,9 @@ LEVELS, SWEEPS, MIN_GAIN = 7, 3, 0.01
 def greedy(J: Array, P: Array, requested: Array, n: int, *, in_order: bool = False) -> tuple[Array, Array]:
     """Return rows chosen one by one, and the predicted RMS error before and after each.
 
-    Args:
-        J: (N, M, F) whitened Jacobians of the candidates.
-        P: (F, F) covariance before.
-        requested: (3 K, F) derivative of K positions, whose error is to be low.
-        n: how many to choose.
-        in_order: take them as they come instead.
+    ``J``: (N, M, F) whitened Jacobians of the candidates. ``P``: (F, F) covariance before. ``requested``: (3 K, F)
+    derivative of K positions, whose error is to be low. ``n``: how many to choose. ``in_order``: take them as they come
+    instead.
     """
     left, chosen = np.ones(len(J), bool), list[int]()
     W = requested.T @ requested
@@ -93,14 +90,8 @@ def exchanged(
 ) -> tuple[Array, Array]:
     """Return poses (n, J) and sides (n, J) that together lower the error more than those given.
 
-    Args:
-        q: (n, J) joint angles to start from, rad.
-        approach: (n, J) sides.
-        information: of poses, and which are allowed.
-        P: (F, F) covariance before.
-        requested: (3 K, F) derivative of K positions, whose error is to be low.
-        limits: (J,) and (J,) least and greatest angles, rad.
-        rng: sets the levels, and the order of the joints.
+    ``approach``: (n, J) sides. ``information``: of poses, and which are allowed. ``rng``: sets the levels, and the
+    order of the joints.
     """
     q, approach, W = q.copy(), approach.copy(), requested.T @ requested
     J, _ = information(q, approach)
@@ -191,14 +182,9 @@ def plan_joints(
 ) -> Plan:
     """Choose the poses that lower the position error of an identification most.
 
-    Args:
-        arm: the nominal arm.
-        done: what was measured already, which locates base and tool; None: all that can be reached counts as seen.
-        rig: the stereo rig; None: all that can be reached counts as seen, equally well.
-        n: how many.
-        seed: of the candidates.
-        noise: sigmas of position, m, and rotation, rad, of the instrument where there is no rig.
-        floor_m: how far above the base's plane the links must stay, m.
+    ``done``: what was measured already, which locates base and tool; None: all that can be reached counts as seen.
+    ``noise``: sigmas of position, m, and rotation, rad, of the instrument where there is no rig. ``floor_m``: how far
+    above the base's plane the links must stay, m.
 
     Raises:
         InputError: ``done`` is too few poses, or not of this arm; or fewer than ``n`` poses can be reached and seen.
@@ -244,10 +230,7 @@ def plan_joints(
 
 
 def _with_curves(model: Model, x: Array, prior: Array) -> tuple[Model, Array, Array]:
-    """Return a model, its vector and its priors with every harmonic of the sensors' curves.
-
-    Few poses cannot select among them, but a curve stays unknown where it is not measured, so poses must be spread.
-    """
+    """Return a model, its vector and its priors with every harmonic of the sensors' curves."""
     backlash = any(f.kind == "backlash" for f in model.features)
     whole = model.with_features(all_features(model.arm.joints, backlash, (*RIPPLES, *FAST)))
     known = dict(zip(model.names, zip(x, prior, strict=True), strict=True))
@@ -318,10 +301,7 @@ class _Scene(Record):
         return Measured(q, p, T[:, :3, :3] if model.full else None, self._cov(T), approach)
 
     def _cov(self, Ts: Array) -> Array | None:
-        """Return the covariance of bodies: of their middle from all markers, of their rotation from the markers' spread.
-
-        Of the tool's points instead of its full pose: theirs, each from its share of the markers.
-        """
+        """Return the covariance of bodies: of their middle from all markers, of their rotation from their spread."""
         if self.rig is None:
             return None
         H, points = np.zeros((len(Ts), 3, 3)), self.model.points
@@ -347,10 +327,7 @@ class _Scene(Record):
         return whitened(replace(linear, own=linear.own | {"joints": by_joints(self.model, linear.J)}), variances)[1]
 
     def candidates(self, rng: np.random.Generator) -> tuple[Array, Array, Measured]:
-        """Return joint angles, directions of approach and measurements of poses that are reachable, free and visible.
-
-        They are uniform over all such joint angles; where cameras see little of what an arm reaches, more are sampled.
-        """
+        """Return joint angles, directions of approach and measurements of poses that are reachable, free and visible."""
         angles, sides, found = [], [], 0
         for _ in range(SAMPLING_ROUNDS):
             q = rng.uniform(*self.limits, (4 * CANDIDATES, len(self.limits[0])))
@@ -383,10 +360,7 @@ def _rotated(rig: StereoRig, Ts: Array, axes: Array) -> Array:
 
 
 def free_of_collision(model: Model, q: Array, floor_m: float = FLOOR_M) -> Mask:
-    """Return which joint angles (N, J) keep the arm above the base's plane and apart from itself.
-
-    Links are the straight lines between the axes' frames; the first two and neighbours are not compared.
-    """
+    """Return which joint angles (N, J) keep the arm above the base's plane and apart from itself."""
     if not len(q):
         return np.zeros(0, bool)
     o = np.stack([model.arm.links(angles)[:, :3, 3] for angles in q])
@@ -405,8 +379,8 @@ def free_of_collision(model: Model, q: Array, floor_m: float = FLOOR_M) -> Mask:
     return out
 
 
-#: Candidates for a mounting: how far the flange is rotated at most from the nearest pose it had, rad, how much larger its
-#: space may become, and by how much the target may leave the part of the image in which its middle was seen, as a tangent.
+#: Candidates for a mounting: largest rotation from a pose it had, rad, how much larger its space may become, and
+#: its margin in the image, a tangent.
 POSES, NEAR_RAD, WIDER, BESIDE = 1500, np.radians(25), 0.2, 0.02
 
 
@@ -429,12 +403,6 @@ def plan_mounting(found: HandEye, poses: Poses, count: int, seed: int = 0) -> Mo
 
     Candidates lie near poses that the arm has taken: each rotates one of them about the target's middle, the flange stays
     within its space, a fifth more, and the target within the part of the image and the distances in which it was seen.
-
-    Args:
-        found: the calibration.
-        poses: the poses it was made from.
-        count: how many to choose.
-        seed: of the candidates.
     """
     A, B = _near(found, poses.rows(found.used), np.random.default_rng(seed))
     J = found.whitened(Poses(A, B, np.tile(poses.cov.mean(axis=0), (len(A), 1, 1)), poses.in_hand, poses.centre))

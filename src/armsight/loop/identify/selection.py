@@ -10,9 +10,6 @@ on poses left out by more than chance, and removes again what does not lower it.
 added as a whole, as its harmonics hide each other at few poses; then every harmonic is removed that is not worth its price,
 and so is every load of a compliance. The price (PRICE) is on top of held-out errors: of two models that predict alike, the
 smaller one stands. Then what the whole curves hid may be added.
-
-Everything is scored on one linearisation (:mod:`armsight.estimate.select`). Folds are made of clusters of joint angles
-rather than of rows: what is kept must also hold where the arm was not measured.
 """
 
 from __future__ import annotations
@@ -37,22 +34,15 @@ from armsight.loop.identify.model import Model
 SCALED = ("gain", "wave", "ripple", "backlash", "gravity_backlash", "compliance")
 #: Least and greatest factor: a sharper prior than a hundredth is none, and none is widened.
 MIN_FACTOR, MAX_FACTOR = 0.01, 1.0
-#: The factor is itself determined by a handful of numbers; it is taken at the upper end of what they allow, where twice
-#: the log of the evidence has fallen by so much from its best (one sigma), and this far above the best at least. The
-#: other kinds are held at their best meanwhile: the interval is conditional, narrower than the profile's, in which they
-#: give way.
+#: The factor is taken where twice the log of the evidence fell by so much from its best, and so far above it at least.
 FALLEN, WIDER = 1.0, 1.5
 
 
 def scaled_prior(model: Model, start: Solution, measured: Measured, free: Mask, prior: Array) -> Array:
     """Return prior sigmas (P,) with each kind of error source scaled to this arm.
 
-    Args:
-        model: the arm with every error source.
-        start: a fit to linearise at, with the poses used and the noise.
-        measured: the poses.
-        free: (P,) what may be off.
-        prior: (P,) prior sigmas.
+    ``start``: a fit to linearise at, with the poses used and the noise. ``free``: (P,) what may be off. ``prior``: (P,)
+    prior sigmas.
     """
     kinds = [kind for kind in SCALED if any(p.kind == kind and f for p, f in zip(model.parameters, free, strict=True))]
     if not kinds:
@@ -88,12 +78,10 @@ def _upper_ends(cost: Callable[[Array], float], best: Array) -> Array:
 
 #: Folds; each is a random union of clusters of poses, of which there are at most so many, of a few poses each.
 FOLDS, CLUSTERS, CLUSTER = 20, 200, 3
-#: Where numbers are few: what a harmonic's or load's coefficient costs, in the logarithms of the held-out squares summed
-#: over the numbers measured, which is minus twice a log likelihood. Without a price chance keeps half as many again.
+#: What a harmonic's or load's coefficient costs in the log of held-out squares; none: chance keeps half as many again.
 PRICE = 1.0
 PLACEMENT = ("base", "tool")  # the kinds that say where the arm is: base in the rig, tool on the flange
-#: A sensor's harmonics make one curve, and the links' loads one compliance: they may be added together, and priors keep
-#: them small. One of these numbers alone may hardly show at the poses measured.
+#: A sensor's harmonics make one curve, the links' loads one compliance: they may be added together.
 CURVE = ("wave", "ripple")
 TOGETHER = (*CURVE, "compliance")
 _GROUPS = {"offset": "joint zeros", "d": "lengths", "a": "lengths", "alpha": "axis angles", "beta": "axis angles"}
@@ -139,14 +127,8 @@ def forward_selection(
 ) -> Selection:
     """Select error sources, starting from base and tool alone.
 
-    Args:
-        model: the arm with every error source.
-        start: a fit to linearise at, with the poses used and the noise.
-        measured: the poses.
-        free: (P,) the candidates.
-        prior: (P,) prior sigmas.
-        together: (P,) harmonics and loads that may also be added as a whole.
-        progress: called with a line of text after each step.
+    ``start``: a fit to linearise at, with the poses used and the noise. ``together``: (P,) harmonics and loads that may
+    also be added as a whole.
     """
     part = measured.rows(start.used)
     phi = model.feature_values(part.q, part.approach)

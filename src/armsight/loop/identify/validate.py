@@ -94,11 +94,7 @@ def validate(found: Identified, measured: Measured | Read) -> Validation:
 
 
 def require_alike(measured: Measured, points: int, full: bool) -> None:
-    """Reject poses that do not have the points, or full poses, of those identified with.
-
-    Raises:
-        InputError: another number of points, or points instead of poses.
-    """
+    """Reject poses with another number of points, or points instead of poses (InputError)."""
     have, need = (
         "full poses" if f else f"{p} tracked point{'s' if p > 1 else ''} a pose"
         for p, f in ((measured.points, measured.R_rig_body is not None), (points, full))

@@ -27,8 +27,7 @@ from armsight.loop.iso9283.statistic import (
     sampled_errors,
 )
 
-#: Degrees on either side of a reversal that are left out, and that its step is estimated from. The axis stands still until
-#: its backlash is taken up: within the first 8 degrees for backlash of up to 1 % of the radius, 1 - cos 8 degrees.
+#: Degrees beside a reversal that are left out (backlash up to 1 % of the radius), and that its step is estimated from.
 NEAR_DEG, FAR_DEG = 8.0, 32.0
 #: Fewest positions on either side of a reversal; fewest of a whole circle; and the largest gap between them, deg.
 _SIDE, _MIN_POINTS, _GAP_DEG = 5, 72, 15.0
@@ -84,11 +83,7 @@ def path_metrics(attained: Array, command: Array, cov: Array, common: Array | No
 
 
 def square_to(command: Array) -> Array:
-    """Return projections (S, 3, 3) onto the planes square to a path at its points (S, 3).
-
-    Raises:
-        InputError: two points of the path in a row are equal.
-    """
+    """Return projections (S, 3, 3) onto the planes square to a path at its points (S, 3); no two in a row are equal."""
     along = np.gradient(command, axis=0)
     length = np.linalg.norm(along, axis=1)
     if not length.all():
@@ -214,8 +209,7 @@ def _widest(statistic: Callable[[Array], Array], radii: Array, errors: Array) ->
 def _neighbour_variance(angle: Array, r: Array) -> float:
     """Return the variance of radii (N,) at angles (N,), deg, m^2: how far each is off the line through its neighbours.
 
-    Whichever time round those are of: what comes slowly along the way is its form (Gasser, Sroka and Jennen-Steinmetz,
-    Biometrika 73, 1986).
+    What comes slowly along the way is its form (Gasser, Sroka and Jennen-Steinmetz, Biometrika 73, 1986).
     """
     order = np.argsort(angle, kind="stable")
     at, r = angle[order], r[order]
@@ -227,10 +221,7 @@ def _neighbour_variance(angle: Array, r: Array) -> float:
 
 
 def _binned(ways: list[tuple[Array, Array]]) -> tuple[Array, Array, Array]:
-    """Return of angles (N,), deg, and radii (N,), m, of both ways: angles (B,), mean radii (2, B) about them, and counts.
-
-    The counts (2, B) are of positions; empty bins are interpolated.
-    """
+    """Return angles (B,), deg, mean radii (2, B), m, of both ways, and counts (2, B); empty bins are interpolated."""
     grid = np.arange(0, 360, _BIN_DEG)
     radii, counts = np.zeros((2, len(grid))), np.ones((2, len(grid)))
     for w, (angle, r) in enumerate(ways):
@@ -247,8 +238,7 @@ def _backlash(steps: Array, variances: Array) -> Metric:
 
     Backlash cannot make the radius fall, but the interval has a sign and can reach below 0.
 
-    Where the jumps differ by more than their sigmas allow, the interval is that of their own scatter (Birge, Phys. Rev. 40,
-    1932): then something else than the backlash of that axis contributes, as is usual on arms of revolute joints.
+    Where jumps differ by more than their sigmas the interval is that of their scatter (Birge, Phys. Rev. 40, 1932).
     """
     value, freedom = float(steps.mean()), steps.size - 1
     apart = float(((steps - value) ** 2 / variances).sum()) if np.all(variances > 0) else 0.0
@@ -292,11 +282,7 @@ def _step(angle: Array, r: Array, at: float, way: float) -> tuple[float, float]:
 
 
 def plane_axes(normal: Array) -> Array:
-    """Return axes (2, 3) of a plane: the base's that lies nearest to it, and the one square to it, by the right hand.
-
-    Args:
-        normal: (3,) unit vector square to the plane; its sign does not count: about its largest part taken positive.
-    """
+    """Return axes (2, 3) of a plane with a unit normal (3,): the base's that lies nearest, and the one square to it."""
     n = normal * np.sign(normal[np.argmax(np.round(np.abs(normal), 6))])
     first = np.eye(3)[np.argmin(np.round(np.abs(n), 6))]
     first = first - (first @ n) * n

@@ -14,8 +14,7 @@ from armsight.geometry.pose import pose
 from armsight.geometry.rotation import exp_so3
 from armsight.robot.kinematics.arm import Arm
 
-#: Smallest singular value of the Jacobian (linear rows over the arm's size) at a pose of the test. ISO 9283 sets no number:
-#: this one keeps the test where the outer loop still corrects every direction (``servo.UNCORRECTED_BELOW``).
+#: Smallest singular value of the Jacobian at a pose of the test: the outer loop still corrects every direction.
 MIN_SINGULAR_VALUE = 0.02
 #: The poses are this part of the diagonal from the cube's corners (6.8.1).
 INSIDE = 0.1
@@ -65,13 +64,10 @@ def plan_check(
 ) -> CheckPlan:
     """Choose the poses of a test in the largest cube that the arm reaches, clear of its limits and of singularities.
 
-    Args:
-        arm: the arm.
-        centre: (3,) of the cube in the base, m; None: on the side where the tool is at home, where the cube is largest.
-        wide: a hundred poses all over the cube, rotated too, instead of the standard's five.
-        seed: of the hundred.
-        allowed: returns which poses (N, 4, 4) may be used, such as those that the cameras see.
-        feasible: returns whether a plan can be carried out; if not, the next cube is tried.
+    ``centre``: (3,) of the cube in the base, m; None: on the side where the tool is at home, where the cube is largest.
+    ``wide``: a hundred poses all over the cube, rotated too, instead of the standard's five. ``allowed``: returns which
+    poses (N, 4, 4) may be used, such as those that the cameras see. ``feasible``: returns whether a plan can be carried
+    out; if not, the next cube is tried.
 
     Raises:
         InputError: not even the smallest cube will do.
@@ -107,10 +103,7 @@ def _centres(arm: Arm, p_home: Array) -> Array:
 
 
 def _reached(arm: Arm, Ts: Array, allowed: Callable[[Array], NDArray[np.bool_]]) -> Iterator[Array]:
-    """Yield joint angles (N, n) of poses (N, 4, 4), rad, for each configuration that the first of them can be in.
-
-    NaN where a pose is not reached in it, not clear or not allowed.
-    """
+    """Yield joint angles (N, n) of poses, rad, for each configuration; NaN where not reached, clear or allowed."""
     rows_m = np.array([arm.size_m] * 3 + [1.0] * 3)[:, None]
     low, high = arm.q_min + CLEAR_RAD, arm.q_max - CLEAR_RAD
     may = allowed(Ts)

@@ -37,7 +37,6 @@ class PoseMetrics(Record):
     """Clause 7.2: one commanded pose.
 
     Attributes:
-        count: how many attained poses.
         AP_m: AP of the position: distance of the attained poses' barycentre from the command.
         AP_xyz_m: (3,) its parts.
         AP_rotation_rad: (3,) the rotation from the command to the mean about the command's axes; None if unknown.
@@ -91,13 +90,7 @@ def pose_metrics(
 
 
 def repeatability(p: Array, cov: Array, way: NDArray[np.int64] | None = None) -> Metric:
-    """Return RP of positions (7.2.2): mean distance from the barycentre plus three standard deviations of the distances.
-
-    Args:
-        p: (n, 3) positions attained, m.
-        cov: (n, 3, 3) their covariance by the instrument, m^2.
-        way: (n,) see :func:`pose_metrics`.
-    """
+    """Return RP of positions (7.2.2): mean distance from the barycentre plus three standard deviations of them."""
     off, freedom = _within(p, way)
     distance = np.linalg.norm(off, axis=1)
     raw = float(distance.mean() + 3 * np.sqrt(((distance - distance.mean()) ** 2).sum() / freedom))
@@ -146,14 +139,7 @@ def anywhere(off: Array, cov: Array, common: Array) -> tuple[Metric, Metric]:
 
 
 def multi_directional(attained: list[Array]) -> Metric:
-    """Return vAP (7.2.3): the largest distance between the barycentres of one pose come to from several directions.
-
-    Args:
-        attained: (n, 3) positions for every direction.
-
-    Raises:
-        InputError: fewer than two directions.
-    """
+    """Return vAP (7.2.3): the largest distance of barycentres (n, 3) of one pose come to from several directions."""
     if len(attained) < 2:
         raise InputError("a pose was come to from one direction only; two and more are needed")
     i, j = np.triu_indices(len(attained), 1)
@@ -171,11 +157,8 @@ def _errors_of_means(groups: list[Array]) -> Array:
 def distance_metrics(from_m: Array, to_m: Array, commanded_m: float, cov: Array) -> tuple[Metric, Metric]:
     """Return AD and RD (7.3): error of the mean distance between two poses, and three deviations of it.
 
-    Args:
-        from_m: (n, 3) positions attained at the first pose.
-        to_m: (n, 3) at the second, in the same cycles.
-        commanded_m: distance of the commands, m.
-        cov: (n, 3, 3) covariance of either position by the instrument, m^2.
+    ``from_m``: (n, 3) positions attained at the first pose. ``to_m``: (n, 3) at the second, in the same cycles.
+    ``cov``: (n, 3, 3) covariance of either position by the instrument, m^2.
     """
     along = to_m - from_m
     d = np.linalg.norm(along, axis=1)
@@ -189,11 +172,6 @@ def distance_metrics(from_m: Array, to_m: Array, commanded_m: float, cov: Array)
 
 def drift(t_s: Array, p: Array, groups: int = 5) -> tuple[Array, Array, Metric]:
     """Return the drift of one pose's position (7.5).
-
-    Args:
-        t_s: (n,) times, s.
-        p: (n, 3) positions attained, m.
-        groups: parts of equal count in order of time.
 
     Returns:
         (groups,) middle times, s; (groups,) distances of each group's barycentre from the first one's, m; the largest.

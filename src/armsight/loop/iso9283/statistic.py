@@ -70,10 +70,7 @@ def lengths(vectors: Array) -> Array:
 
 
 def mean_errors(values: Array, rng: np.random.Generator) -> Array:
-    """Sample errors (B, ...) of the mean of values (n, ...), from their own scatter: also where parts go together.
-
-    They are as much wider as intervals by Student's t are: a scatter of few values is not well known.
-    """
+    """Sample errors (B, ...) of the mean of values (n, ...), from their own scatter: also where parts go together."""
     n = len(values)
     if n < 2:
         return np.zeros((SAMPLES, *values.shape[1:]))
@@ -85,10 +82,7 @@ def mean_errors(values: Array, rng: np.random.Generator) -> Array:
 def group_errors(within: Array, counts: Array, rng: np.random.Generator) -> Array:
     """Sample errors (B, k, 3) of the means of k groups of so many values that scatter alike, as ``mean_errors``.
 
-    Args:
-        within: (n, 3) all values less their group's mean.
-        counts: (k,) how many each group has.
-        rng: samples them.
+    ``within``: (n, 3) all values less their group's mean. ``counts``: (k,) how many each group has.
     """
     freedom = len(within) - len(counts)
     if freedom < 1:
@@ -111,12 +105,8 @@ def scatter(S: Array, noise: Array, n: int, statistic: Callable[[Array], Array],
     The trace of S is taken as a chi square with the degrees of freedom that the metric of such a scatter shows by trial;
     the interval of the trace, less the noise, scales the metric.
 
-    Args:
-        S: (d, d) covariance of n values.
-        noise: (d, d) the instrument's.
-        n: how many.
-        statistic: the metric of covariances (..., d, d); proportional to their root.
-        ratio: of the metric as measured to ``statistic(S)``.
+    ``S``: (d, d) covariance of n values. ``noise``: (d, d) the instrument's. ``statistic``: the metric of covariances
+    (..., d, d); proportional to their root. ``ratio``: of the metric as measured to ``statistic(S)``.
     """
     total, own = float(np.trace(S)), float(np.trace(noise))
     raw = ratio * float(statistic(S))
