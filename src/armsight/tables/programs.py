@@ -8,7 +8,9 @@ of their own: Universal Robots ``p[x, y, z, rx, ry, rz]``, m and rad, a rotation
 
 from __future__ import annotations
 
+import functools
 import re
+from bisect import bisect_left
 from pathlib import Path
 from typing import NamedTuple
 
@@ -281,7 +283,13 @@ def _pose_points(
 
 def _line(text: str, found: re.Match[str]) -> int:
     """Return the line that a match begins in."""
-    return text.count("\n", 0, found.start() + len(found[0]) - len(found[0].lstrip())) + 1
+    return bisect_left(_line_ends(text), found.start() + len(found[0]) - len(found[0].lstrip())) + 1
+
+
+@functools.lru_cache(maxsize=2)
+def _line_ends(text: str) -> list[int]:
+    """Return where the lines of a text end."""
+    return [end.start() for end in re.finditer("\n", text)]
 
 
 def _rectangular(path: Path, text: str) -> tuple[str, tuple[str, ...]]:
