@@ -1,4 +1,4 @@
-"""Limits of chance: the chi-square distribution's upper tail and its quantile.
+"""Limits of chance: the chi-square distribution's upper tail and its quantile, and a number among its siblings.
 
 SciPy has them too; what measures a single pair of images would take a third longer to start for them.
 """
@@ -7,6 +7,10 @@ from __future__ import annotations
 
 import functools
 import math
+
+import numpy as np
+
+from armsight.data import Array
 
 #: Relative change at which a series, a fraction or Newton's steps have converged; half: nothing, double: nothing.
 _DIGITS = 1e-15
@@ -59,3 +63,22 @@ def chi_square_limit(freedom: float, chance: float) -> float:
         if abs(step) < 1e-14 * x:
             break
     return 2 * x
+
+
+def chance_among(value: float, others: Array, least: float = 0.0) -> tuple[float, float]:
+    """Return sigma of what scatters about zero, and the probability of a value as far off: Student's.
+
+    Args:
+        value: one that is not among the others.
+        others: (N,) their median size is the scale, so that a few that are far off hardly change it.
+        least: sigma of the value by itself: that of the scatter is no smaller.
+
+    Returns:
+        Sigma, and the chance; 1 where sigma is 0.
+    """
+    from scipy.special import stdtr
+
+    sigma = max(float(np.median(np.abs(others))) / 0.6745, least)  # of a normal variable: its sigma
+    # A median of sizes has the precision of a mean square of 0.37 times as many (its efficiency for normal variables).
+    freedom = max(0.37 * len(others), 1.0)
+    return sigma, float(2.0 * stdtr(freedom, -abs(value) / sigma)) if sigma > 0.0 else 1.0

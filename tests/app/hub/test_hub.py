@@ -84,6 +84,11 @@ def test_a_cell_that_began_before_its_hub_arrives_with_all_its_events(hub_at, ce
     assert found["state"]["temperature_c"] == 41.2
     assert [each["kind"] for each in json.loads(fetched(hub, "events?q=camera+moved"))] == ["health"]
     assert fetched(hub, "image?site=site&cell=table-1").startswith(b"\xff\xd8")
+    assert json.loads(fetched(hub, "shots?site=site&cell=table-1")) == []  # none is kept before somebody asks
+    for number in range(30):
+        cell.put(ShotDatum(Shot(str(number), GREY, GREY), Missed("hidden")))
+    (one,) = wait(lambda: json.loads(fetched(hub, "shots?site=site&cell=table-1")))  # of 30 within 0.2 s
+    assert (one["status"], one["reason"]) == ("missed", "hidden")
     assert "day" not in json.loads(fetched(hub, "state"))["cells"][0]
     assert json.loads(fetched(hub, "state?day=1"))["cells"][0]["day"] == []
     assert 'armsight_cell_missed_ratio{site="site",cell="table-1"}' in fetched(hub, "metrics").decode()
@@ -188,10 +193,10 @@ def test_a_cell_writes_below_its_own_name_alone(hub_at, cell_at, port, tmp_path,
     cell_at(tmp_path / "keys/cells/a/cell.toml")
     wait(lambda: shown(hub).get("a", {}).get("state"))
     wait(lambda: len(hub._router.links()) == 2)
-    hub._look_for_names()
+    hub._look()
     assert {each["cell"] for each in hub._store.events()} == {"a"}  # a cell that is about to begin is none
-    hub._look_for_names()
-    hub._look_for_names()  # it is said once
+    hub._look()
+    hub._look()  # it is said once
     assert set(shown(hub)) == {"a"}
     (found,) = [each for each in hub._store.events() if each["cell"] == "hub"]
     assert found["kind"] == "rejected"
@@ -300,7 +305,6 @@ def test_a_cell_holds_for_the_key_of_its_site_alone(hub_at, cell_at, port, tmp_p
             return datetime.now(tz) - timedelta(seconds=90)
 
     monkeypatch.setattr("armsight.app.hub.keys.datetime", Earlier)
-    monkeypatch.setattr("armsight.app.hub.keys._check_valid", lambda path: None)
     assert b"it is old" in hub._router.ask("lab", "arm", "hold", sign_hold(keys, "arm", "old"))
     assert len(held) == 2
 

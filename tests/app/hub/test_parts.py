@@ -117,12 +117,14 @@ def test_keys_are_made_once_and_renewed_before_their_end(tmp_path, monkeypatch):
         def now(cls, tz=None):
             return datetime.now(tz) + timedelta(days=380)
 
-    monkeypatch.setattr("armsight.app.hub.keys.datetime", Later)
-    assert len(make_keys(keys, "lab", ["a", "b"], "hub.local", 7447)) == 2
+    for module in ("armsight.app.hub.keys", "armsight.app.stream.cell_file"):
+        monkeypatch.setattr(f"{module}.datetime", Later)
+    assert make_keys(keys, "lab", ["a", "b"], "new.local", 7447) == [keys / f"cells/{n}/cell.toml" for n in "ab"]
     assert read_cell(str(toml)).holds  # what its owner changed stays
     monkeypatch.setattr(Later, "now", classmethod(lambda cls, tz=None: datetime.now(UTC) + timedelta(days=900)))
-    with pytest.raises(InputError, match="this computer's date is"):
-        site_of(keys)
+    for read in (lambda: site_of(keys), lambda: read_cell(str(toml))):
+        with pytest.raises(InputError, match=r"\.pem: valid from 2027-.* and this computer's date is 2029-"):
+            read()
 
 
 def slopes(rng, per_h, blocks=30):

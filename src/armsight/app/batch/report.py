@@ -17,12 +17,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.special import stdtr
 from scipy.stats import kendalltau, theilslopes
 
 from armsight.app.batch.run import RECORDINGS, SHOTS
 from armsight.data import Array
 from armsight.errors import InputError
+from armsight.estimate.chance import chance_among
 
 #: Chance that a report names any cell of a site in which none differs; half: a difference must be larger, double: one
 #: report in ten names one.
@@ -174,19 +174,11 @@ def _compared(runs: Sequence[_PushedRun], metric: str) -> Iterator[CellRow]:
 
 
 def _chance(value: float, others: Array, least: float) -> float | None:
-    """Return how probable a value as far off others is: Student's, with their median and their median deviation.
-
-    Args:
-        value: of one cell.
-        others: (N,) of its siblings.
-        least: sigma of the value by itself: the spread is no smaller.
-    """
+    """Return how probable a value as far off its siblings (N,) is; ``least``: sigma of the value by itself."""
     middle = float(np.median(others))
-    spread = max(float(np.median(np.abs(others - middle))) / 0.6745, least)  # of a normal variable: its sigma
-    if not spread > 0.0:
-        return None
-    freedom = max(0.37 * len(others), 1.0)  # efficiency of the median deviation for normal variables
-    return float(2.0 * stdtr(freedom, -abs(value - middle) / (spread * math.sqrt(1.0 + math.pi / (2 * len(others))))))
+    off = (value - middle) / math.sqrt(1.0 + math.pi / (2 * len(others)))  # the median is uncertain, too
+    sigma, chance = chance_among(off, others - middle, least)
+    return chance if sigma > 0.0 else None
 
 
 def _trend(own: Sequence[_PushedRun], metric: str) -> tuple[float | None, float | None]:

@@ -10,16 +10,17 @@ a few cells that do drift hardly change it, and the chance is Student's with the
 
 from __future__ import annotations
 
+import functools
 import math
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
-from scipy.special import chdtri, stdtr
 
 from armsight.app.stream.cell_file import STATE_S
+from armsight.estimate.chance import chance_among
 from armsight.files import natural_key
 
 #: s without a state after which a connected cell is frozen, or its network cut; half: a busy computer is red now and
@@ -67,28 +68,18 @@ ENDED, WELL, LOOK, DRIFTING, FINDING, LOST = range(-1, 5)
 
 def number(value: object) -> float | None:
     """Return a number of JSON; None where it is none, or not finite."""
-    if isinstance(value, bool) or not isinstance(value, int | float):
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e300:
         return None
-    try:
-        found = float(value)
-    except OverflowError:
-        return None
-    return found if math.isfinite(found) else None
+    return float(value)
 
 
 @dataclass(frozen=True)
 class Drift:
-    """A slope against what slopes are by chance.
+    """A slope against what slopes are by chance."""
 
-    Attributes:
-        per_h: the slope an hour, in the number's unit.
-        sigma_per_h: one sigma of slopes by chance; NaN while that is unknown.
-        chance: how probable a slope as steep is where nothing drifts; 1 while that is unknown.
-    """
-
-    per_h: float
-    sigma_per_h: float
-    chance: float
+    per_h: float  #: in the number's unit
+    sigma_per_h: float  #: one sigma of slopes by chance; NaN while that is unknown
+    chance: float  #: how probable a slope as steep is where nothing drifts; 1 while that is unknown
 
 
 @dataclass
@@ -101,15 +92,10 @@ class Slopes:
 
     def add(self, t_s: float, mean: float) -> None:
         """Take the mean of a block at its time, s."""
+        self._number = self._number + 1 if self.blocks else 1
         self.blocks.append((t_s, mean))
-        self._number += 1
         if self._number % BLOCKS == 0 and (slope := self.per_h(t_s, BLOCKS)) is not None:
             self.past.append(slope)
-
-    def begin_anew(self) -> None:
-        """Forget the window: what follows is not to be compared with it."""
-        self.blocks.clear()
-        self._number = 0
 
     def count(self, now_s: float) -> int:
         """Return how many blocks of the last window there are."""
@@ -126,36 +112,17 @@ class Slopes:
 
 
 def drifts(cells: Mapping[str, Slopes], now_s: float) -> dict[str, Drift]:
-    """Compare the slopes of one number of all cells, each with those of as many blocks.
-
-    Args:
-        cells: name -> its means.
-        now_s: the time now, s.
-
-    Returns:
-        Name -> its drift; those of too few means are left out.
-    """
+    """Compare the slopes of one number of all cells, each with those of as many blocks; too few are left out."""
+    slope = functools.cache(lambda name, count: cells[name].per_h(now_s, count))
     found: dict[str, Drift] = {}
-    counts = {name: each.count(now_s) for name, each in cells.items()}
-    for count in sorted(set(counts.values())):
-        slopes = {name: each.per_h(now_s, count) for name, each in cells.items()}
-        for name, slope in slopes.items():
-            if slope is not None and counts[name] == count:
-                siblings = [other for each, other in slopes.items() if each != name and other is not None]
-                found[name] = _against(slope, siblings, list(cells[name].past) if count == BLOCKS else [])
+    for name, each in cells.items():
+        count = each.count(now_s)
+        if (own := slope(name, count)) is not None:
+            siblings = [s for other in cells if other != name and (s := slope(other, count)) is not None]
+            known = [siblings, each.past] if count == BLOCKS else [siblings]
+            against = (chance_among(own, np.array(slopes)) for slopes in known if len(slopes) >= _SLOPES)
+            found[name] = Drift(own, *max(against, default=(math.nan, 1.0)))  # those that are steeper by chance
     return found
-
-
-def _against(slope: float, *sources: Sequence[float]) -> Drift:
-    """Compare a slope with others: those of the source in which slopes are larger."""
-    of_sigma = math.sqrt(chdtri(1, 0.5))  # the median size of a normal variable
-    known = [(float(np.median(np.abs(each))) / of_sigma, len(each)) for each in sources if len(each) >= _SLOPES]
-    scale, count = max(known, default=(0.0, 0))
-    if not scale > 0.0:
-        return Drift(slope, math.nan, 1.0)
-    # A median of sizes has the precision of a mean square of 0.37 times as many (its efficiency for normal variables).
-    freedom = max(0.37 * count, 1.0)
-    return Drift(slope, scale, float(2.0 * stdtr(freedom, -abs(slope) / scale)))
 
 
 @dataclass
@@ -191,14 +158,12 @@ class CellView:
             if not self.sessions:  # another command, perhaps another rig: not to be compared with what was before
                 self.alive_s, self.drifts = at_s, {}
                 for each in self.slopes.values():
-                    each.begin_anew()
+                    each.blocks.clear()
             self.sessions.add(session)
-            self.lost_s, self.ended = None, ""
-            self.state_s = max(self.state_s, at_s)
-            return
-        self.sessions.discard(session)
-        if not self.sessions:
-            self.lost_s = at_s
+            self.lost_s, self.ended, self.state_s = None, "", max(self.state_s, at_s)
+        else:
+            self.sessions.discard(session)
+            self.lost_s = self.lost_s if self.sessions else at_s
 
     def take(self, state: Any, at_s: float) -> dict[str, Any] | None:  # noqa: ANN401 - whatever JSON holds
         """Take a state; return the row to be stored, None where it is none."""
@@ -206,12 +171,11 @@ class CellView:
             self.rejected_s = at_s
             self.why_rejected = state if isinstance(state, str) else "a state without a time t"
             return None
-        self.state_s = at_s
         row: dict[str, Any] = {"t": t, "arrived": at_s, "mode": str(state.get("mode", ""))[:20]}
         row |= {key: number(state.get(key)) for key in NUMBERS}
         health = state.get("health")
         row["health"] = [str(each)[:300] for each in health[:5]] if isinstance(health, list) else []
-        self.state, self.offset_s = row, row["t"] - at_s
+        self.state, self.state_s, self.offset_s = row, at_s, t - at_s
         if row["error_mm"] is not None:
             bar = int(at_s // _BAR_S)
             self.day[bar] = max(self.day.get(bar, 0.0), row["error_mm"])
@@ -236,11 +200,8 @@ class CellView:
         if not self.sessions:
             if self.ended:
                 return LOOK if self.failed else ENDED, 0.0, self.ended
-            return (
-                LOST,
-                now_s - (self.lost_s or now_s),
-                "lost: the connection closed, and its command did not say that it ends",
-            )
+            why = "lost: the connection closed, and its command did not say that it ends"
+            return LOST, now_s - (self.lost_s or now_s), why
         if (silent := abs(now_s - self.state_s)) > _SILENT_S:  # where the hub's clock was set, until the next state
             return LOST, silent, f"silent for {silent:.0f} s although connected: frozen, or the network is cut"
         state = self.state
@@ -275,8 +236,7 @@ class CellView:
 
     def to_json(self, now_s: float) -> dict[str, Any]:
         """Return what the page shows."""
-        level, size, why = self.need(now_s)
-        first = int(now_s // _BAR_S) - _BARS + 1
+        (level, size, why), first = self.need(now_s), int(now_s // _BAR_S) - _BARS + 1
         return {
             "site": self.site,
             "name": self.name,
@@ -289,7 +249,6 @@ class CellView:
             "health": self.state.get("health", []),
             "drifts": {key: asdict(each) for key, each in self.drifts.items() if each.sigma_per_h > 0.0},
             "alive_s": round(now_s - self.alive_s) if self.sessions else None,
-            "state_age_s": round(now_s - self.state_s, 1) if self.state_s else None,
             "clock_s": None if math.isnan(self.offset_s) else round(self.offset_s, 3),
             "clock_s_per_h": self.slopes[_CLOCK].per_h(now_s, self.slopes[_CLOCK].count(now_s)),
             "day": [[bar - first, round(error, 4)] for bar, error in sorted(self.day.items()) if bar >= first],
@@ -299,12 +258,9 @@ class CellView:
 def look_for_drifts(cells: Mapping[tuple[str, str], CellView], now_s: float) -> None:
     """Compare the slopes of cells that are connected; to be called once a minute."""
     alive = {f"{each.site}/{each.name}": each for each in cells.values() if each.sessions}
-    for key in DRIFTS:
-        found = drifts({name: each.slopes[key] for name, each in alive.items()}, now_s)
-        for name, each in alive.items():
-            each.drifts = {k: d for k, d in each.drifts.items() if k != key} | (
-                {key: found[name]} if name in found else {}
-            )
+    found = {key: drifts({name: each.slopes[key] for name, each in alive.items()}, now_s) for key in DRIFTS}
+    for name, each in alive.items():
+        each.drifts = {key: of[name] for key, of in found.items() if name in of}
 
 
 def ranked(cells: list[CellView], now_s: float) -> list[dict[str, Any]]:

@@ -9,29 +9,18 @@ import click
 
 from armsight.app.options import PATH, output
 
-_KEYS = "site-keys"
 _JSON = click.option("--json", "as_json", is_flag=True, help="Print the result as one JSON object.")
-_KEYS_OPTION = click.option(
-    "--keys", default=_KEYS, show_default=True, metavar="DIR", type=PATH, help="Folder of the site's keys."
-)
 _HUB = click.option(
-    "--hub",
-    "address",
-    default="127.0.0.1:7447",
-    show_default=True,
-    metavar="HOST[:PORT]",
+    "--hub", "address", default="127.0.0.1:7447", show_default=True, metavar="HOST[:PORT]",
     help="Where cells find the hub; port 7447 where none is given.",
-)
+)  # fmt: skip
 
 
 @click.group("hub", invoke_without_command=True)
 @click.option(
-    "--listen",
-    default="tcp/127.0.0.1:7447",
-    show_default=True,
-    metavar="ADDRESS",
+    "--listen", default="tcp/127.0.0.1:7447", show_default=True, metavar="ADDRESS",
     help="Where cells connect: tls/0.0.0.0:7447, with --keys, for other computers.",
-)
+)  # fmt: skip
 @click.option("--http", default="127.0.0.1:8730", show_default=True, metavar="HOST:PORT", help="Where the page is.")
 @click.option("--keys", metavar="DIR", type=PATH, help="Folder of the site's keys (armsight hub keys).")
 @click.option("--mqtt", metavar="ADDRESS", help="Publish Sparkplug B to a broker: mqtt[s]://[USER@]HOST[:PORT].")
@@ -53,19 +42,19 @@ def command(
         return
     import threading
 
-    from armsight.app.hub.router import rejected
-    from armsight.app.hub.service import Hub
     from armsight.app.show.http import host_and_port
     from armsight.app.show.messages import require
     from armsight.app.stream.cell_file import endpoint
     from armsight.files import check_folder
 
-    require("a hub", "cells", "zenoh", "pyarrow")
+    require("a hub", "cells", "zenoh", "pyarrow", "cryptography")
+    from armsight.app.hub.router import rejected
+    from armsight.app.hub.service import Hub
+
     check_folder(output, problem="no hub can be kept here")
     host_and_port(http, "--http")
-    hub = Hub(
-        output, endpoint(listen, "--listen"), http, keys, lambda line: click.echo(f"note: {line}", err=True), mqtt
-    )
+    listening = endpoint(listen, "--listen")
+    hub = Hub(output, listening, http, keys, lambda line: click.echo(f"note: {line}", err=True), mqtt)
     try:
         if as_json:
             click.echo(json.dumps({"address": hub.pages.address, "listen": listen, "directory": str(output)}))
@@ -80,7 +69,7 @@ def command(
 @command.command("keys")
 @click.argument("site")
 @click.argument("cells", nargs=-1, metavar="CELL...")
-@output("DIR", "Folder of the keys.", default=_KEYS)
+@output("DIR", "Folder of the keys.", default="site-keys")
 @_HUB
 @_JSON
 def keys_command(site: str, cells: tuple[str, ...], output: Path, address: str, as_json: bool) -> None:
@@ -89,9 +78,12 @@ def keys_command(site: str, cells: tuple[str, ...], output: Path, address: str, 
     Typed again it adds cells and renews what ends within 30 days. Start the hub again after it. DIR/ca.key must stay
     secret: who has it can make cells, and ask cells to hold.
     """
-    from armsight.app.hub.keys import make_keys
     from armsight.app.show.http import host_and_port
+    from armsight.app.show.messages import require
     from armsight.files import check_folder
+
+    require("keys", "cells", "cryptography")
+    from armsight.app.hub.keys import make_keys
 
     host, port = host_and_port(address if ":" in address.rpartition("]")[2] else f"{address}:7447", "--hub", least=1)
     made = make_keys(check_folder(output, problem="no keys can be made here"), site, cells, host, port)
@@ -108,7 +100,9 @@ def keys_command(site: str, cells: tuple[str, ...], output: Path, address: str, 
 @command.command("hold")
 @click.argument("cell")
 @click.argument("reason")
-@_KEYS_OPTION
+@click.option(
+    "--keys", default="site-keys", show_default=True, metavar="DIR", type=PATH, help="Folder of the site's keys."
+)
 @_HUB
 @_JSON
 def hold_command(cell: str, reason: str, keys: Path, address: str, as_json: bool) -> None:
@@ -117,8 +111,11 @@ def hold_command(cell: str, reason: str, keys: Path, address: str, as_json: bool
     A cell does so only where its cell.toml says holds = true, and the request is signed by the site's key. The
     cell keeps an event of it. Exit code 2: it did not.
     """
-    from armsight.app.hub.router import hold
+    from armsight.app.show.messages import require
     from armsight.errors import ArmsightError
+
+    require("a request to hold", "cells", "zenoh", "cryptography")
+    from armsight.app.hub.router import hold
 
     answer = hold(keys, cell, reason, address)
     if as_json:
@@ -142,12 +139,9 @@ def clocks_command(first: Path, second: Path, as_json: bool) -> None:
     from armsight.tables.poses import read_pose_table
 
     found = time_between(*(read_pose_table(each, side="seen") for each in (first, second)))
-    if as_json:
-        click.echo(json.dumps({"delay_s": found.delay_s, "sigma_s": found.sigma_s}))
-    else:
-        click.echo(
-            f"times of {second} less those of {first}: {1e3 * found.delay_s:+.3f} ± {1e3 * found.sigma_s:.3f} ms"
-        )
+    off, sigma = 1e3 * found.delay_s, 1e3 * found.sigma_s
+    said = json.dumps({"delay_s": found.delay_s, "sigma_s": found.sigma_s})
+    click.echo(said if as_json else f"times of {second} less those of {first}: {off:+.3f} ± {sigma:.3f} ms")
 
 
 @command.command("push")
@@ -173,10 +167,6 @@ def push_command(runs: Path, store: str, spec: str, rate: float, as_json: bool) 
     cell = read_cell(spec)
     with steps() as say:
         done = push(cell, runs, store, rate, lambda sent: say(f"pushing: {sent / 1e6:.1f} MB"))
-    if as_json:
-        click.echo(json.dumps(asdict(done)))
-    else:
-        click.echo(
-            f"{done.runs} runs are in {store} now ({done.files} files, {done.sent_bytes / 1e6:.1f} MB); "
-            f"{done.complete_before} were before"
-        )
+    sent = f"{done.files} files, {done.sent_bytes / 1e6:.1f} MB"
+    said = f"{done.runs} runs are in {store} now ({sent}); {done.complete_before} were before"
+    click.echo(json.dumps(asdict(done)) if as_json else said)

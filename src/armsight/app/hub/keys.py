@@ -9,67 +9,69 @@ import re
 from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from armsight.app.stream.cell_file import check_name, hold_bytes
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+from armsight.app.stream.cell_file import certificate, check_name, hold_bytes
 from armsight.errors import InputError
 from armsight.files import read_bytes, read_text, replacing, write_text
-
-if TYPE_CHECKING:
-    from cryptography import x509
-    from cryptography.hazmat.primitives.asymmetric.ec import EllipticCurvePrivateKey
 
 #: days that certificates are valid: of cells and hub, and of the authority; half: renewed twice as often, double: a
 #: stolen key works longer.
 _DAYS, _CA_DAYS = 397, 3650
 #: days before its end in which a certificate is made anew; half: less warning, double: made anew more often.
 _RENEW_DAYS = 30
-_CA, HUB, _CELLS = "ca", "hub", "cells"
+#: Name of the hub's certificate.
+HUB = "hub"
+_CELL = """name = "{}"
+site = "{}"
+router = ""
+ca = "ca.pem"
+certificate = "cell.pem"
+key = "cell.key"
+holds = false  # true: the hub may ask this cell to hold its arm
+"""
+#: A certificate and its private key.
+_Pair = tuple[x509.Certificate, ec.EllipticCurvePrivateKey]
 
 
 def make_keys(folder: Path, site: str, cells: Sequence[str], host: str, port: int) -> list[Path]:
     """Make what a site lacks: the authority, the hub's certificate, and a folder a cell with its cell.toml.
 
-    Args:
-        folder: of the site's keys; ``ca.key`` in it must stay secret.
-        site: its name.
-        cells: names of cells; those that have a valid certificate keep it.
-        host: under which cells find the hub.
-        port: of the hub.
+    Cells that have a valid certificate keep it; host and port are where they find the hub. ``ca.key`` must stay secret.
 
     Returns:
         The files of cells that are new or changed, each to be carried to its cell.
 
     Raises:
-        InputError: a name that cannot be part of a key, a folder of another site, or cryptography is not installed.
+        InputError: a name that cannot be part of a key, or a folder of another site.
     """
-    _required()
-    check_name(site, "the site's name")
-    for name in cells:
-        check_name(name, "a cell's name")
-        if name == HUB:
-            raise InputError(f"a cell cannot be called {HUB}: that is the hub's own certificate")
-    folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-    authority = _authority(folder, site)
+    for name in (site, *cells):
+        check_name(name, "the name of a site or a cell")
+    if HUB in cells:
+        raise InputError(f"a cell cannot be called {HUB}: that is the hub's own certificate")
+    if not (folder / "ca.pem").exists():
+        _ensure(folder / "ca", None, site, [])
+    authority = certificate(folder / "ca.pem"), _private(folder / "ca.key")
+    if (name := _common_name(authority[0])) != site:
+        raise InputError(f"{folder}: these are the keys of site {name}, not of {site}: give another folder with -o")
     _ensure(folder / HUB, authority, f"{site}.{HUB}", [host, "localhost", "127.0.0.1"])
+    router = f'router = "tls/[{host}]:{port}"' if ":" in host else f'router = "tls/{host}:{port}"'
     made = []
     for name in cells:
-        at = folder / _CELLS / name
-        router = f"tls/[{host}]:{port}" if ":" in host else f"tls/{host}:{port}"
-        named = {"name": name, "site": site, "router": router}
-        named |= {"ca": "ca.pem", "certificate": "cell.pem", "key": "cell.key"}
-        lines = [f"{key} = {json.dumps(value)}" for key, value in named.items()]
-        if _ensure(at / "cell", authority, f"{site}.{name}", []):
-            write_text(at / "ca.pem", (folder / "ca.pem").read_text())
-            made.append(at / "cell.toml")
-        if not (at / "cell.toml").exists():
-            last = "holds = false  # true: the hub may ask this cell to hold its arm"
-            write_text(at / "cell.toml", "\n".join([*lines, last]) + "\n")
-        before = read_text(at / "cell.toml")  # what its owner changed in it stays; the hub's address follows
-        now = re.sub(r"(?m)^router = .*$", lines[2], before)
-        if now != before:
-            write_text(at / "cell.toml", now)
-            made.append(at / "cell.toml")
+        at = folder / "cells" / name
+        toml = at / "cell.toml"
+        new = _ensure(at / "cell", authority, f"{site}.{name}", [])
+        if new:
+            write_text(at / "ca.pem", read_text(folder / "ca.pem"))
+        before = read_text(toml) if toml.exists() else _CELL.format(name, site)  # what its owner changed in it stays
+        now = re.sub(r"(?m)^router = .*$", router, before)
+        if new or now != before:
+            write_text(toml, now)
+            made.append(toml)
     return made
 
 
@@ -79,92 +81,60 @@ def site_of(folder: Path) -> tuple[str, list[str]]:
     Raises:
         InputError: it holds no keys, or a certificate has ended.
     """
-    _required()
     if not (folder / "ca.pem").is_file():
         raise InputError(
             f"{folder}: no keys of a site are here: make them with `armsight hub keys SITE CELL ... -o {folder}`"
         )
-    site = _common_name(_certificate(folder / "ca.pem"))
-    _check_valid(folder / f"{HUB}.pem")
-    return site, sorted(path.parent.name for path in folder.glob(f"{_CELLS}/*/cell.pem"))
+    certificate(folder / f"{HUB}.pem")
+    cells = sorted(path.parent.name for path in folder.glob("cells/*/cell.pem"))
+    return _common_name(certificate(folder / "ca.pem")), cells
 
 
 def sign_hold(folder: Path, cell: str, text: str) -> bytes:
     """Return a request that a cell holds its arm, signed by the authority of a folder."""
-    from cryptography.hazmat.primitives import hashes
-    from cryptography.hazmat.primitives.asymmetric import ec
-
-    site, _ = site_of(folder)
     t = round(datetime.now(UTC).timestamp(), 3)
-    signature = _private(folder / "ca.key").sign(hold_bytes(site, cell, t, text), ec.ECDSA(hashes.SHA256()))
+    signed = hold_bytes(site_of(folder)[0], cell, t, text)
+    signature = _private(folder / "ca.key").sign(signed, ec.ECDSA(hashes.SHA256()))
     return json.dumps({"t": t, "text": text, "signature": signature.hex()}).encode()
 
 
-def _required() -> None:
-    try:
-        import cryptography  # noqa: F401 - whether it is there
-    except ImportError:
-        raise InputError('cryptography is not installed: pip install "armsight[cells]"') from None
-
-
-def _authority(folder: Path, site: str) -> tuple[x509.Certificate, EllipticCurvePrivateKey]:
-    if not (folder / "ca.pem").exists():
-        _ensure(folder / _CA, None, site, [])
-    found = _certificate(folder / "ca.pem"), _private(folder / "ca.key")
-    if (name := _common_name(found[0])) != site:
-        raise InputError(f"{folder}: these are the keys of site {name}, not of {site}: give another folder with -o")
-    return found
-
-
-def _ensure(
-    path: Path, authority: tuple[x509.Certificate, EllipticCurvePrivateKey] | None, name: str, hosts: list[str]
-) -> bool:
+def _ensure(path: Path, authority: _Pair | None, name: str, hosts: list[str]) -> bool:
     """Make PATH.pem and PATH.key where they are missing, end soon or lack a host; return whether they were made."""
-    from cryptography import x509
-    from cryptography.hazmat.primitives import hashes, serialization
-    from cryptography.hazmat.primitives.asymmetric import ec
-    from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
-
-    pem = path.with_suffix(".pem")
+    pem, now = path.with_suffix(".pem"), datetime.now(UTC)
     if pem.exists() and path.with_suffix(".key").exists():
-        found = _certificate(pem)
-        if not _ends_soon(found) and set(hosts) <= _hosts(found):
+        found = certificate(pem, ended=True)
+        names = found.extensions.get_extension_for_class(x509.SubjectAlternativeName).value if hosts else ()
+        had = {str(each.value) for each in names}
+        if found.not_valid_after_utc - now > timedelta(days=_RENEW_DAYS) and set(hosts) <= had:
             return False
-        hosts = sorted({*hosts, *_hosts(found)} if hosts else ())
+        hosts = sorted({*hosts, *had})
     path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
     key = ec.generate_private_key(ec.SECP256R1())
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
-    now, own = datetime.now(UTC), authority is None
-    builder = (
-        x509.CertificateBuilder()
-        .subject_name(subject)
-        .issuer_name(subject if authority is None else authority[0].subject)
-        .public_key(key.public_key())
-        .serial_number(x509.random_serial_number())
-        .not_valid_before(now - timedelta(hours=1))
-        .not_valid_after(now + timedelta(days=_CA_DAYS if own else _DAYS))
-        .add_extension(x509.BasicConstraints(ca=own, path_length=0 if own else None), critical=True)
-    )
-    if not own:
+    issuer, signing = (subject, key) if authority is None else (authority[0].subject, authority[1])
+    end = now + timedelta(days=_CA_DAYS if authority is None else _DAYS)
+    builder = x509.CertificateBuilder().subject_name(subject).issuer_name(issuer).public_key(key.public_key())
+    builder = builder.serial_number(x509.random_serial_number())
+    builder = builder.not_valid_before(now - timedelta(hours=1)).not_valid_after(end)
+    own = x509.BasicConstraints(authority is None, 0 if authority is None else None)
+    builder = builder.add_extension(own, critical=True)
+    if authority is not None:
         uses = [ExtendedKeyUsageOID.CLIENT_AUTH, *([ExtendedKeyUsageOID.SERVER_AUTH] if hosts else [])]
         builder = builder.add_extension(x509.ExtendedKeyUsage(uses), critical=False)
-        if hosts:
-            names = x509.SubjectAlternativeName([_alternative(each) for each in hosts])
-            builder = builder.add_extension(names, critical=False)
-    certificate = builder.sign(key if authority is None else authority[1], hashes.SHA256())
-    pkcs8 = serialization.PrivateFormat.PKCS8
-    private = key.private_bytes(serialization.Encoding.PEM, pkcs8, serialization.NoEncryption())
+    if hosts:
+        known = x509.SubjectAlternativeName([_alternative(each) for each in hosts])
+        builder = builder.add_extension(known, critical=False)
+    made = builder.sign(signing, hashes.SHA256())
+    encoding, pkcs8 = serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8
     with replacing(path.with_suffix(".key"), "wb") as file:
         os.chmod(file.name, 0o600)
-        file.write(private)
+        file.write(key.private_bytes(encoding, pkcs8, serialization.NoEncryption()))
     with replacing(pem, "wb") as file:
-        file.write(certificate.public_bytes(serialization.Encoding.PEM))
+        file.write(made.public_bytes(encoding))
     return True
 
 
 def _alternative(host: str) -> x509.GeneralName:
-    from cryptography import x509
-
     try:
         return x509.IPAddress(ipaddress.ip_address(host))
     except ValueError:
@@ -173,29 +143,7 @@ def _alternative(host: str) -> x509.GeneralName:
         return x509.DNSName(host)
 
 
-def _hosts(certificate: x509.Certificate) -> set[str]:
-    from cryptography import x509
-
-    try:
-        names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
-    except x509.ExtensionNotFound:
-        return set()
-    return {str(each.value) for each in names}
-
-
-def _certificate(path: Path) -> x509.Certificate:
-    from cryptography import x509
-
-    try:
-        return x509.load_pem_x509_certificate(read_bytes(path))
-    except ValueError:
-        raise InputError(f"{path}: no certificate is in it: make the site's keys anew") from None
-
-
-def _private(path: Path) -> EllipticCurvePrivateKey:
-    from cryptography.hazmat.primitives import serialization
-    from cryptography.hazmat.primitives.asymmetric import ec
-
+def _private(path: Path) -> ec.EllipticCurvePrivateKey:
     try:
         key = serialization.load_pem_private_key(read_bytes(path), None)
     except (ValueError, TypeError):
@@ -204,20 +152,5 @@ def _private(path: Path) -> EllipticCurvePrivateKey:
     return key
 
 
-def _common_name(certificate: x509.Certificate) -> str:
-    from cryptography.x509.oid import NameOID
-
-    return str(certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)[0].value)
-
-
-def _ends_soon(certificate: x509.Certificate) -> bool:
-    return certificate.not_valid_after_utc - datetime.now(UTC) < timedelta(days=_RENEW_DAYS)
-
-
-def _check_valid(path: Path) -> None:
-    certificate, now = _certificate(path), datetime.now(UTC)
-    if not certificate.not_valid_before_utc <= now <= certificate.not_valid_after_utc:
-        ended = certificate.not_valid_after_utc.date()
-        raise InputError(
-            f"{path}: valid until {ended}, and this computer's date is {now.date()}: run `armsight hub keys` again"
-        )
+def _common_name(found: x509.Certificate) -> str:
+    return str(found.subject.get_attributes_for_oid(NameOID.COMMON_NAME)[0].value)

@@ -20,7 +20,7 @@ from armsight.app.hub.router import Heard, Link, Router, parsed
 from armsight.app.hub.sparkplug import Node, check_address
 from armsight.app.hub.store import FLUSH_S, Store
 from armsight.app.show.http import Answer, Pages, metrics_text
-from armsight.app.stream.cell_file import NAME, STATE_S
+from armsight.app.stream.cell_file import STATE_S
 
 #: s that an answer of /state is served to all who ask; half: thirty tabs cost twice, double: a second of age.
 _STATE_S = STATE_S / 2
@@ -50,18 +50,11 @@ _TEXTS = ("armsight", "host", "mode", "arm", "body", "rig_made_utc")
 
 
 class Hub:
-    """Listens to the cells of a site, keeps what they send, and shows it.
+    """Listens to the cells of a site, keeps what they send in a folder, and shows it.
 
-    Args:
-        folder: where it is kept.
-        listen: zenoh endpoint for cells.
-        http: address of the page.
-        keys: folder of the site's keys; None on this computer alone.
-        mqtt: address of a broker that is given Sparkplug B; None: nobody is.
-        say: is given a line for what a person should know at once.
-
-    Raises:
-        InputError: an address is in use or not safe, or nothing can be written.
+    ``listen`` is the zenoh endpoint of cells, ``keys`` the folder of the site's keys (None: on this computer alone), and
+    ``say`` is given a line for what a person should know at once. An InputError says which address is in use or not
+    safe, or that nothing can be written.
     """
 
     def __init__(
@@ -86,15 +79,22 @@ class Hub:
         self._cached = dict[bool, tuple[float, bytes]]()  # whether with the errors of a day -> when made, the answer
         self._asking = ThreadPoolExecutor(4, "ask")
         self._ended = threading.Event()
-        self._page = importlib.resources.files(__package__).joinpath("page.html").read_bytes()
-        routes = {"/": self._html, "/state": self._state, "/events": self._events, "/image": self._image}
+        page = importlib.resources.files(__package__).joinpath("page.html").read_bytes()
+        routes: dict[str, Callable[[dict[str, str]], Answer]] = {
+            "/": lambda _: (200, "text/html; charset=utf-8", page),
+            "/state": self._state,
+            "/events": self._events,
+            "/image": self._asked("image", "image/jpeg"),
+            "/shots": self._asked("shots", "application/json"),
+            "/metrics": self._metrics,
+        }
         with ExitStack() as opened:
             self._store = Store(folder)
             opened.callback(self._store.close)
             self._cells.update({(cell.site, cell.name): cell for cell in self._store.known()})
             self._router = Router(listen, keys, self._hear, self._stored)
             opened.callback(self._router.close)
-            self.pages = Pages(http, {**routes, "/metrics": self._metrics}, "--http")
+            self.pages = Pages(http, routes, "--http")
             opened.pop_all()
         self._thread = threading.Thread(target=self._run, name="hub", daemon=True)
         self._thread.start()
@@ -121,11 +121,10 @@ class Hub:
 
     def _reject(self, text: str) -> None:
         now = time.time()
-        if self._site is None:
-            return
-        self._say(text)
-        event = {"n": 1, "kind": "rejected", "level": "warning", "text": text, "t": now}
-        self._store.add_events(self._site, HUB, {"outbox": str(now), "events": [event]}, now)
+        if self._site is not None:
+            self._say(text)
+            event = {"n": 1, "kind": "rejected", "level": "warning", "text": text, "t": now}
+            self._store.add_events(self._site, HUB, {"outbox": str(now), "events": [event]}, now)
 
     def _hear(self, heard: Heard) -> None:
         if heard[2] == "state" and self._heard.qsize() > _WAITING:  # another follows in a second; of tokens none does
@@ -135,13 +134,10 @@ class Hub:
 
     def _stored(self, site: str, cell: str, message: Any) -> int:  # noqa: ANN401 - whatever JSON holds
         """Store events; called in a thread of the router."""
-        if not (NAME.fullmatch(site) and NAME.fullmatch(cell)):
-            return 0
-        n = self._store.add_events(site, cell, message, time.time())
-        if n:  # a command that began after one that ended has not ended
-            events = [each for each in message["events"] if isinstance(each, dict)]
-            for each in [each for each in events if each.get("kind") in ("began", "ended")][-1:]:
-                self._hear((site, cell, each["kind"], time.time(), each))
+        if n := self._store.add_events(site, cell, message, time.time()):
+            ends = [e for e in message["events"] if isinstance(e, dict) and e.get("kind") in ("began", "ended")]
+            for each in ends[-1:]:
+                self._hear((site, cell, "command", time.time(), each))  # one that began after another ended goes on
         return n
 
     def _run(self) -> None:
@@ -159,10 +155,9 @@ class Hub:
                 if time.monotonic() - done[k] > every_s:
                     done[k] = time.monotonic()
                     self._try(failed, task)
-            if self._store.problem != self._problem:
-                self._problem = self._store.problem
-                if self._problem:
-                    self._say(self._problem)
+            before, self._problem = self._problem, self._store.problem
+            if self._problem and self._problem != before:
+                self._say(self._problem)
 
     def _try(self, what: str, do: Callable[..., None], *given: object) -> None:
         """Do what must not end the hub where it fails; the same failure is said once until it succeeds."""
@@ -170,10 +165,10 @@ class Hub:
             do(*given)
             self._failed.pop(what, None)
         except Exception as error:  # noqa: BLE001
-            why = f"{type(error).__name__}: {error}"
+            why = f"{what}: {type(error).__name__}: {error}"
             if self._failed.get(what) != why:
                 self._failed[what] = why
-                self._say(f"{what}: {why}")
+                self._say(why)
 
     def _publish(self) -> None:
         """Publish the cells as devices of a node a site."""
@@ -184,48 +179,37 @@ class Hub:
             self._try(f"MQTT is without {site}/{cell['name']}", self._nodes[site].update, [cell])
 
     def _look(self) -> None:
-        with self._lock:
-            look_for_drifts(self._cells, time.time())
-        self._look_for_names()
-
-    def _look_for_names(self) -> None:
-        """Reject whoever has the key of a cell and for a minute another name."""
+        """Look for drifts, and reject whoever has the key of a cell and for a minute another name."""
         links = set(self._router.links())
         with self._lock:
+            look_for_drifts(self._cells, time.time())
             wrong = {each for each in links if each[1] not in self._cells.get(each[0], CellView("", "")).sessions}
         for each in sorted(link for link in wrong if self._misnamed.get(link) is False):
             self._reject(f"{each[2]} has the key of {each[0][1]} and sends under another name: correct its cell.toml")
         self._misnamed = {link: link in self._misnamed for link in wrong}
 
     def _take(self, heard: Heard) -> None:
-        site, name, what, at_s, content = heard
-        if not (NAME.fullmatch(site) and NAME.fullmatch(name)):
-            return
+        (site, name, what, at_s, content), ask = heard, False
         with self._lock:
             cell = self._cells.setdefault((site, name), CellView(site, name))
             if what == "alive":
                 session, came = content
                 cell.token(session, came, at_s)
-                if came:
-                    self._ask(cell, at_s)
-            elif what in ("began", "ended"):
-                goes_on = what == "began" or len(cell.sessions) > 1
+                ask = came
+            elif what == "command":
+                goes_on = content["kind"] == "began" or len(cell.sessions) > 1
                 cell.end("" if goes_on else str(content.get("text") or "ended"), content.get("level"))
-            elif what == "state":
+            else:
                 before_s = cell.state_s
-                row = cell.take(content, at_s)
-                if row is not None and at_s - before_s > _STATE_S:
+                if (row := cell.take(content, at_s)) is not None and at_s - before_s > _STATE_S:
                     self._store.add_state(cell, row)
-                if not cell.about and at_s - cell.asked_s > _ASK_AGAIN_S:
-                    self._ask(cell, at_s)
-
-    def _ask(self, cell: CellView, at_s: float) -> None:
-        """Ask a cell who it is, beside the others."""
-        cell.asked_s = at_s
-        self._asking.submit(self._ask_about, cell)
+                ask = not cell.about and at_s - cell.asked_s > _ASK_AGAIN_S
+            if ask:
+                cell.asked_s = at_s
+                self._asking.submit(self._ask_about, cell)
 
     def _ask_about(self, cell: CellView) -> None:
-        """Ask a cell that has connected who it is."""
+        """Ask a cell who it is."""
         about = parsed(self._router.ask(cell.site, cell.name, "about"))
         if isinstance(about, dict) and about:
             texts = {key: about[key][:200] for key in _TEXTS if isinstance(about.get(key), str)}
@@ -238,16 +222,8 @@ class Hub:
         now = time.time()
         with self._lock:
             cells = ranked(list(self._cells.values()), now)
-        return {
-            "t": now,
-            "cells": cells,
-            "events": self._store.count(),
-            "dropped": self._dropped,
-            "problem": self._store.problem,
-        }
-
-    def _html(self, _: dict[str, str]) -> Answer:
-        return 200, "text/html; charset=utf-8", self._page
+        of_hub = {"events": self._store.count(), "dropped": self._dropped, "problem": self._store.problem}
+        return {"t": now, "cells": cells, **of_hub}
 
     def _state(self, query: dict[str, str]) -> Answer:
         made, data = self._cached.get(day := "day" in query, (0.0, b""))
@@ -260,26 +236,26 @@ class Hub:
         return 200, "application/json", data
 
     def _events(self, query: dict[str, str]) -> Answer:
-        found = self._store.events(query.get("q", ""), query.get("site", ""), query.get("cell", ""))
+        found = self._store.events(*(query.get(key, "") for key in ("q", "site", "cell")))
         return 200, "application/json", json.dumps(found).encode()
 
-    def _image(self, query: dict[str, str]) -> Answer:
-        site, cell = query.get("site", ""), query.get("cell", "")
-        if (site, cell) not in self._cells:
-            return 404, "text/plain", b"no such cell\n"
-        data = self._router.ask(site, cell, "image")
-        if not data.startswith(b"\xff\xd8"):
-            return 404, "text/plain", b"the cell has no image\n"
-        return 200, "image/jpeg", data
+    def _asked(self, what: str, kind: str) -> Callable[[dict[str, str]], Answer]:
+        """Return a page of what a cell answers."""
+
+        def answer(query: dict[str, str]) -> Answer:
+            key = query.get("site", ""), query.get("cell", "")
+            data = self._router.ask(*key, what) if key in self._cells else b""
+            return (200, kind, data) if data else (404, "text/plain", b"no such cell is there, or it has none\n")
+
+        return answer
 
     def _metrics(self, _: dict[str, str]) -> Answer:
         found = self.snapshot()
         rows = {"hub_events": {"": float(found["events"])}, "hub_dropped_total": {"": float(found["dropped"])}}
-        for name, (key, _help) in _GAUGES.items():
-            rows[name] = {
-                f'{{site="{cell["site"]}",cell="{cell["name"]}"}}': float(value)
-                for cell in found["cells"]
-                if (value := {**cell["state"], **cell}.get(key)) is not None
-            }
-        metrics = {gauge: ("gauge", text) for gauge, (_, text) in _GAUGES.items()} | _OF_HUB
-        return 200, "text/plain; version=0.0.4", metrics_text(metrics, rows)
+        for cell in found["cells"]:
+            labels, values = f'{{site="{cell["site"]}",cell="{cell["name"]}"}}', {**cell["state"], **cell}
+            for name, (key, _help) in _GAUGES.items():
+                if values.get(key) is not None:
+                    rows.setdefault(name, {})[labels] = float(values[key])
+        kinds = {gauge: ("gauge", text) for gauge, (_, text) in _GAUGES.items()} | _OF_HUB
+        return 200, "text/plain; version=0.0.4", metrics_text(kinds, rows)

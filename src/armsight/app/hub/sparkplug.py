@@ -37,11 +37,7 @@ Value = bool | int | float | str | None
 
 
 def check_address(address: str) -> tuple[str, str | None, str, int]:
-    """Return scheme, user, host and port of a broker's address.
-
-    Raises:
-        InputError: it is none, or another computer without TLS, or paho-mqtt is not installed.
-    """
+    """Return scheme, user, host and port of a broker's address; an InputError says why it cannot be used."""
     found = _ADDRESS.fullmatch(address)
     if found is None or int(found[4] or 1) > 65535:
         raise InputError(f"--mqtt is {address!r}: expected mqtt://[USER@]HOST[:PORT], mqtts:// for another computer")
@@ -72,13 +68,7 @@ def _field(number: int, value: bool | int | float | bytes) -> bytes:
 
 
 def payload(t_s: float, values: Mapping[str, tuple[type, Value]], seq: int | None) -> bytes:
-    """Return a Payload of sparkplug_b.proto.
-
-    Args:
-        t_s: time, s.
-        values: name -> its type, and its value; None where it is not known. Whole numbers are no less than 0.
-        seq: number of the message, 0 to 255; None: it has none.
-    """
+    """Return a Payload of sparkplug_b.proto, numbered where it has a number; whole values are no less than 0."""
     t = round(1e3 * t_s)
     out = _field(1, t)
     for name, (kind, value) in values.items():
@@ -92,21 +82,14 @@ def payload(t_s: float, values: Mapping[str, tuple[type, Value]], seq: int | Non
 def metrics(cell: Mapping[str, Any]) -> dict[str, tuple[type, Value]]:
     """Return the metrics of a cell as the page shows it."""
     found = {**cell["about"], **cell["state"], **cell}
-    numbers = (*NUMBERS, "rig_heldout_mm", "limit_mm", "clock_s")
-    return (
-        {"level": (int, cell["level"])}
-        | {name: (float, found.get(name)) for name in numbers}
-        | {name: (str, found.get(name)) for name in _TEXTS}
-    )
+    kinds = dict.fromkeys((*NUMBERS, "rig_heldout_mm", "limit_mm", "clock_s"), float) | dict.fromkeys(_TEXTS, str)
+    return {"level": (int, cell["level"])} | {name: (kind, found.get(name)) for name, kind in kinds.items()}
 
 
 class Node:
-    """One site at a broker; it connects, again and again, in a thread of the library.
+    """One site, a group, at a broker; it connects, again and again, in a thread of the library.
 
-    Args:
-        site: the group.
-        address: that :func:`check_address` passes.
-        say: is given a line for what a person should know at once.
+    ``say`` is given a line for what a person should know at once.
     """
 
     def __init__(self, site: str, address: str, say: Callable[[str], None]) -> None:
@@ -137,14 +120,12 @@ class Node:
         if self._birth.is_set():
             self._birth.clear()
             self._born, self._seq = {}, 0
-            bd = {"bdSeq": (int, self._bd), _REBIRTH: (bool, False)}
-            self._publish("NBIRTH", "", bd)
+            self._publish("NBIRTH", "", {"bdSeq": (int, self._bd), _REBIRTH: (bool, False)})
         for cell in cells:
             name, now = cell["name"], metrics(cell)
             before = self._born.get(name)
             if cell["up"]:
-                changed = {key: value for key, value in now.items() if before is None or before[key] != value}
-                if changed:
+                if changed := {key: value for key, value in now.items() if before is None or before[key] != value}:
                     self._publish("DBIRTH" if before is None else "DDATA", name, changed)
                 self._born[name] = now
             elif before is not None:

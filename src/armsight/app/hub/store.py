@@ -38,19 +38,12 @@ _TABLES = (
 
 
 class Store:
-    """Keeps events and states in a folder.
-
-    Args:
-        folder: made where it is not there.
-
-    Raises:
-        InputError: nothing can be written there, or another hub uses it.
-    """
+    """Keeps events and states in a folder; an InputError says that it cannot, or that another hub uses it."""
 
     def __init__(self, folder: Path) -> None:
         self._folder, self._lock = folder, threading.Lock()
         self._rows: dict[str, list[dict[str, Any]]] = defaultdict(list)
-        self.problem = ""
+        self._problems = {"events": "", "states": ""}
         with ExitStack() as opened:
             try:
                 opened.enter_context(alone_in(folder, "hub"))
@@ -63,6 +56,11 @@ class Store:
             except (sqlite3.Error, OSError) as error:
                 raise InputError(f"{folder}: nothing can be kept here: {error}") from None
             self._opened = opened.pop_all()
+
+    @property
+    def problem(self) -> str:
+        """What cannot be kept now, and why; empty where all is."""
+        return "; ".join(filter(None, self._problems.values()))
 
     def add_events(self, site: str, cell: str, message: Any, arrived_s: float) -> int:  # noqa: ANN401 - whatever JSON holds
         """Store events of a cell, each once; return the number up to which they are stored, 0 where none is."""
@@ -82,9 +80,9 @@ class Store:
             with self._lock, self._db:
                 self._db.executemany("INSERT OR IGNORE INTO events VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)", rows)
         except sqlite3.Error as error:
-            self.problem = f"events are not stored, the cells keep them: {error}"
+            self._problems["events"] = f"events are not stored, the cells keep them: {error}"
             return 0
-        self.problem = ""
+        self._problems["events"] = ""
         return last
 
     def keep_about(self, cell: CellView) -> None:
@@ -119,17 +117,15 @@ class Store:
             if value:
                 where.append(f"{key} = ?")
                 values.append(value)
-        names = ("site", "cell", "n", "t", "arrived", "kind", "level", "text")
-        query = (
-            f"SELECT {', '.join(names)} FROM events WHERE {' AND '.join(where)} ORDER BY t DESC, n DESC LIMIT {_FOUND}"
-        )
+        names = "site, cell, n, t, arrived, kind, level, text"
+        query = f"SELECT {names} FROM events WHERE {' AND '.join(where)} ORDER BY t DESC, n DESC LIMIT {_FOUND}"
+        found: list[dict[str, Any]] = []
         with closing(sqlite3.connect(self._folder / "events.sqlite", timeout=0.2)) as db:
-            end = time.monotonic() + _SEARCH_S
+            end, db.row_factory = time.monotonic() + _SEARCH_S, sqlite3.Row
             db.set_progress_handler(lambda: time.monotonic() > end, 10_000)
-            found: list[dict[str, Any]] = []
             with suppress(sqlite3.Error):  # the time is over: what was found until then
-                found.extend(dict(zip(names, row, strict=True)) for row in db.execute(query, values))
-            return found
+                found.extend(map(dict, db.execute(query, values)))
+        return found
 
     def count(self) -> int:
         """Return how many events there are."""
@@ -145,7 +141,7 @@ class Store:
         import pyarrow as pa
         import pyarrow.parquet as pq
 
-        rows, self._rows = self._rows, defaultdict(list)
+        rows, self._rows, self._problems["states"] = self._rows, defaultdict(list), ""
         numbers = [(key, pa.float64()) for key in ("t", "arrived", *NUMBERS)]
         schema = pa.schema([*numbers, ("mode", pa.string()), ("health", pa.list_(pa.string()))])
         for cell, states in rows.items():
@@ -156,7 +152,7 @@ class Store:
                 with replacing(path, "wb") as file:
                     pq.write_table(pa.Table.from_pylist(states, schema), file)
             except (OSError, InputError, ValueError) as error:  # ValueError: of pyarrow, too
-                self.problem = f"states are not stored: {error}"
+                self._problems["states"] = f"states are not stored: {error}"
         oldest = "SELECT arrived FROM events ORDER BY arrived DESC LIMIT 1 OFFSET ?"
         with suppress(sqlite3.Error), self._lock, self._db:
             self._db.execute(f"DELETE FROM events WHERE arrived <= ({oldest})", (_MOST,))

@@ -1,9 +1,9 @@
 """What a cell sends to the hub of its site: who it is, its state once a second, its events, an image on request.
 
-The keys are ``armsight/SITE/CELL/...`` (docs/howto/cells.md): ``alive`` a liveliness token; ``about``, ``image`` and
-``hold`` are answered; ``state`` is put; ``events`` are asked to be stored, until the hub answers up to which number
-they are. The cell never waits for the hub: all of it happens in threads of its own, and without a hub only the events
-are kept.
+The keys are ``armsight/SITE/CELL/...`` (docs/howto/cells.md): ``alive`` a liveliness token; ``about``, ``image``,
+``shots`` and ``hold`` are answered; ``state`` is put; ``events`` are asked to be stored, until the hub answers up to
+which number they are. The cell never waits for the hub: all of it happens in threads of its own, and without a hub only
+the events are kept.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import math
 import socket
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -24,7 +25,16 @@ import click
 import cv2
 import numpy as np
 
-from armsight.app.stream.cell_file import ANSWER_S, LONGEST, STATE_S, Cell, hold_bytes, read_cell, zenoh_config
+from armsight.app.stream.cell_file import (
+    ANSWER_S,
+    LONGEST,
+    STATE_S,
+    Cell,
+    certificate,
+    hold_bytes,
+    read_cell,
+    zenoh_config,
+)
 from armsight.app.stream.datum import Published, json_text
 from armsight.app.stream.outbox import Outbox, state_folder
 from armsight.app.stream.sink import Sink
@@ -51,6 +61,9 @@ _FRESH_S = 60.0
 #: px, the longer side of an image for the hub, and its JPEG quality; half: a rough look, double: four times the bytes
 #: (15 kB).
 _SIDE_PX, _JPEG = 480, 70
+#: s between two shots that are kept for who asks, how many are (7 kB each), and for how many s after a question; half:
+#: gaps where a page asks once a second, double: an answer is longer than a hub reads.
+_SHOT_S, _SHOTS, _ASKED_S = 0.2, 5, 10.0
 #: findings that a state names at most; half: less is seen at once, double: a state of 2 kB.
 _FINDINGS = 5
 #: s that closing may take; half: a slow hub aborts the process, double: the same.
@@ -132,13 +145,7 @@ class CellSink(Sink):
 
     def __init__(self, cell: Cell, published: Published, mode: str) -> None:
         super().__init__(wakes=256, close_s=_CLOSE_S)
-        tls = None if cell.ca is None else {
-            "root_ca_certificate": str(cell.ca),
-            "enable_mtls": True,
-            "connect_certificate": str(cell.certificate),
-            "connect_private_key": str(cell.key),
-        }  # fmt: skip
-        self._config = zenoh_config("client", connect=cell.router, tls=tls)
+        self._config = zenoh_config("client", cell.router, (cell.ca, cell.certificate, cell.key))
         self._cell, self._published, self._mode = cell, published, mode
         self._outbox = Outbox(state_folder() / "cells" / cell.site / cell.name, cell.name)
         self._lock = threading.Lock()  # of the outbox: this thread adds, the other one sends
@@ -146,6 +153,7 @@ class CellSink(Sink):
         self._began = self._state_at = time.monotonic()
         self._looked = 0.0
         self._newest: Shot | None = None
+        self._asked_s, self._kept = -math.inf, deque[tuple[float, bytes]](maxlen=_SHOTS)
         self._held, self._began_utc = set[float](), time.time()
         self._exit: tuple[int, str] | None = None
         self._exited = threading.Event()  # whether nothing more is to be heard of how the command ends
@@ -184,7 +192,9 @@ class CellSink(Sink):
         elif isinstance(datum, ShotDatum):
             self._shots += 1
             self._window.shots += 1
-            self._newest = datum.shot
+            self._newest, now = datum.shot, time.monotonic()
+            if now - self._asked_s < _ASKED_S and not (self._kept and now - self._kept[-1][0] < _SHOT_S):
+                self._kept.append((now, json_text(datum.to_json(self._published.body))))
             if isinstance(datum.result, PoseEstimate):
                 self._measured(datum.result)
             elif datum.result is not None or datum.shot.problem is not None:
@@ -305,6 +315,7 @@ class CellSink(Sink):
                 topic("about"), lambda query: query.reply(topic("about"), json_text(self.about()))
             ),
             session.declare_queryable(topic("image"), lambda query: query.reply(topic("image"), self._image())),
+            session.declare_queryable(topic("shots"), lambda query: query.reply(topic("shots"), self._shots_kept())),
             session.declare_queryable(topic("hold"), lambda query: query.reply(topic("hold"), self._hold(query))),
             session.liveliness().declare_token(topic("alive", str(session.zid()))),
         ]
@@ -342,6 +353,11 @@ class CellSink(Sink):
         scale = _SIDE_PX / max(image.shape[:2])
         small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1.0 else image
         return cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _JPEG])[1].tobytes()
+
+    def _shots_kept(self) -> bytes:
+        """Return the newest shots as JSON, thinned; none are kept unless they are asked for."""
+        self._asked_s = time.monotonic()
+        return b"[" + b",".join(shot for at_s, shot in list(self._kept) if self._asked_s - at_s < _ASKED_S) + b"]"
 
     def _hold(self, query: Any) -> bytes:  # noqa: ANN401 - of the library
         """Answer a request to hold: done, or why not; both are events."""
@@ -382,12 +398,11 @@ class CellSink(Sink):
 
 def signed_by(ca: Path, signature: bytes, data: bytes) -> bool:
     """Whether the key of a site's certificate signed bytes."""
-    from cryptography import x509
     from cryptography.exceptions import InvalidSignature
     from cryptography.hazmat.primitives import hashes
     from cryptography.hazmat.primitives.asymmetric import ec
 
-    public = x509.load_pem_x509_certificate(ca.read_bytes()).public_key()
+    public = certificate(ca, ended=True).public_key()
     try:
         assert isinstance(public, ec.EllipticCurvePublicKey)
         public.verify(signature, data, ec.ECDSA(hashes.SHA256()))

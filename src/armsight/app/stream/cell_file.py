@@ -7,12 +7,17 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from armsight.errors import InputError
-from armsight.files import read_toml
+from armsight.files import read_bytes, read_toml
+
+if TYPE_CHECKING:
+    from cryptography import x509
 
 #: The router of a hub on this computer.
 ROUTER = "tcp/127.0.0.1:7447"
@@ -61,9 +66,8 @@ def read_cell(spec: str) -> Cell:
     """Read ``NAME[@ROUTER]`` or the path of a cell.toml.
 
     Raises:
-        InputError: a name that cannot be part of a key, no endpoint, a file without the keys it needs, or another
-        computer's
-            router without TLS.
+        InputError: a name that cannot be part of a key, no endpoint, a file without the keys it needs, a certificate
+            that has ended, or another computer's router without TLS.
     """
     if spec.endswith(".toml"):
         return _from_file(Path(spec).expanduser())
@@ -98,11 +102,13 @@ def _from_file(path: Path) -> Cell:
 def _checked(cell: Cell, where: str) -> Cell:
     for what, name in (("cell", cell.name), ("site", cell.site)):
         check_name(name, f"{where}: the {what}'s name")
-    tls = cell.router.startswith("tls/")
-    if tls and None in (cell.ca, cell.certificate, cell.key):
-        raise InputError(
-            f"{where}: {cell.router} needs ca, certificate and key in a cell.toml; `armsight hub keys` makes it"
-        )
+    if cell.router.startswith("tls/"):
+        if cell.ca is None or cell.certificate is None or cell.key is None:
+            raise InputError(
+                f"{where}: {cell.router} needs ca, certificate and key in a cell.toml; `armsight hub keys` makes it"
+            )
+        for path in (cell.ca, cell.certificate):
+            certificate(path)
     require_here(cell.router, where)
     return cell
 
@@ -133,19 +139,41 @@ def require_here(router: str, where: str) -> None:
         )
 
 
+def certificate(path: Path, *, ended: bool = False) -> x509.Certificate:
+    """Return the certificate in a PEM file; with ``ended`` one that has ended, too.
+
+    Raises:
+        InputError: none is in it, it is not valid by this computer's date, or cryptography is not installed.
+    """
+    try:
+        from cryptography import x509
+    except ImportError:
+        raise InputError('cryptography is not installed: pip install "armsight[cells]"') from None
+    try:
+        found = x509.load_pem_x509_certificate(read_bytes(path))
+    except ValueError:
+        raise InputError(f"{path}: no certificate is in it: run `armsight hub keys` again") from None
+    begin, end, now = found.not_valid_before_utc, found.not_valid_after_utc, datetime.now(UTC)
+    if not (ended or begin <= now <= end):
+        raise InputError(
+            f"{path}: valid from {begin.date()} to {end.date()}, and this computer's date is {now.date()}: correct the "
+            "date, or run `armsight hub keys` again"
+        )
+    return found
+
+
 def hold_bytes(site: str, cell: str, t: float, text: str) -> bytes:
     """Return what is signed in a request to hold."""
     return json.dumps(["armsight hold", site, cell, t, text]).encode()
 
 
-def zenoh_config(mode: str, connect: str = "", listen: str = "", tls: dict[str, Any] | None = None) -> Any:  # noqa: ANN401
+def zenoh_config(mode: str, end: str, keys: Sequence[Path | None] = (None,)) -> Any:  # noqa: ANN401 - of the library
     """Return the configuration of a zenoh session that looks for nobody by itself.
 
     Args:
-        mode: client or router.
-        connect: endpoint to connect to, with a second to do so; empty for none.
-        listen: endpoint to listen at; empty for none.
-        tls: zenoh's ``transport/link/tls``.
+        mode: client, which connects within a second, or router, which listens.
+        end: endpoint of the router.
+        keys: files of the site's certificate, the own one and its key; without TLS the first is None.
 
     Raises:
         InputError: zenoh is not installed.
@@ -154,15 +182,18 @@ def zenoh_config(mode: str, connect: str = "", listen: str = "", tls: dict[str, 
         import zenoh
     except ImportError:
         raise InputError('zenoh is not installed: pip install "armsight[cells]"') from None
-    config = zenoh.Config()
+    config, way = zenoh.Config(), {"client": "connect", "router": "listen"}[mode]
     settings: dict[str, Any] = {
         "mode": mode,
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
-        "listen/endpoints": [listen] if listen else [],
-        "connect/endpoints": [connect] if connect else [],
+        "listen/endpoints": [],
+        f"{way}/endpoints": [end],
         "connect/timeout_ms": 1000,
     }
-    for key, value in {**settings, **({"transport/link/tls": tls} if tls else {})}.items():
+    if keys[0] is not None:
+        files = zip(("root_ca_certificate", f"{way}_certificate", f"{way}_private_key"), map(str, keys), strict=True)
+        settings["transport/link/tls"] = {"enable_mtls": True, **dict(files)}
+    for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
     return config

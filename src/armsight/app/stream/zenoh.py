@@ -18,6 +18,7 @@ import struct
 from itertools import count
 from typing import Any
 
+from armsight.app.stream.cell_file import zenoh_config
 from armsight.app.stream.datum import Published, json_text
 from armsight.app.stream.foxglove import Messages, nanoseconds, require_foxglove
 from armsight.app.stream.mcap_file import TOPICS
@@ -76,13 +77,8 @@ class Ros2Sink(Sink):
         self._store = get_typestore(Stores.ROS2_JAZZY)
         self._publishers: dict[str, _RosPublisher] = {}
         self._infos: dict[str, Any] = {}
-        config = zenoh.Config()
-        config.insert_json5("mode", '"client"')
-        config.insert_json5("connect/endpoints", f'["tcp/{host}:{port}"]')
-        config.insert_json5("scouting/multicast/enabled", "false")
-        config.insert_json5("connect/timeout_ms", "1000")
         try:
-            self._session: Any = zenoh.open(config)
+            self._session: Any = zenoh.open(zenoh_config("client", f"tcp/{host}:{port}"))
         except zenoh.ZError:
             raise InputError(
                 f"--stream ros2:{host}:{port}: no zenoh router answers there; start it: ros2 run rmw_zenoh_cpp rmw_zenohd"
