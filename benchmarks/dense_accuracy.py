@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,6 @@ import numpy as np
 
 from armsight.geometry.pose import pose
 from armsight.geometry.rotation import exp_so3
-from armsight.sim.render.mesh import box, see, with_noise
 from armsight.vision.camera import Camera
 from armsight.vision.dense.block import Block
 from armsight.vision.dense.evaluate import TrueDisparity, evaluate_disparity
@@ -20,6 +20,9 @@ from armsight.vision.dense.postprocess import filled
 from armsight.vision.dense.rectified import plain_grey
 from armsight.vision.dense.scanline import Scanline
 from armsight.vision.dense.semiglobal import Semiglobal
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "vision"))
+from solids import box, see, with_noise
 
 OURS = {
     "block": Block(),
@@ -113,9 +116,9 @@ def boxes(seed: int, size: tuple[int, int] = (480, 360)) -> tuple[np.ndarray, np
                 pose(exp_so3(rng.uniform(-0.7, 0.7, 3)), position),
             )
         )
-    left, depth, _ = see(camera, solids)
+    left, depth = see(camera, solids)
     aside = pose(np.eye(3), np.array([-baseline, 0, 0]))
-    right, depth_right, _ = see(camera, [(s, aside @ T) for s, T in solids])
+    right, depth_right = see(camera, [(s, aside @ T) for s, T in solids])
     d = focal * baseline / depth
     column = np.arange(size[0])[None] - d
     k = np.clip(np.rint(column), 0, size[0] - 1).astype(int)

@@ -23,14 +23,9 @@ _SOFT_FLOAT = re.compile(r"__aeabi_[fd](?!p)")
 
 @dataclass(frozen=True)
 class ElfSegment:
-    """A piece of memory the image fills.
+    """A piece of memory the image fills: stored at ``load_address`` (flash), used at ``address``.
 
-    Attributes:
-        address: where it is used.
-        load_address: where it is stored: flash, for what is copied to RAM at start.
-        data: what is stored.
-        size: bytes it takes in use; beyond ``data`` they are zero.
-        writable: whether it is RAM.
+    ``size``: bytes it takes in use, zero beyond ``data``; ``writable``: whether it is RAM.
     """
 
     address: int
@@ -42,14 +37,10 @@ class ElfSegment:
 
 @dataclass(frozen=True)
 class Elf:
-    """An image.
+    """An image: what is loaded, addresses (functions with the Thumb bit) and sizes of symbols by name.
 
-    Attributes:
-        segments: what is loaded.
-        symbols: addresses by name, functions with the Thumb bit.
-        sizes: bytes of each symbol, by name.
-        undefined: names it needs from elsewhere; none once it is linked.
-        hard_float: whether floats are passed in floating-point registers and no soft-float helper is in it.
+    ``undefined``: names it needs from elsewhere; ``hard_float``: floats are passed in floating-point registers and no
+    soft-float helper is in it.
     """
 
     segments: tuple[ElfSegment, ...]

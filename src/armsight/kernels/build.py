@@ -38,13 +38,9 @@ CACHE = PACKAGE.parents[1] / "build" / "kernels"
 
 @dataclass(frozen=True)
 class Platform:
-    """A kind of machine.
+    """A kind of machine by LLVM's ``triple`` and zig's name of it, and the extension module's file name.
 
-    Attributes:
-        triple: LLVM's name of it.
-        zig: zig's.
-        levels: processors, the newest first: the first that a machine has is used there.
-        library: file name of the extension module.
+    ``levels``: processors, the newest first: the first that a machine has is used there.
     """
 
     triple: str

@@ -34,14 +34,9 @@ TRUTH, TRUTH_RIG = "truth.json", "truth_rig.json"
 
 @dataclass(frozen=True, eq=False)
 class Truth(Record):
-    """The true values of a recording.
+    """The true values of a recording: the rig, covariance zero, and poses Ts_left_body (N, 4, 4), m, at times (N,), s.
 
-    Attributes:
-        rig: the cameras that took it; its covariance is zero.
-        target: what they saw, as ``--target`` takes it.
-        shots: names, in order.
-        times_s: (N,) times of the shots, s.
-        Ts_left_body: (N, 4, 4) poses of the target in the left camera's frame, m.
+    ``target`` is what they saw, as ``--target`` takes it; ``shots`` are names, in order.
     """
 
     rig: StereoRig

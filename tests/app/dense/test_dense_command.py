@@ -6,11 +6,11 @@ from functools import partial
 import cv2
 import numpy as np
 import pytest
+from solids import box, see, with_noise
 
 from armsight.geometry.pose import inverse, pose
 from armsight.geometry.rotation import exp_so3
 from armsight.sim.example_rig import example_rig
-from armsight.sim.render.mesh import box, see, with_noise
 from armsight.vision.dense import METHODS
 from armsight.vision.dense.middlebury import read_pfm
 from armsight.vision.rig import StereoRig
@@ -135,7 +135,7 @@ def seen(tmp_path_factory):
     posed = [(wall, pose(exp_so3(np.array([0.1, 0.2, 0.0])), np.array([0, 0, 1.6])))]
     posed.append((near, pose(exp_so3(np.array([0.2, -0.3, 0.1])), np.array([0.05, 0.0, 0.9]))))
     for name, camera, T in (("left", rig.left, np.eye(4)), ("right", rig.right, inverse(rig.T_left_right))):
-        image, depth, _ = see(camera, [(s, T @ P) for s, P in posed])
+        image, depth = see(camera, [(s, T @ P) for s, P in posed])
         cv2.imwrite(str(folder / f"{name}_00.png"), with_noise(image, 1.0, rng))
         if name == "left":
             truth = depth

@@ -4,10 +4,10 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
+from solids import box, see, with_noise
 
 from armsight.geometry.pose import pose
 from armsight.geometry.rotation import exp_so3
-from armsight.sim.render.mesh import box, see, with_noise
 from armsight.vision.camera import Camera
 from armsight.vision.dense.evaluate import TrueDisparity, seen_by_right
 
@@ -55,9 +55,9 @@ def rendered(seed, size=(360, 270), noise=2.0):
         )
         position = np.array([rng.uniform(-0.45, 0.45) * z, rng.uniform(-0.35, 0.35) * z, z])
         solids.append((body, pose(exp_so3(rng.uniform(-0.7, 0.7, 3)), position)))
-    left, depth, _ = see(camera, solids)
+    left, depth = see(camera, solids)
     aside = pose(np.eye(3), np.array([-baseline, 0.0, 0.0]))
-    right, depth_right, _ = see(camera, [(s, aside @ T) for s, T in solids])
+    right, depth_right = see(camera, [(s, aside @ T) for s, T in solids])
     d = focal * baseline / depth
     column = np.arange(size[0])[None] - d
     k = np.clip(np.rint(column), 0, size[0] - 1).astype(int)

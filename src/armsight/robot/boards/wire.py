@@ -59,13 +59,10 @@ class _Layout(NamedTuple):
 
 
 class Wire:
-    """Sends and receives the dialect's messages over a link.
+    """Sends and receives the dialect's messages over a link; WELCOME gives the ``session`` whose commands it sends.
 
-    Attributes:
-        session: whose commands it sends; WELCOME gives it.
-        heard: whether any byte came at all.
-        broken: parts of what came that are no message.
-        lost: messages that are missing in the count of the frames.
+    ``heard``: whether any byte came; ``broken``: parts that are no message; ``lost``: messages missing in the count of
+    frames.
     """
 
     def __init__(self, link: Link) -> None:

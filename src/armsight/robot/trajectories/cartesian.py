@@ -68,14 +68,14 @@ def follow(
     duration_s: float | None = None,
     cruises: Array | None = None,
 ) -> PathMotion:
-    """Plan to travel a path of the tool, in the configuration of the start.
+    """Plan to travel a path of the tool that begins where ``q_start`` puts it, in the configuration of the start.
 
     Args:
         arm: the arm.
-        path: the path; its start is where ``q_start`` puts the tool.
+        path: the path.
         q_start: (n,) angles to start from, rad.
         qd_start: (n,) speeds to start with, rad/s; they must carry the tool along the path. None for rest.
-        qdd_start: (n,) accelerations to start with, rad/s^2, as ``qd_start``.
+        qdd_start: (n,) accelerations to start with, rad/s^2.
         duration_s: how long it is to take, s; None for as short as the limits allow.
         cruises: (C, 2) shares between which the pace is to be steady: the bends of the path. None for none.
 

@@ -48,18 +48,10 @@ def arm_load(q: Array) -> Array:
 
 
 class So101Servos:
-    """The mechanics of six servos.
+    """The mechanics of six servos at joint angles q (6,), rad by the sensors, with what is wrong with them.
 
-    Args:
-        mechanics: what is wrong with them.
-        load: returns the torques (6,) that pull the joints towards smaller angles, N m, at their angles (6,), rad.
-        q: (6,) where the joints are, rad by the sensors.
-
-    Attributes:
-        shaft: (6,) angles of the output shafts, rad.
-        rate: (6,) how fast the shafts move, rad/s; ``shaft_speed`` is the same as a servo measures it, filtered.
-        on: (6,) whether the torque is on.
-        celsius: (6,) temperatures.
+    ``load`` returns the torques (6,) that pull the joints towards smaller angles, N m, at their angles. ``shaft`` (6,),
+    rad, and ``rate`` (6,), rad/s, of the output shafts; ``shaft_speed`` is the same as a servo measures it, filtered.
     """
 
     def __init__(self, mechanics: So101Mechanics, load: Callable[[Array], Array], q: Array) -> None:

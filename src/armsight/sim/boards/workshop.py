@@ -55,19 +55,10 @@ def swapped(first: int, second: int) -> tuple[int, ...]:
 class WorkshopPlant:
     """A wired arm behind the contract :class:`~armsight.robot.boards.link.Plant`, with a hand on it.
 
-    Args:
-        plant: the joints.
-        wiring: how they are wired.
-        bend_counts: (6,) by how much each potentiometer is off a straight line, at most.
-        encoders: what reads the joints that have no potentiometer; those are wired rightly.
-
-    Attributes:
-        wiring: may be changed at any time.
-        load_n_m: (6,) torque on the joints beside gravity and the hand.
-        hold: joint and angle, rad, that the hand brings it to; None: it lets go.
-        drives_s: for how long the drives were on.
-        t_s: how much time has passed.
-        far_rad: (6,) farthest way of the joints from where each was when the drives came on.
+    ``wiring`` may be changed at any time; ``bend_counts`` (6,): by how much a potentiometer is off a straight line at
+    most; joints with ``encoders`` are wired rightly. ``load_n_m`` (6,): beside gravity and the hand, which brings a
+    joint to an angle, rad, by ``hold``. ``drives_s``: for how long the drives were on, ``far_rad`` (6,): how far the
+    joints went since.
     """
 
     def __init__(

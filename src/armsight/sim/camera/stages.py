@@ -66,14 +66,9 @@ class Stage:
 class ExposureTiming(Stage):
     """When the camera looks; the renderer applies motion blur and the rolling shutter, see :meth:`CameraPipeline.shutter`.
 
-    Attributes:
-        rate_hz: images a second.
-        exposure_ms: how long each row gathers light.
-        readout_ms: from the first row's beginning to the last row's; 0 is a global shutter.
-        delay_ms: from the end of the exposure until the image has arrived.
-        jitter_ms: standard deviation of the time stamp.
-        sync_ms: the exposures of two such cameras begin so far apart at most, by chance.
-        skew_ms: by how much the right one of two is later, always.
+    ``readout_ms``: from the first row's beginning to the last row's, 0 for a global shutter; ``delay_ms``: from the end
+    of the exposure until the image has arrived; ``jitter_ms``: sigma of the stamp; the exposures of two begin
+    ``sync_ms`` apart at most, by chance, the right one always by ``skew_ms`` later.
     """
 
     rate_hz: float = _number(1, 500)
@@ -96,10 +91,8 @@ class Lens(Stage):
 class Lamp(Stage):
     """A lamp near a target plane: a smooth gain over the image, cos(angle) / distance^2 of a plane that faces it.
 
-    Attributes:
-        distance_m: from the lamp to the plane.
-        foot: the point of the image that the lamp is in front of, shares of width and height.
-        pixel_mm: size of a pixel on the plane.
+    ``foot``: the point of the image that the lamp is in front of, shares of width and height; ``pixel_mm``: on the
+    plane.
     """
 
     distance_m: float = _number(0.1, 10)
@@ -109,13 +102,7 @@ class Lamp(Stage):
 
 @dataclass(frozen=True)
 class Glint(Stage):
-    """A specular highlight, Gaussian in the image.
-
-    Attributes:
-        peak: radiance of its middle; 1 is a white reflector.
-        sigma_px: its size.
-        centre: where it is, shares of width and height.
-    """
+    """A specular highlight, Gaussian in the image, at shares of width and height; a peak of 1 is a white reflector."""
 
     peak: float = _number(0, 100)
     sigma_px: float = _number(0.3, 100)
@@ -189,12 +176,10 @@ class Photosensor(Stage):
 
 @dataclass(frozen=True)
 class AutoExposure(Stage):
-    """Automatic gain before the converter, in steps; the exposure time stays, for the renderer needs it beforehand.
+    """Automatic gain before the converter; the exposure time stays, for the renderer needs it beforehand.
 
-    Attributes:
-        target: share of the converter's range that the image's mean is brought to, before the tone curve.
-        step_ev: size of a step, powers of two; at most one step an image.
-        gain_max: largest gain; the least is 1.
+    ``target``: share of the converter's range that the image's mean is brought to, before the tone curve, by
+    ``step_ev`` an image at most, powers of two, up to ``gain_max``; the least is 1.
     """
 
     target: float = _number(0.01, 0.9)
@@ -206,10 +191,8 @@ class AutoExposure(Stage):
 class Mosaic(Stage):
     """A colour filter array (RGGB) over the sensor, white balance, and the interpolation of colours.
 
-    Attributes:
-        response: what red, green and blue pixels get of the light, relative to green.
-        white_balance: factors that the camera applies to red, green and blue.
-        demosaic: bilinear, or directed by edges.
+    ``response``: what red, green and blue pixels get of the light, relative to green; ``white_balance``: factors of
+    these.
     """
 
     response: tuple[float, float, float] = _number(0.05, 2, count=3)
@@ -219,13 +202,7 @@ class Mosaic(Stage):
 
 @dataclass(frozen=True)
 class ToneCurve(Stage):
-    """From linear light to grey levels: gain, power, S-curve.
-
-    Attributes:
-        gain: digital, before the curve.
-        gamma: the output is the light to the power of 1 / gamma.
-        contrast: share of the S-curve 3 y^2 - 2 y^3 in it.
-    """
+    """From linear light to grey levels: gain, power 1 / gamma, and a share ``contrast`` of the S-curve 3 y^2 - 2 y^3."""
 
     gain: float = _number(0.1, 16)
     gamma: float = _number(0.5, 3)
@@ -234,13 +211,7 @@ class ToneCurve(Stage):
 
 @dataclass(frozen=True)
 class SpatialDenoise(Stage):
-    """A bilateral filter of the luma.
-
-    Attributes:
-        diameter_px: of the neighbourhood, pixels of the sensor.
-        sigma_px: weight by distance.
-        sigma_grey: weight by difference, grey levels.
-    """
+    """A bilateral filter of the luma: diameter and weights by distance, px of the sensor, weight by grey levels."""
 
     diameter_px: int = _number(3, 15, whole=True)
     sigma_px: float = _number(0.3, 10)
@@ -249,11 +220,9 @@ class SpatialDenoise(Stage):
 
 @dataclass(frozen=True)
 class TemporalDenoise(Stage):
-    """A recursive filter of the luma: the previous output is mixed in where little has changed.
+    """A recursive filter of the luma: the previous output has ``weight`` where nothing has changed.
 
-    Attributes:
-        weight: of the previous output where nothing has changed.
-        threshold_grey: difference, a mean over 3 x 3 pixels, at which the weight has fallen to zero, grey levels.
+    That falls to zero at a difference of ``threshold_grey`` levels, a mean over 3 x 3 pixels.
     """
 
     weight: float = _number(0, 0.95)
@@ -262,12 +231,7 @@ class TemporalDenoise(Stage):
 
 @dataclass(frozen=True)
 class Sharpening(Stage):
-    """An unsharp mask of the luma: y + amount (y - blurred y).
-
-    Attributes:
-        amount: factor of the difference.
-        sigma_px: of the Gaussian blur, pixels of the sensor.
-    """
+    """An unsharp mask of the luma: y + amount (y - blurred y), the blur's sigma in pixels of the sensor."""
 
     amount: float = _number(0, 4)
     sigma_px: float = _number(0.3, 5)

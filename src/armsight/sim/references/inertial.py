@@ -29,22 +29,16 @@ class InertialErrors(Record):
 
     Attributes:
         noise: (6,) density, per sqrt(Hz).
-        bias: (6,) at power-on.
-        walk: (6,) of the bias, per sqrt(s).
-        warming: (6,) change of the bias as the chip warms up.
-        warming_s: time constant of that, s.
+        walk: (6,) of the bias at power-on, per sqrt(s).
+        warming: (6,) change of the bias as the chip warms up, with time constant ``warming_s``, s.
         scale: (6, 3) by how much the matrices of gyro and accelerometer differ from the identity, row by row.
         g_sensitivity: (3, 3) of the gyro, rad/s per m/s2.
-        largest: (6,) end of the range.
-        step: (6,) that values are rounded to.
+        largest: (6,) end of the range; values are rounded to ``step``.
         bandwidth_hz: of the chip's low-pass of second order.
-        rate_hz: readings a second, by its own clock.
-        clock: by how much that clock is slow, relative.
-        lost: share of the readings.
-        repeated: share of the readings that repeat the one before.
+        rate_hz: readings a second, by its own clock, which is slow by ``clock``, relative.
+        lost, repeated: share of the readings that are missing, or repeat the one before.
         mount_hz: resonance of a loose mount about the sensor's x axis; 0: rigid.
-        hum: (6,) amplitude of the motors' vibration.
-        hum_hz: its frequency.
+        hum: (6,) amplitude of the motors' vibration at ``hum_hz``.
     """
 
     noise: Array = field(default_factory=lambda: np.repeat([9e-5, 4e-3], 3))

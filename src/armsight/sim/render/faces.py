@@ -20,14 +20,9 @@ from armsight.sim.render.scene import CLEAR, Pattern
 
 @kernel_types("f8[::1], f8[::1], f8[::1], f8[:, ::1], i8[:, ::1]")
 class Palette(NamedTuple):
-    """Patterns as the painter takes them, end to end.
+    """Patterns as the painter takes them, end to end: borders, m, cells with a clear rim, row by row, discs (K, 4).
 
-    Attributes:
-        x_edges: all borders of columns, m.
-        y_edges: all borders of rows, m.
-        values: all cells with a clear rim around each pattern's, row by row.
-        discs: (K, 4) all discs.
-        first: (P + 1, 4) where each pattern's begin in the four above.
+    ``first`` (P + 1, 4): where each pattern's begin in these.
     """
 
     x_edges: Array
@@ -56,16 +51,12 @@ def palette(patterns: tuple[Pattern, ...]) -> Palette:
 
 @kernel_types("Palette, f8[::1], i8[:, ::1], f8[:, :, :, :, ::1], i8[:, ::1]")
 class Exposure(NamedTuple):
-    """What is painted in an exposure of S steps.
+    """What is painted in an exposure of S steps, of P patterns with K discs; each step has a share (S,) of the light.
 
-    Attributes:
-        palette: P patterns with K discs.
-        weights: (S,) share of each step in the light.
-        order: (S, P) patterns in the order they are painted in; -1 for those that do not face the camera.
-        Ms: (S, P, 1 or H, 3, 3) from rays to homogeneous coordinates of each pattern's plane, for all rows or for each;
-            the third is 1 / depth along the ray.
-        boxes: (P + K, 4) pixels that each pattern can cover, and after it each of its discs: first column, first row, end
-            column, end row, counted from the crop's corner.
+    ``order`` (S, P): of the patterns, -1 for those that do not face the camera; Ms (S, P, 1 or H, 3, 3): from rays to
+    homogeneous coordinates of each plane, for all rows or for each; the third is 1 / depth along the ray; boxes (P + K,
+    4): pixels that each pattern, then each disc, can cover: first column and row, end column and row, from the crop's
+    corner.
     """
 
     palette: Palette

@@ -47,14 +47,10 @@ class Optics:
 
 @dataclass(frozen=True)
 class Sensor:
-    """How a sensor converts light into numbers.
+    """How a sensor converts light into numbers: grey levels of a reflectance of one, ``gain``, and of black, ``offset``.
 
-    Attributes:
-        gain: grey levels of a reflectance of one.
-        offset: grey level of black.
-        read_noise: standard deviation of the noise that is always there, grey levels.
-        shot_noise: variance of the light's own noise per grey level of light; 0.02 is a web camera in a lit room.
-        jpeg_quality: 1 to 100 to send the image through JPEG as web cameras do; None for none.
+    ``read_noise``: sigma that is always there; ``shot_noise``: variance of the light's own noise per grey level of
+    light, 0.02 in a lit room; ``jpeg_quality``: 1 to 100, None for none.
     """
 
     gain: float = 255.0

@@ -60,14 +60,11 @@ class Pattern(Record):
 
 @dataclass(frozen=True, eq=False)
 class PosedBody(Record):
-    """A rigid body in front of a camera.
+    """A rigid body in front of a camera at T_camera_body (4, 4), m, in the middle of the exposure of the middle row.
 
-    Attributes:
-        patterns: what is on the body, painted in this order: a tag comes after the plate it is stuck on.
-        T_camera_body: (4, 4) pose in the camera's frame in the middle of the exposure of the middle row, m.
-        twist: (6,) velocity [m/s; rad/s] in the body's axes.
-        acceleration: (6,) its change, m/s^2 and rad/s^2: at time t the pose is T_camera_body @ exp_se3(t twist +
-            t^2 acceleration / 2).
+    ``patterns`` are painted in their order: a tag comes after the plate it is stuck on. ``twist`` (6,), m/s and rad/s,
+    in the body's axes, and ``acceleration``, its change: at time t the pose is T_camera_body @ exp_se3(t twist + t^2
+    acceleration / 2).
     """
 
     patterns: tuple[Pattern, ...]

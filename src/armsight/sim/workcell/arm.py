@@ -141,14 +141,9 @@ def _value(path: str, key: str, value: object) -> float | int | tuple[float, flo
 
 @dataclass(frozen=True, eq=False)
 class TrueArm(Record):
-    """The true arm: its table, its backlash and its potentiometers' errors.
+    """The true arm: its table, its backlash (n,) from stop to stop, and its potentiometers' errors, rad.
 
-    Attributes:
-        arm: the true table; limits, home and names are the nominal one's.
-        backlash_rad: (n,) backlash of each joint, from stop to stop.
-        pot_offset_rad: (n,) offset error of each potentiometer, rad.
-        pot_sines: (n, 3, 3) amplitude, rad; cycles over the travel; phase, rad: each potentiometer's linearity error.
-        imperfections: what it was sampled from.
+    ``pot_sines`` (n, 3, 3): amplitude, rad; cycles over the travel; phase, rad: each potentiometer's linearity error.
     """
 
     arm: Arm

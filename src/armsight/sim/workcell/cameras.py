@@ -50,17 +50,10 @@ BASELINE_M = 0.2
 
 @dataclass(frozen=True)
 class CameraTiming:
-    """The timing of two cameras.
+    """The timing of two cameras, s; a row is exposed for ``exposure_s``, ``row_s`` after the one above.
 
-    Attributes:
-        image_size_px: (width, height).
-        rate_hz: shots a second.
-        exposure_s: how long a row gathers light.
-        delay_s: from the end of the exposure until the image has arrived.
-        jitter_s: standard deviation of the stamp, beside the arrival.
-        sync_s: the two exposures begin so far apart at most, by chance.
-        skew_s: by how much the right one is later, always.
-        row_s: how much later each row begins than the one above; 0 is a global shutter.
+    ``delay_s``: from the end of the exposure until the image has arrived; ``jitter_s``: sigma of the stamp, beside the
+    arrival; the exposures of both begin ``sync_s`` apart at most, by chance, the right one always by ``skew_s`` later.
     """
 
     image_size_px: tuple[int, int] = (1280, 720)
@@ -203,17 +196,11 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(3)
 
 
 class _Exposed(NamedTuple):
-    """What is before a camera in an exposure.
+    """What is before a camera in an exposure with its middle at t_s, s.
 
-    Attributes:
-        number: of the shot; below zero where something is held before the cameras for the calibration.
-        t_s: middle of the exposure, s.
-        shutter: how long it looks.
-        first: the millisecond of the first row of ``q``.
-        q: (M, n) the links' true angles at the milliseconds about the exposure, rad; to the newest one.
-        covered: whether a card is held before it.
-        held: what else is held, left camera's frame; None for nothing.
-        led: the sync LED as it is lit; None without.
+    ``number``: of the shot, below zero where something is held before the cameras for the calibration; ``first``: the
+    millisecond of the first row of ``q`` (M, n), the links' true angles about the exposure, rad; ``covered``: a card is
+    held before it; ``held``: what else is, left camera's frame.
     """
 
     number: int

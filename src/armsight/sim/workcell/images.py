@@ -234,13 +234,10 @@ def _moved(body: PosedBody, t_s: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class LedSeen(Record):
-    """A round LED that shines at a camera, or one that does so for a part of an exposure.
+    """A round LED that shines at a camera, or one that does so for a part of an exposure, at a depth, m.
 
-    Attributes:
-        window: the pixels that its light reaches.
-        share: (h, w) of each pixel that it covers, times its light.
-        spread: (h, w) the same through the lens.
-        depth_m: its distance.
+    ``share`` (h, w): of each pixel of the window that it covers, times its light; ``spread``: the same through the
+    lens.
     """
 
     window: Window
@@ -257,14 +254,9 @@ class LedSeen(Record):
 class _Room(NamedTuple):
     """What a camera sees while nothing moves, and what its images are made of.
 
-    Attributes:
-        corners: rays of the pixels' corners.
-        rays: (3, H, W) unit rays of all pixels.
-        still: what stands still before it.
-        light: (H, W) its light through the lens.
-        grey: (H, W) the same, shaded, in grey levels.
-        gain: (H, W) grey levels of a reflectance of 1.
-        lamp: (3,) unit vector to the lamp, camera's frame.
+    Rays of the pixels' ``corners`` and unit ``rays`` (3, H, W); ``light`` (H, W) of what is ``still`` through the lens,
+    ``grey`` the same, shaded, in grey levels; ``gain`` (H, W): grey levels of a reflectance of 1; ``lamp`` (3,): unit
+    vector to it.
     """
 
     corners: Array

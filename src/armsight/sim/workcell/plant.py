@@ -235,15 +235,9 @@ class Travelled:
 
 
 class ArmPlant:
-    """An arm with motors, backlash, twist and potentiometers.
+    """An arm with motors, backlash, twist and potentiometers; ``arm`` is the true table.
 
-    Attributes:
-        arm: the true table.
-        parts: the solids it is made of.
-        motors: what drives it.
-        stop_pressed: whether the emergency stop button is pressed; may be set.
-        supply_mv: motor supply, mV; may be set.
-        stepped: called after every step; may be set.
+    May be set: ``stop_pressed``, the supply, and ``stepped``, which is called after every step.
     """
 
     def __init__(self, model: Arm, true: TrueArm, seed: int = 0) -> None:

@@ -79,17 +79,11 @@ _POSES_SIZE_M = (
 
 @dataclass(frozen=True, eq=False)
 class WorkcellTruth(Record):
-    """The true values of a workcell up to now. No estimator gets them.
+    """The true values of a workcell up to now, arm and cameras (covariance zero). No estimator gets them.
 
-    Attributes:
-        arm: the true table.
-        rig: the true cameras; covariance zero.
-        T_base_rig: (4, 4) where the left camera is, m.
-        T_tool_body: (4, 4) where the body is on the tool, m.
-        t_s: (N,) every millisecond since the beginning, s.
-        q: (N, n) true joint angles, rad: of the links, behind backlash and twist.
-        shaft: (N, n) true angles of the gears' shafts, where the potentiometers sit, rad.
-        shot_t_s: name of each shot handed out -> middle of its left exposure, s.
+    Poses (4, 4), m; at every millisecond t_s (N,), s, the angles (N, n), rad, of the links, behind backlash and twist,
+    ``q``, and of the gears' shafts, where the potentiometers sit; ``shot_t_s``: name of each shot handed out -> middle
+    of its left exposure, s.
     """
 
     arm: Arm
@@ -108,25 +102,11 @@ class WorkcellTruth(Record):
 
 
 class _Parts(NamedTuple):
-    """What a workcell is made of.
+    """What a workcell is made of; ``model`` is the table that it is assumed to have, ``default`` the arm it was drawn for.
 
-    Attributes:
-        model: the table that it is assumed to have.
-        timing: of the cameras.
-        seed: of all that is sampled.
-        plant: the arm.
-        rig: the true cameras.
-        T_base_rig: (4, 4) where the left camera is, m.
-        T_tool_body: (4, 4) where the body is on the tool, m.
-        cameras: left and right.
-        room: what must be the same for another workcell to use these cameras.
-        pipeline: what lies between light and file; None for white noise.
-        link: to the board with our firmware; None where the arm keeps its own controller.
-        board: configured.
-        gravity: returns the duty (n,) that compensates the nominal arm's gravity load at joint angles (n,), rad.
-        default: whether it is the arm that the workcell was drawn for.
-        p_led: (3,) where the sync LED is, m, base frame; None without.
-        processes: whether each camera's images are rendered in a process of its own.
+    ``room``: what must be the same for another workcell to use these cameras; ``pipeline``: None for white noise;
+    ``link``: None where the arm keeps its own controller; ``gravity`` returns the duty (n,) that compensates the
+    nominal arm's load at angles (n,), rad; p_led (3,), m, base frame, None without the sync LED.
     """
 
     model: Arm
@@ -217,15 +197,10 @@ def _driven(
 class Workcell:
     """An arm, its board, two cameras and a body; :meth:`open` builds one.
 
-    Attributes:
-        model: the arm as it is assumed to be: all that an estimator may know of it.
-        link: the wire to our board, and all of its inside, see EmulatedLink; None where the arm keeps its own controller.
-        board: the board, configured, its drives off; the arm is at home, held by brakes. A controller of its own holds it.
-        source: the cameras.
-        target: the body on the tool, as it is looked for.
-        body_text: its body file.
-        chessboard_spec: the chessboard that :meth:`chessboard_shots` shows.
-        timing: how the cameras keep time, as their maker says: rate, exposure, how well they are synchronised.
+    ``model`` is the arm as it is assumed to be: all that an estimator may know of it. ``link`` is the wire to our
+    board, and all of its inside, None where the arm keeps its own controller. ``board`` is configured, its drives off;
+    the arm is at home, held by brakes or its controller. ``timing`` is what the cameras' maker says: rate, exposure,
+    synchronisation.
     """
 
     def __init__(self, parts: _Parts) -> None:

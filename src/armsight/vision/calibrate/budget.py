@@ -29,13 +29,10 @@ _THIRD = 2 * np.pi / 3  # rad; between the pairs of three cameras
 
 @dataclass(frozen=True)
 class CauseKind:
-    """What kind of cause it is.
+    """What kind of cause it is: ``moving`` costs nothing at rest; ``common`` is the same in all shots (trueness).
 
-    Attributes:
-        moving: it costs nothing at rest.
-        common: it is the same in all shots (trueness); else it differs from shot to shot (precision).
-        loop: it is no error of what the cameras measure, but of where a closed loop brings the arm.
-        camera: each camera, or each pair of them, has one of its own.
+    ``loop``: no error of what the cameras measure, but of where a closed loop brings the arm; ``camera``: each has its
+    own.
     """
 
     moving: bool = False
@@ -104,13 +101,10 @@ class Conditions(Record):
 
 @dataclass(frozen=True, eq=False)
 class Budget(Record):
-    """The error of a body's pose, [translation m; rotation rad] along the left camera's axes, at G points of a volume.
+    """The error of a body's pose, [translation m; rotation rad] along the left camera's axes, at p_left (G, 3), m.
 
-    Attributes:
-        p_left: (G, 3) the points, m, left camera's frame.
-        forward: (3,) direction of depth.
-        factors: cause -> (G, 6, K) what its K sources of variance one do to the pose.
-        shared: causes that multiply the same sources, which add before they are squared.
+    ``forward`` (3,) is the direction of depth; ``factors``: cause -> (G, 6, K) what its K sources of variance one do to
+    the pose; ``shared``: causes that multiply the same sources, which add before they are squared.
     """
 
     p_left: Array

@@ -26,16 +26,11 @@ class RejectedPair:
 
 @dataclass(frozen=True, eq=False)
 class PairErrors(Record):
-    """Errors of pairs that a rig was not fitted on.
+    """Errors of S pairs that a rig was not fitted on, each over ``weight`` matched points.
 
-    Attributes:
-        pair: (S,) rows of the pairs.
-        epipolar_px: (S,) RMS distance from the epipolar lines, both images, undistorted px.
-        rigid_m: (S,) RMS distance of the triangulated board from the perfect one after a rigid fit.
-        scale: (S,) how many times larger than the perfect board the triangulated one is.
-        weight: (S,) matched points of the pair.
-        normalised: (S,) RMS of the rigid residual over its predicted sigma.
-        over_noise: (S,) RMS of the rigid residual over the sigma that the corners' noise alone gives it.
+    ``epipolar_px``: RMS distance from the epipolar lines, both images, undistorted; ``rigid_m``: RMS of the
+    triangulated board from the perfect one after a rigid fit; ``scale``: how many times larger it is; ``normalised``:
+    RMS of the rigid residual over its predicted sigma; ``over_noise``: over that of the corners' noise alone.
     """
 
     pair: Array

@@ -38,15 +38,10 @@ _MEDIAN_CHI2_2 = 1.3863  # median of the chi-square distribution of two degrees 
 
 @dataclass(frozen=True, eq=False)
 class Screened(Record):
-    """The detections that remain after screening.
+    """The detections that remain after screening, shots renumbered, and the robust adjustment of them.
 
-    Attributes:
-        observations: the good detections, shots renumbered.
-        unscreened: all detections of the same pairs: what a measurement would meet.
-        kept: (S,) rows of the pairs that remain.
-        solution: the robust adjustment of those.
-        rejected: pairs rejected, and why.
-        notes: pairs of which corners were dropped, and how many.
+    ``unscreened``: all detections of the same pairs: what a measurement would meet; ``kept`` (S,): their rows;
+    ``rejected``: pairs, and why; ``notes``: pairs of which corners were dropped, and how many.
     """
 
     observations: Observations

@@ -24,14 +24,9 @@ QUANTILES = (50, 90, 95, 99)
 
 @dataclass(frozen=True)
 class DisparityErrors:
-    """The errors over one set of pixels.
+    """The errors over one set of pixels, px.
 
-    Attributes:
-        pixels: how many there are.
-        bad_percent: share that is off by more than each of THRESHOLDS_PX, in %.
-        average_px: mean error.
-        rms_px: root of the mean squared error.
-        quantiles_px: A50, A90, A95 and A99: that share of the errors is below.
+    ``bad_percent``: share that is off by more than each of THRESHOLDS_PX; ``quantiles_px``: A50, A90, A95 and A99.
     """
 
     pixels: int

@@ -108,11 +108,9 @@ _SIGMA_MODEL = SigmaModel(0.38)
 class Table(NamedTuple):
     """The costs of the best ways to match a row from its left end up to a pixel, less their least.
 
-    Attributes:
-        matched: (W + 2, stride) with the pixel matched, flat; the pixel x is entry x + 2.
-        skipping: the same with pixels skipped just before it, the cost of the break not added yet.
-        taken: (W,) what was taken off at each pixel.
-        best: (W,) the disparity of the best way.
+    ``matched`` (W + 2, stride): with the pixel matched, flat; pixel x is entry x + 2; ``skipping``: with pixels skipped
+    just before it, the break's cost not yet added; ``taken`` (W,): what was taken off; ``best`` (W,): disparity of the
+    best way.
     """
 
     matched: Whole

@@ -31,14 +31,9 @@ _STEPS, _DONE = 12, 1e-4
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis(Record):
-    """A naming of detections and the pose that follows.
+    """A naming of detections, rows (M, 2), -1 where not seen, the pose that follows, and its covariance (6, 6).
 
-    Attributes:
-        rows: (M, 2) rows of the left and the right camera's discs, -1 where a disc was not seen.
-        T_left_body: (4, 4) the pose.
-        cov: (6, 6) covariance of its tangent, noise and calibration.
-        seen: ellipse centres by rows of the target's body.
-        score: logarithm of the Bayes factor against clutter.
+    ``seen``: ellipse centres by rows of the body; ``score``: logarithm of the Bayes factor against clutter.
     """
 
     rows: Ids

@@ -248,14 +248,10 @@ def _fit_each(
 
 @dataclass(frozen=True, eq=False)
 class Fits(Record):
-    """Fitted discs.
+    """Fitted discs, parameters theta (N, 10) as in :class:`Blobs`; ``cov`` (N, 2, 2) of the centres, px^2.
 
-    Attributes:
-        theta: (N, 10) their parameters, as in :class:`Blobs`.
-        cov: (N, 2, 2) covariance of the centres, px^2.
-        shape: (N, 3) their ellipses S11, S12, S22, px^2.
-        codes: (N,) 0 or the reason why it is not a disc (``fit.REASONS``).
-        common: (2, 3) as in :class:`~armsight.data.Discs`.
+    ``shape`` (N, 3): ellipses S11, S12, S22, px^2; ``codes`` (N,): 0 or why it is not a disc (``fit.REASONS``);
+    ``common`` (2, 3) as in :class:`~armsight.data.Discs`.
     """
 
     theta: Array

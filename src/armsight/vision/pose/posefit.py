@@ -52,14 +52,9 @@ class PixelObservations(Record):
 
 @dataclass(frozen=True, eq=False)
 class PoseFit(Record):
-    """The minimum of a pose fit.
+    """The minimum of a pose fit, ``cost``: the sum of the squared distances (N,), in sigmas, or their Cauchy loss.
 
-    Attributes:
-        T_left_body: (4, 4) the pose.
-        residuals_px: (N, 2) detection minus projection.
-        distance2: (N,) squared distance in standard deviations.
-        information: (6, 6) of the tangent [translation m; rotation rad], perturbation on the right.
-        cost: the minimum: the sum of the squared distances, or their Cauchy loss.
+    ``information`` (6, 6): of the tangent [translation m; rotation rad], perturbation on the right.
     """
 
     T_left_body: Array

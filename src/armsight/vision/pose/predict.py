@@ -36,12 +36,9 @@ def plain_rig(focal_px: float = 900.0, baseline_m: float = 0.2) -> StereoRig:
 
 @dataclass(frozen=True, eq=False)
 class PredictedView(Record):
-    """A body before two cameras.
+    """A body before two cameras, ``forward`` (3,) of the left one; normals out of its faces are NaN where unknown.
 
-    Attributes:
-        T_left_body: (4, 4) its pose.
-        forward: (3,) unit vector from the cameras to it, left camera's frame.
-        seen: (M, 2) whether a camera sees a point: in its image, and its face not rotated away; (M, 1): one camera alone.
+    ``seen`` (M, 2): whether a camera sees a point, in its image, its face not rotated away; (M, 1): one camera alone.
     """
 
     T_left_body: Array
@@ -79,16 +76,10 @@ def view(
     aside_m: tuple[float, float] = (0.0, 0.0),
     roll: float = 0.0,
 ) -> PredictedView:
-    """Set a body before the cameras, its faces towards them and its middle between their axes.
+    """Set a body, points and normals (M, 3), before the cameras, its faces towards them, its middle between their axes.
 
-    Args:
-        rig: the cameras.
-        points: (M, 3) points, m.
-        normals: (M, 3) out of their faces; NaN where unknown.
-        distance_m: from the cameras to the body's middle.
-        rotation: about the horizontal and the vertical axis of the image, rad.
-        aside_m: right and down, of the point between the cameras' axes.
-        roll: of the body about the direction of view, rad.
+    ``rotation``: about the horizontal and the vertical axis of the image, rad; ``aside_m``: right and down, of the
+    point between the axes; ``roll``: about the direction of view, rad.
     """
     towards = look_direction(points, normals)
     ahead = np.array([0.0, 0.0, distance_m, 1.0])
@@ -147,18 +138,11 @@ def _facing(rig: StereoRig, T_left_body: Array, points: Array, normals: Array) -
 
 @dataclass(frozen=True, eq=False)
 class PoseDerivatives(Record):
-    """How the measured pose of a body follows from its N pixel positions, weighted alike.
+    """How the measured pose of a body follows from its N pixel positions uv, weighted alike; side 0 is left.
 
-    Tangents are [translation m; rotation rad], perturbation on the right.
-
-    Attributes:
-        side: (N,) 0 left, 1 right.
-        point: (N,) row of the body's points.
-        uv: (N, 2) the projections, raw pixels.
-        by_uv: (6, N, 2) derivative of the pose by the pixels.
-        by_rig: (6, P) by the rig's parameters: what the pose is off by where they are.
-        by_point: (6, M, 3) by the true positions of the body's points, the body's file unchanged.
-        uv_by_pose: (N, 2, 6) derivative of the pixels by the pose.
+    Tangents are [translation m; rotation rad], perturbation on the right. ``by_uv`` (6, N, 2), ``by_rig`` (6, P): what
+    the pose is off by where the pixels or the rig's parameters are; ``by_point`` (6, M, 3): the true positions of the
+    body's points, its file unchanged; ``uv_by_pose`` (N, 2, 6).
     """
 
     side: Ids

@@ -53,13 +53,10 @@ _NOISE_MOST = 0.3
 
 @dataclass(frozen=True, eq=False)
 class TimedShot(Record):
-    """What both cameras saw of a body in one shot, and when.
+    """What both cameras saw of a body in one shot; t_s is the time of the left exposure's middle row, s.
 
-    Attributes:
-        t_s: time of the left exposure's middle row, s.
-        seen: the correspondences as detected; pairs that a wrong skew takes off their epipolar lines included.
-        T_left_body: (4, 4) pose to begin with, m.
-        apart_s: by how much the right stamp is later than the left, s.
+    ``seen`` as detected, pairs that a wrong skew takes off their epipolar lines included; T_left_body (4, 4) to begin
+    with; ``apart_s``: by how much the right stamp is later than the left.
     """
 
     t_s: float
@@ -72,11 +69,7 @@ class TimedShot(Record):
 class Motion(Record):
     """The motion of a body about the time of a shot: exp(twist t + acceleration t^2 / 2), in its own axes.
 
-    Attributes:
-        twist: (6,) velocity, m/s and rad/s.
-        acceleration: (6,) m/s^2 and rad/s^2.
-        cov: (6, 6) covariance of the twist.
-        centred: whether shots on both sides were there.
+    twist (6,), m/s and rad/s, with ``cov``; ``centred``: shots on both sides were there.
     """
 
     twist: Array
@@ -534,13 +527,9 @@ def _score(
 
 @dataclass(frozen=True, eq=False)
 class Alignment(Record):
-    """How the observations of one shot come to its time.
+    """How the observations of one shot come to its time: pose then, and motion, None where too few neighbours show it.
 
-    Attributes:
-        T_left_body: (4, 4) pose at the shot's time.
-        motion: of the body; None where too few neighbours show it.
-        apart_s: by how much the right exposure is later than the left, beyond the mean skew, s.
-        variance: what is not known of it, s^2.
+    ``apart_s``: by how much the right exposure is later than the left, beyond the mean skew; ``variance``: of it, s^2.
     """
 
     T_left_body: Array

@@ -43,13 +43,10 @@ _FARTHEST = 1e9
 
 @dataclass(frozen=True)
 class ImportOptions:
-    """Values that a user may have to add to a foreign file.
+    """Values that a user may have to add to a foreign file; None where file or format say it.
 
-    Attributes:
-        unit_m: length of the file's unit of translation, m; None where the file or the format says it.
-        image_size_px: (width, height); None where the file says it.
-        sigma_px: standard deviation of a detection, px.
-        pair: names of the left and the right camera, of a file that has more than two; None takes the first two.
+    ``unit_m``: of the file's translation; ``sigma_px``: of a detection; ``pair``: names of the left and the right
+    camera, of a file that has more than two; None takes the first two.
     """
 
     unit_m: float | None = None

@@ -35,13 +35,9 @@ _CELLS = 10_000_000
 
 @dataclass(frozen=True, eq=False)
 class LeRobotJoints(Record):
-    """The joints of a dataset.
+    """The joints of a dataset by its names: values (N, n) in the unit of the robot's driver.
 
-    Attributes:
-        names: (n) of the joints, as the dataset has them.
-        t_s: (N,) times, s, from the beginning of each episode.
-        values: (N, n) values as they are in the dataset; its unit is that of the robot's driver.
-        episode: (N,) number of the episode.
+    Times (N,), s, count from the beginning of each episode, whose number is in ``episode`` (N,).
     """
 
     names: tuple[str, ...]

@@ -85,13 +85,9 @@ class _Planned:
 
 
 class BagSource(Source):
-    """The stereo images of a recording in the order of time; two messages that belong together are a shot.
+    """The stereo images of a recording in the order of time; an image without a partner is a shot with a problem.
 
-    An image without a partner is a shot with a problem, which says so.
-
-    Attributes:
-        notes: what was left out, or is odd, a line each.
-        topics: of the left and of the right images.
+    ``notes``: what was left out, or is odd, a line each; ``topics``: of the left and of the right images.
     """
 
     timed = True

@@ -30,16 +30,11 @@ _NS = 1e-9
 
 @dataclass(frozen=True)
 class Stamps:
-    """The stamps of one topic.
+    """The stamps of one topic, t_ns, in the order of the messages: of the headers, or of the arrival without any.
 
-    Attributes:
-        topic: its name.
-        t_ns: time stamps, ns, in the order of the messages: those of the headers, or from the arrival where there are none.
-        notes: what is wrong with them.
-        repeats: numbers of the messages that were recorded before, with the same stamp and content.
-        unknown: numbers of the messages without a stamp whose time of arrival does not say when they were sent.
-        jumps_ns: after how much time of arrival the clock jumped, ns, and by how much; none for most.
-        arrival_ns: the recorder's times of arrival, ns.
+    ``notes``: what is wrong with them; ``repeats``: messages recorded before, with the same stamp and content;
+    ``unknown``: those whose time of arrival does not say when they were sent; ``jumps_ns``: after how much time of
+    arrival the clock jumped, and by how much; ``arrival_ns``: by the recorder.
     """
 
     topic: str
@@ -138,15 +133,10 @@ def _jumps(t: _Times, arrival: _Times) -> tuple[tuple[int, int], ...]:
 
 @dataclass(frozen=True)
 class Pairing:
-    """Which messages are one shot.
+    """Which messages are one shot: ``pairs`` (left, right) in the order of time, no further apart than ``allowed_s``.
 
-    Attributes:
-        pairs: (left, right) message numbers in the order of time.
-        alone: (side, message number) of those without a partner, 0 left, 1 right -> why.
-        allowed_s: how far apart a pair may be, s.
-        skew_s: median of right minus left over the pairs, s; 0 without any.
-        notes: what was left out.
-        due_ns: (side, message number) -> its time as if no clock had jumped, ns.
+    ``alone``: (side, message number) without a partner, 0 left -> why; ``skew_s``: median of right minus left, 0
+    without any; ``due_ns``: (side, message number) -> its time as if no clock had jumped.
     """
 
     pairs: tuple[tuple[int, int], ...]

@@ -53,16 +53,10 @@ class Topic:
 
 @dataclass(frozen=True)
 class BagMessage:
-    """One message.
+    """One message, number ``index`` on its topic, of a kind as in :class:`Topic`.
 
-    Attributes:
-        topic: name of its topic.
-        kind: its type, as in :class:`Topic`.
-        index: its number on its topic, from 0.
-        arrival_ns: when it was recorded, ns, clock of the recorder.
-        encoding: of its bytes: ros1, cdr, protobuf or json.
-        data: its bytes.
-        decode: returns it decoded; raises InputError where it cannot be.
+    ``arrival_ns``: when it was recorded, clock of the recorder; ``encoding``: of its bytes: ros1, cdr, protobuf or
+    json; ``decode`` returns it decoded, or raises InputError.
     """
 
     topic: str
@@ -86,13 +80,10 @@ class BagMessage:
 
 
 class Bag:
-    """A recording that is read from its beginning as often as one likes.
+    """A recording that is read from its beginning as often as one likes; ``path`` as the user gave it.
 
-    Attributes:
-        path: as the user gave it.
-        notes: what could not be read, a line each; more may come while messages are read.
-        topics: its topics by name.
-        metadata: texts that its writer stored beside the messages, by name; MCAP alone has them.
+    ``notes``: what could not be read, a line each, more may come while messages are read; ``topics`` by name;
+    ``metadata``: texts that its writer stored beside the messages, MCAP alone.
     """
 
     def __init__(self, path: str | Path) -> None:

@@ -23,14 +23,7 @@ TRANSFORMS = ("tf2_msgs/TFMessage", "tf/tfMessage", "foxglove.FrameTransforms", 
 
 @dataclass(frozen=True, eq=False)
 class JointStream(Record):
-    """Joint angles over time.
-
-    Attributes:
-        names: (n) of the joints, in the order of the columns.
-        t_s: (N,) rising times, s.
-        q: (N, n) angles, rad.
-        notes: what was left out.
-    """
+    """Joint angles q (N, n), rad, of named joints at rising times (N,), s; ``notes``: what was left out."""
 
     names: tuple[str, ...]
     t_s: Array
