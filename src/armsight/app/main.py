@@ -20,8 +20,7 @@ from armsight.app.retired import in_todays_options
 from armsight.app.show.messages import UNANSWERED, colour, print_error, print_notes, silence_stdout
 from armsight.errors import ArmsightError
 
-#: What a person is about -> the commands, each with the first sentence of its help; each has a folder of its name, whose
-#: ``command.py`` holds a click command called ``command``. Their list imports none of them.
+#: What a person is about -> the commands with the first sentence of their help; each has a folder of its name.
 SECTIONS: dict[str, dict[str, str]] = {
     "See it live": {
         "live": "Open a page in the browser that leads from two uncalibrated cameras to a closed loop, step by step."
@@ -132,10 +131,7 @@ def main() -> None:
 
 
 def run(arguments: list[str]) -> int:
-    """Run a command and return its exit code; what is wrong is said on stderr.
-
-    What the command appends to its context's ``obj`` is called with the exit code, and what is wrong.
-    """
+    """Run a command and return its exit code; what is wrong is said on stderr."""
     at_exit: list[Callable[[int, str], None]] = []
     code, wrong = 1, "a mistake in armsight"
     try:

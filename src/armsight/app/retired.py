@@ -57,10 +57,7 @@ def _value(arguments: list[str], option: str) -> str:
 
 
 def _part(option: str, k: int, default: str, *, before: str = "", mark: str = ",") -> Rule:
-    """Return the rule of the first (0) or the second (1) one of two values behind one option, with a mark between.
-
-    ``before`` begins what such options make; another value of the option contradicts them.
-    """
+    """Return the rule of the first (0) or the second (1) one of two values behind one option, with a mark between."""
 
     def rule(arguments: list[str], value: str) -> tuple[str, str]:
         both = default

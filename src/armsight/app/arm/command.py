@@ -289,11 +289,7 @@ def report(run: Path, arm_name: str | None, compare: tuple[Path, ...], output: P
 
 
 def _keep(output: Path, yes: bool) -> None:
-    """Keep a file that is to be replaced as OUT.old, after asking.
-
-    Raises:
-        InputError: OUT.old exists, or cannot be written.
-    """
+    """Keep a file that is to be replaced as OUT.old, after asking."""
     old = output.with_name(f"{output.name}.old")
     if old.exists():
         raise InputError(f"{old}: exists; what was kept is never written over: move it away")

@@ -48,8 +48,8 @@ VERSION = 1  # version of report.json
 #: Fewest rests, and shots of one.
 MIN_RESTS, _SHOTS = 12, 2
 _SIGMAS = tuple(f"sigma_{name}" for name in ("x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad"))
-#: Delays of the joints that are tried, s; how much a joint must move in a motion to show its delay, rad; how much of the
-#: rest after it counts, s; and so many motions at most.
+#: Delays that are tried, s; the least motion of a joint that shows its delay, rad; how much of a rest counts, s;
+#: motions.
 _DELAYS_S, _MOVED_RAD, _AFTER_S, _MOTIONS = np.arange(0.0, 1.2, 0.005), np.radians(2.0), 0.5, 60
 _SAME_RAD = 1e-6  # poses that are at most this far apart by their commands, rad, are one pose
 #: Part of the error -> the kinds of parameters that make it, and its remedy.
@@ -107,11 +107,7 @@ class RestPoses(Record):
 
 
 def rests_of(folder: Path, arm: Arm) -> RestPoses:
-    """Read the rests of a run's motions in open loop.
-
-    Raises:
-        InputError: no run, another arm's, or too few rests in view.
-    """
+    """Read the rests of a run's motions in open loop."""
     segments = segments_of(folder, closed=False)
     track = joint_track(folder, arm.joints)
     seen, sigmas = read_track(folder / "vision.csv", _SIGMAS)
@@ -225,17 +221,7 @@ def _with_sigmas(values: dict[str, Any]) -> dict[str, Any]:
 
 
 def evaluate_arm(folder: Path, arm: Arm, *, progress: Callable[[str], None] = lambda line: None) -> ArmReport:
-    """Evaluate a run.
-
-    Args:
-        folder: of ``armsight run`` or ``demo``.
-        arm: the nominal arm of it.
-        progress: called with what is being done.
-
-    Raises:
-        InputError: no run, another arm's, or too few rests in view.
-        CalibrationError: poses too alike for an identification.
-    """
+    """Evaluate a run."""
     progress("reading the run")
     rests, summary = rests_of(folder, arm), _summary(folder)
     progress("identifying the arm")
@@ -324,8 +310,7 @@ def _split(arm: Arm, rests: RestPoses, found: Identified) -> tuple[Array, dict[s
 def _displacements(arm: Arm, rests: RestPoses, found: Identified) -> tuple[Array, Array, Array]:
     """Return the derivative of the tool's position (N, 3, P), the same by the error sources' means, and what is off (P,).
 
-    Base and tool are off the frames of the run. The derivative is that in the middle between the run's and what was found,
-    so that all of them together move the tool as far as both put it apart, to the second order.
+    Base and tool are off the frames of the run; the derivative is that in the middle, right to the second order.
     """
     model, x = found.model, found.solution.x - found.moved
     T_tool, T_base, T_body = arm.T_flange_tool, model.T_rig_base(x), model.T_6_body(x)
@@ -425,10 +410,7 @@ def _drift(rests: RestPoses) -> tuple[Array, tuple[float, float] | None]:
 
 
 def _latencies(folder: Path, arm: Arm) -> list[float | None]:
-    """Return the delay from command to reading of each joint in the motions, s: the shift that leaves the least.
-
-    Every motion counts with the beginning of its rest, and without its mean: a joint may rest off its command.
-    """
+    """Return the delay from command to reading of each joint in the motions, s: the shift that leaves the least."""
     track = joint_track(folder, arm.joints)
     moving = np.zeros(len(track.t_s), bool)
     for segment in segments_of(folder, closed=False):
@@ -461,16 +443,7 @@ def plan_report(
 
     Poses all over where the body is seen, each from two opposite sides of all joints, and five of them again and again.
 
-    Args:
-        arm: the nominal arm, as slow as its board.
-        around: (M, n) joint angles at which the body was seen, rad; the arm stands at the first to begin with.
-        visible: returns whether the body is seen at poses (N, 4, 4) of the tool.
-        poses: how many poses from both sides.
-        cycles: how often five of them come again.
-        seed: of the choice.
-
-    Raises:
-        InputError: too few poses are in view.
+    ``cycles``: how often five of them come again.
     """
     rng, found = np.random.default_rng([seed, 40]), list[tuple[Array, Array]]()
     low, high = arm.q_min + 2 * _ASIDE_RAD, arm.q_max - 2 * _ASIDE_RAD
@@ -512,11 +485,7 @@ def _motion(name: str, q: Array, rest_s: float) -> str:
 
 
 def nominal_arm(folder: Path, name: str | None) -> Arm:
-    """Return the nominal arm of a run: the one of this name, or the one that the run names.
-
-    Raises:
-        InputError: there is no such folder, or the run names no arm that is known.
-    """
+    """Return the nominal arm of a run: the one of this name, or the one that the run names."""
     if not folder.is_dir():
         raise InputError(
             f"{folder}: {'is no folder' if folder.exists() else 'no such folder'}: give one of armsight run or demo"
@@ -531,11 +500,7 @@ def nominal_arm(folder: Path, name: str | None) -> Arm:
 
 
 def seen_angles(folder: Path, arm: Arm) -> Array:
-    """Return the joint angles (M, n) at which a run saw the body, rad: where its motions start, then its hand-eye poses.
-
-    Raises:
-        InputError: no run with a hand-eye calibration, or another arm's.
-    """
+    """Return the joint angles (M, n) at which a run saw the body, rad: where its motions start, then its hand-eye poses."""
     path = folder / "handeye_poses.csv"
     table = Columns.of_csv(path)
     names = [f"q{i + 1}_rad" for i in range(arm.joints)]

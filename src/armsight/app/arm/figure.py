@@ -24,11 +24,7 @@ _ARM: dict[str, Any] = {"color": INK, "lw": 3.5, "solid_capstyle": "round", "sol
 
 
 def write_arm_figure(arm: Arm, path: Path) -> None:
-    """Plot an arm at home and write it as a PNG.
-
-    Raises:
-        InputError: matplotlib is missing, or the file cannot be written.
-    """
+    """Plot an arm at home and write it as a PNG."""
     with drawing():
         data = png(_figure(arm))
     with replacing(path, "wb") as file:

@@ -215,11 +215,7 @@ def assess(report: ArmReport) -> tuple[Grade, str]:
 
 
 def write_report(report: Report, found: ArmReport, folder: Path) -> None:
-    """Write JSON, then page, figures and PDF into a folder.
-
-    Raises:
-        InputError: matplotlib is missing, or the folder cannot be written to.
-    """
+    """Write JSON, then page, figures and PDF into a folder."""
     write_text(writable_folder(folder, "no report") / "report.json", report.json_text())
     with drawing():
         pdf = _pdf([_text_page(report), _figures_page(found)])

@@ -60,8 +60,7 @@ _DEAD_DUTY, _DEAD_A = 0.25, 0.02
 _RESTS = 0.25  # of what counts as a motion
 #: A swing: amplitudes, rad, and frequencies, Hz, that add up, and how far a joint may get away from where it began.
 _SWING_RAD, _SWING_HZ, _SWING_MOST_RAD = (0.12, 0.04), (0.5, 2.0), 0.26
-#: Duties on top of it, at all of DITHER_HZ together, their phases such that they hardly add up (Schroeder): they separate
-#: resistance from back-EMF where friction is all the load, and show a spring between motor and sensor.
+#: Duties on top of it, at all of DITHER_HZ together (Schroeder's phases): they separate resistance from back-EMF.
 _DITHER_DUTY = 0.15
 _FIRST_SWING_S, _SWING_S, _GROW_S = 3.0, 5.0, 0.5
 _VERIFY_RAD, _VERIFY_HZ, _VERIFY_S, _VERIFY_MOST_RAD = 0.035, 0.5, 4.0, 0.01
@@ -97,11 +96,7 @@ class _Quit(Exception):
 
 
 class TerminalOperator:
-    """A person at this terminal: lines come from stdin while the board's time goes on; its end is a q.
-
-    Args:
-        echo: prints a line.
-    """
+    """A person at this terminal: lines come from stdin while the board's time goes on; its end is a q."""
 
     def __init__(self, echo: Callable[[str], None]) -> None:
         self.say, self._ended = echo, False
@@ -128,17 +123,7 @@ class TerminalOperator:
 
 
 class Bringup:
-    """A bring-up of one board.
-
-    Args:
-        board: the board, its drives off.
-        person: who answers.
-        folder: where everything is written.
-        joints: which, from 0.
-        encoders: joints that are read by an encoder, from 0: its kind, and which input a quadrature one is at.
-        again: do also what an earlier run has found.
-        most_current_a: what a motor may draw.
-    """
+    """A bring-up of one board."""
 
     def __init__(
         self,
@@ -170,12 +155,7 @@ class Bringup:
         self._motion: list[SensorReadings] = []
 
     def run(self, steps: Sequence[str] = tuple(STEPS)) -> None:
-        """Do the steps, in their order; what was found is kept whatever happens.
-
-        Raises:
-            DeviceError: the board is gone; its motors are off.
-            InputError: a folder that cannot be written.
-        """
+        """Do the steps, in their order; what was found is kept whatever happens."""
         goes_on = f"what was found is kept in {self._folder}: the same command goes on there"
         try:
             self._board.watch_sensors(_EVERY_S)

@@ -43,11 +43,7 @@ def package_build() -> Built:
 
 
 def build_firmware(board: str, folder: Path, compiler: str | None = None) -> Built:
-    """Build a board's image and its .bin files into a folder, which is made where it is missing.
-
-    Raises:
-        InputError: no such board or compiler, or it does not compile.
-    """
+    """Build a board's image and its .bin files into a folder, which is made where it is missing."""
     chosen = build.open_compiler(compiler)
     if board not in build.boards():
         raise InputError(f"no board {board!r}; there are {', '.join(build.boards())}")
@@ -95,11 +91,7 @@ PROGRAMMERS: Mapping[str, Callable[[Built], list[list[str]]]] = {
 
 
 def flash(built: Built, programmer: str | None = None) -> str:
-    """Write a board's firmware to it and return which programmer did.
-
-    Raises:
-        DeviceError: there is no programmer, or it failed; the message says where the image lies.
-    """
+    """Write a board's firmware to it and return which programmer did; a DeviceError says where the image is."""
     if built.board not in FLASHED:
         raise InputError(f"{built.board} is no board to plug in; there is {', '.join(FLASHED)}")
     name = programmer or next((each for each in PROGRAMMERS if which(each)), None)

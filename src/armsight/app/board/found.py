@@ -44,8 +44,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _MARGIN_RAD = 0.05
-#: Of an elastic joint: its stiffness may be less than found by this factor (another pose, one direction); a sudden load
-#: twists it by this share of the motor's stall torque, an acceleration by so much, rad; half: slower, double: it rings.
+#: Of an elastic joint: factor of its stiffness, share of stall torque and acceleration that twist it, rad; half:
+#: slower, double: it rings.
 _SOFTER, _SUDDEN, _ACCELERATION_TWIST_RAD = 1.5, 0.2, 0.0025
 _MOST_INVERTED_RAD = 1.0
 _MOST_UNEVEN = 0.5  # share of a ratio, as config.c holds it
@@ -148,11 +148,7 @@ class JointFound:
         return SensorKind[self.sensor.upper()]
 
     def fit_encoder(self) -> float:
-        """Fit a line to the angles marked: counts of a revolution and zero; returns the greatest deviation, rad.
-
-        Raises:
-            InputError: an absolute encoder that does not go with the joint one to one.
-        """
+        """Fit a line to the angles marked: counts of a revolution and zero; returns the greatest deviation, rad."""
         marks = np.array(self.marks)
         slope, offset = np.polyfit(marks[:, 1], marks[:, 0], 1)
         per_rev = float(2 * np.pi * slope)
@@ -172,10 +168,7 @@ class JointFound:
         return np.asarray(2 * np.pi / (self.counts_per_rev or 1.0) * (counts - self.zero_counts), dtype=float)
 
     def pot_table(self) -> tuple[list[int], list[float], int]:
-        """Return counts and angles, rad, of the potentiometer's table, and its direction; ends are extrapolated.
-
-        Of an encoder the ends of its range, which is a straight line.
-        """
+        """Return counts and angles, rad, of the potentiometer's table, and its direction; ends are extrapolated."""
         if self.counts_per_rev is not None and self.range_counts is not None:
             sign = 1 if self.counts_per_rev > 0 else -1
             ends = self.encoder_angles(np.array(self.range_counts))

@@ -50,9 +50,6 @@ def further_of(identified: str, nominal: Arm) -> Array:
     """Return by how much each joint really is further than it reports (n,), rad: the offsets that were identified.
 
     Those of a corrected.toml stand beside the angles beta of parallel axes: as an arm without them, it would have others.
-
-    Raises:
-        InputError: a file is wrong, or the two are different arms.
     """
     if Path(identified).is_file() and "identified" in read_toml(Path(identified)):
         found = open_corrected(identified)
@@ -66,11 +63,7 @@ def further_of(identified: str, nominal: Arm) -> Array:
 
 
 def parsed_degrees(text: str) -> Array:
-    """Return angles, rad, of a text such as 0.5,-1.2,0,0,0 in degrees.
-
-    Raises:
-        InputError: it is no list of numbers.
-    """
+    """Return angles, rad, of a text such as 0.5,-1.2,0,0,0 in degrees."""
     try:
         return np.radians([float(each) for each in text.split(",")])
     except ValueError:
@@ -154,11 +147,7 @@ def offer_release(board: FeetechBoard, *, changes: bool, yes: bool) -> None:
 def servo_zeros(
     board: FeetechBoard, further_rad: Array | None, restore: Path | None, calibration: Path | None
 ) -> Zeros:
-    """Return the homing offsets of the servos of a bus, and of LeRobot's file where there is one; torques must be off.
-
-    Raises:
-        InputError: a correction that is none, no file that was kept, or one of another arm.
-    """
+    """Return the homing offsets of the servos of a bus, and of LeRobot's file where there is one; torques must be off."""
     none, bus = np.zeros(board.abilities.joints), board.bus
     changes = corrected_offsets(bus, board.calibration, none if further_rad is None else further_rad)
     said = doubts(changes, board.calibration) if restore is None else []
@@ -207,9 +196,6 @@ def ar4_changes(path: Path, further_rad: Array) -> tuple[str, list[ZeroChange]]:
     """Return the text of a ``joint_offsets`` file of ar4_ros_driver with other offsets, and the changes.
 
     The driver's joint is at ``reported + offset``, in degrees; its joint 1 has the opposite sense of armsight's ``ar4``.
-
-    Raises:
-        InputError: it is no such file, or another number of angles (6,), rad.
     """
     further_deg = np.degrees(_checked(further_rad, len(SENSE)) * SENSE)
     changes: list[ZeroChange] = []
@@ -231,9 +217,6 @@ def pot_changes(config: Configuration, further_rad: Array) -> list[ZeroChange]:
     """Shift the potentiometers' tables of a configuration by the angles (6,), rad, by which joints really are further.
 
     The soft limits go along: they stay where they are on the arm.
-
-    Returns:
-        The changes, by the first node of each.
     """
     further, changes = _checked(further_rad, len(config["joint"])), []
     for k, joint in enumerate(config["joint"]):

@@ -78,11 +78,7 @@ class BoardTestRig:
         driven: bool = True,
         name: str = "the emulated board",
     ) -> BoardTestRig:
-        """Connect to a board: ``name`` is what errors call it, home is where the joints are at first, if not given.
-
-        Raises:
-            DeviceError: the board does not answer, or is of another version.
-        """
+        """Connect to a board: ``name`` is what errors call it, home is where the joints are at first, if not given."""
         wire = SpoiledLink(link)
         here = cls(wire, Board.connect(wire, name=name), plant, problems, amplitude_rad, driven)
         here.home_rad = here.readings(0.02)[-1] if home_rad is None else home_rad
@@ -439,17 +435,7 @@ def speed(emulator: Emulator, ticks: int = _SPEED_TICKS) -> float:
 
 
 def selftest(board: str, *, drives: bool = False, progress: Callable[[str], None] = print) -> SelftestResult:
-    """Run the scenarios on a board.
-
-    Args:
-        board: ``emulated:unicorn``, ``emulated:qemu``, ``emulated:host`` or ``serial:PORT``.
-        drives: let a real board move its arm, by less than 3 degrees; without it its drives are never switched on.
-        progress: called with what is being done, a line at a time.
-
-    Raises:
-        DeviceError: the board is not there, or of another version.
-        InputError: there is no such kind of board.
-    """
+    """Run the scenarios on a board."""
     scenarios = {}
     if board.startswith(SERIAL):
         (port, baud, _), home_rad = serial_port(board, BAUD), None

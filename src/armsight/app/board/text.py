@@ -99,11 +99,7 @@ def gains_text(values: Array) -> str:
 
 
 def changed_gains(values: Array, changes: Sequence[str]) -> Array:
-    """Return gains (6, 8) with changes of the form ``JOINT:NAME=VALUE``; JOINT is 1 to 6 or ``all``.
-
-    Raises:
-        InputError: a change is not of this form.
-    """
+    """Return gains (6, 8) with changes of the form ``JOINT:NAME=VALUE``; JOINT is 1 to 6 or ``all``."""
     changed, names = values.copy(), list(GAIN_RANGES)
     rows = {**{str(j + 1): slice(j, j + 1) for j in range(JOINTS)}, "all": slice(None)}
     for change in changes:

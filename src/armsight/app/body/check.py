@@ -1,9 +1,6 @@
 """Assess a body before it is built: its markers, its predicted pose, and which discs may be taken for which.
 
 In: a body's layout, a stereo rig and distances. Out: an ``Assessment``; ``armsight body check`` prints it.
-
-From top to bottom: the records, and their text; :func:`assess`; findings about the markers themselves (overlaps,
-visibility, sizes) and about the predicted pose; ambiguities of discs, whether they are separated, and what would do it.
 """
 
 from __future__ import annotations
@@ -35,8 +32,7 @@ DISC_PX = (5.0, 150.0)
 SURROUND = 0.5
 #: A face whose cosine to the direction of sight is above this is seen by both cameras wherever it is in their images.
 _WELL_FACING = 0.7
-#: A wrong assignment is separated from the right one where it misses by this many standard deviations: the odds of a
-#: million that identification asks for take five, chance may favour the wrong one by three.
+#: A wrong assignment is separated where it misses by so many standard deviations: five for a million, three for chance.
 SEPARATED_SIGMAS = 8.0
 #: More discs than these are not searched for ambiguities, not with one of them hidden, and none is moved elsewhere.
 SEARCHED, SEARCHED_HIDDEN, SEARCHED_MOVES = 25, 10, 6
@@ -88,8 +84,7 @@ class Ambiguity(Record):
     """Discs that may be taken for others."""
 
     symmetry: Symmetry  #: which for which
-    #: (D,) by how many standard deviations it misses at each distance; infinite where the discs' faces separate it, NaN
-    #: where these discs are not in view.
+    #: (D,) by how many standard deviations it misses at each distance; infinite by the faces, NaN where not in view
     separation_sigmas: Array
     behind: bool  #: whether it shows the other side of a flat body, so that normals settle it
 
@@ -170,13 +165,7 @@ def axis_text(axis: Array, forward: Array, layout: Composite) -> str:
 
 
 def assess(layout: Composite, rig: StereoRig, distances_m: tuple[float, ...]) -> Assessment:
-    """Assess a body by its layout.
-
-    Args:
-        layout: the body.
-        rig: the cameras that are to see it.
-        distances_m: where it is to be used.
-    """
+    """Assess a body by its layout."""
     predictions = tuple(_predicted(layout, rig, distance) for distance in distances_m)
     findings = [*_neighbours(layout), *_in_view(layout, rig, predictions), *_sizes(layout, rig, predictions)]
     found: tuple[Ambiguity, ...] = ()

@@ -121,15 +121,8 @@ class Page(Record):
 def pages(path: str | Path, layout: Composite) -> tuple[tuple[Page, ...], list[str]]:
     """Sort a body's markers by the plane they lie in.
 
-    Args:
-        path: of the body file, for messages.
-        layout: the body.
-
     Returns:
         The pages, and what should be said about them.
-
-    Raises:
-        InputError: a disc has no normal and lies in no plane that others define.
     """
     notes, groups = list[str](), list[list[Mark]]()
     for one in [*_patterns(layout), *_discs(path, layout, notes)]:
@@ -267,16 +260,9 @@ def draw_body(
 ) -> Drawing:
     """Draw bodies' markers and boards to scale.
 
-    Args:
-        paths: TOML body files, and boards' specs such as ``chessboard:9x6:20mm``.
-        output: .pdf (a page for each plane), .svg or .png (a file for each, numbered from the second on).
-        paper: a key of PAPERS; rotated where that fits better.
-        dpi: pixels an inch of a .png.
-        split: draw a plane that does not fit the paper on several sheets that overlap.
-
-    Raises:
-        InputError: no body file and no board, an unknown suffix, a plane that does not fit the paper, no matplotlib,
-            or the file cannot be written.
+    ``paths``: TOML body files, and boards' specs such as ``chessboard:9x6:20mm``. ``paper``: a key of PAPERS; rotated
+    where that fits better. ``dpi``: pixels an inch of a .png. ``split``: draw a plane that does not fit the paper on
+    several sheets that overlap.
     """
     suffix = Path(output).suffix.lower()
     if suffix not in _SAVERS:

@@ -23,8 +23,7 @@ from armsight.vision.triangulate import optimal_points
 
 #: Shares of a predicted sigma, in the order of the first axis of the arrays.
 SHARES = ("pixel noise", "calibration", "both together")
-#: The slice extends beyond the nearest and the farthest target by the first share of its distance, and to both sides by
-#: the second share of the targets' extent, as far as both cameras see.
+#: The slice extends beyond the targets by the first share of their distance, sideways by the second of their extent.
 BEYOND, BESIDE = 0.15, 0.5
 _DEEP, _WIDE, _RIM = 80, 120, 33  # points of the slice, and along each side of the field of view
 _WIDEST_TANGENT = 3.0  # of half the field of view: the slice of a fisheye lens would be infinitely wide otherwise
@@ -106,9 +105,8 @@ def volume_slice(calibration: Calibration) -> Slice:
     return Slice(axis, sideways, depth, np.isfinite(along[0]), along, lateral)
 
 
-#: A metric is good up to the first limit, and fair up to the second. Epipolar error: sharp corners of a still target give
-#: 0.05 to 0.3 px; beyond 1 px something is wrong with the images, not with the noise. The limits grow in proportion where
-#: the image's longer side has more than LARGE_PX pixels, as such images are rarely sharp to the pixel.
+#: A metric is good up to the first limit, and fair up to the second, px; sharp corners give 0.05 to 0.3. In proportion
+#: to images larger than LARGE_PX.
 EPIPOLAR_PX, LARGE_PX = (0.3, 1.0), 1280
 #: Held-out over fitted epipolar RMS: the degree of overfitting.
 OVERFIT = (1.25, 2.0)

@@ -323,15 +323,7 @@ REPORT_FILES = (PAGE, *figure_files("report", FIGURES))
 def calibration_report(
     calibration: Calibration, output: Path, board_file: Path | None, report: Path | None, seconds: float
 ) -> Report:
-    """Return what a calibration says.
-
-    Args:
-        calibration: what is reported on.
-        output: the rig's file.
-        board_file: the board's; None where there is none.
-        report: the report's folder; None where none is asked for.
-        seconds: how long it took.
-    """
+    """Return what a calibration says."""
     c, words, page = calibration, _words(calibration), None if report is None else report / PAGE
     found = assess(c)
     left, right = ("{} x {}".format(*camera.image_size_px) for camera in c.rig.cameras)

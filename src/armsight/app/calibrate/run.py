@@ -80,11 +80,7 @@ class GivenDetections:
 
 
 def _open(spec: str, folder: Path) -> Source:
-    """Open a folder or a recording; what cameras see is stored in a new folder first, so that it is there afterwards.
-
-    Raises:
-        InputError: no such source, or nothing can be stored.
-    """
+    """Open a folder or a recording; what cameras see is stored in a new folder first, so that it is there afterwards."""
     if not spec.startswith((*LIVE, SIM)):
         return open_source(spec)
     stored = unused(folder)
@@ -122,11 +118,7 @@ class GivenImages:
     """Images of a board, to calibrate from; the board's shape as it is found goes into ``board_file``."""
 
     def __init__(self, options: CalibrateOptions) -> None:
-        """Open a source, or the images that two globs match, and find those of one camera alone.
-
-        Raises:
-            InputError: there is no such source, or nothing matches.
-        """
+        """Open a source, or the images that two globs match, and find those of one camera alone."""
         self.named: dict[str, str] = {}
         self._options, self._spec, spec = options, str(options.target), options.source
         alone = ["", ""] if options.alone is None else options.alone.split(",")
@@ -204,11 +196,7 @@ def _files_of(pattern: str) -> list[Path]:
 
 
 def _single(path: Path, target: CalibrationBoard, side: int, size: tuple[int, int]) -> Pair:
-    """Detect the target in an image of one camera alone; pixels of another resolution are converted to those of the pairs.
-
-    Raises:
-        InputError: not an image, or of another shape than those of the pairs.
-    """
+    """Detect the target in an image of one camera alone; its pixels are converted to those of the pairs."""
     image = grey(read_image(path))
     height, width = image.shape
     scale = size[0] / width

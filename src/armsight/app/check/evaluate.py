@@ -28,29 +28,16 @@ from armsight.loop.iso9283 import poses as iso9283
 from armsight.loop.iso9283.paths import PathMetrics, circle_metrics, path_metrics, plane_axes
 from armsight.loop.iso9283.statistic import Metric
 
-#: Where no pose was attained often enough for a repeatability: this many poses and more give errors over the workspace.
-#: A pose attained fewer times than the second is not searched for outliers.
+#: Poses that give errors over the workspace without a repeatability; rows of a pose that is searched for outliers.
 _WIDE, _OUTLIER_ROWS = 10, 10
-#: A row is named an outlier where its distance from the median position is more than this many times the median distance.
-#: Smaller names more rows. Normal scatter along a line, the longest-tailed case, does so in one pose of 200 with ten rows,
-#: in one of 30,000 with thirty.
+#: An outlier is further from the median position than so many median distances; smaller names more rows.
 _OUTLIER_RATIO = 12.0
-#: The median distance counts as this much at least, m: tables are rounded to about that, and rows that agree to the last
-#: digit would make every other row an outlier.
+#: The median distance counts as this much at least, m: rows that agree to the last digit make no other an outlier.
 _OUTLIER_LEAST_M = 1e-5
 
 
 def read_check(path: Path, *, closed: bool = False, columns: str | None = None) -> Attained:
-    """Read what was attained, from a run's folder (or the check.csv in it) or from a CSV.
-
-    Args:
-        path: folder or file.
-        closed: of a run, take the motions with the loop closed on vision.
-        columns: of a CSV, what its columns are called, as the option --columns has it.
-
-    Raises:
-        InputError: it cannot be read, or holds nothing that can be evaluated.
-    """
+    """Read what was attained, from a run's folder (or the check.csv in it) or from a CSV."""
     if path.is_dir() and not (path / "check.csv").exists():
         if columns is not None:
             raise InputError(f"{path}: --columns goes with a table of attained poses; this is a run's folder")
@@ -65,14 +52,7 @@ def read_check(path: Path, *, closed: bool = False, columns: str | None = None) 
 
 
 def evaluate(attained: Attained) -> CheckResult:
-    """Return all metrics that the rows allow, SI units.
-
-    Args:
-        attained: the rows, and what was left out of them: the error message says so where nothing is left.
-
-    Raises:
-        InputError: too few rows for any metric.
-    """
+    """Return all metrics that the rows allow, SI units."""
     by_test = {test: [row for row in attained.rows if row.test == test] for test in TESTS}
     rows, few = by_test["pose"], iso9283.MIN_POSES
     often, said = _often(rows)

@@ -31,8 +31,7 @@ from armsight.vision.rig import StereoRig
 
 #: The circle's radius, in sides of the cube (8.2: its diameter is 80 % of it).
 RADIUS = 0.4
-#: Where on the circle the motion starts, and by how much more than a whole revolution it is run, deg: neither the start nor
-#: the end is evaluated.
+#: Where on the circle the motion starts, and by how much more than a revolution it runs, deg: neither end is evaluated.
 START_DEG, OVER_DEG = 15.0, 60.0
 #: Points of the body stay this far from the images' edges, px; points of a path are looked at for limits and visibility.
 _MARGIN_PX, _LOOKED = 20.0, 200
@@ -68,16 +67,8 @@ def plan_test(
 ) -> PlannedTest:
     """Plan a test.
 
-    Args:
-        arm: the nominal arm.
-        name: which test.
-        cycles: how many times; None for the usual.
-        centre: (3,) of the cube, base, m; None to let it be found.
-        speed_m_s: along lines and circles.
-        visible_in: an earlier run, whose cameras must see all of it; None to let all be seen.
-
-    Raises:
-        InputError: no cube is within reach, or the run's files cannot be used.
+    ``centre``: (3,) of the cube, base, m; None to let it be found. ``visible_in``: an earlier run, whose cameras must
+    see all of it; None to let all be seen.
     """
     allowed = everywhere if visible_in is None else seen_by(visible_in)
     path = {"line": _line, "circle": _circle}.get(name)

@@ -219,14 +219,7 @@ REPORT_FILES = (PAGE, "check.json", "check.csv", *figure_files("check", FIGURES)
 def check_report(
     result: CheckResult, rows: Sequence[Row], source: Path, outcomes: Sequence[LimitResult | None] = ()
 ) -> Report:
-    """Return what a test shows.
-
-    Args:
-        result: its metrics.
-        rows: what they are made of.
-        source: where those came from.
-        outcomes: of the metrics against their limits, one each; none without limits.
-    """
+    """Return what a test shows."""
     listed = list(metric_lines(result))
     remarks = ["" if each is None else each.text() for each in outcomes or [None] * len(listed)]
     wide = max(len(row.what) for row in listed)
@@ -280,12 +273,7 @@ _SYSTEMATIC = 3.0  # accuracy over repeatability; half: identify is named though
 
 
 def assess(lines: Sequence[MetricLine], outcomes: Sequence[LimitResult]) -> tuple[Grade, str]:
-    """Return the grade of a test, and in one sentence what it found and what to do next.
-
-    Args:
-        lines: all metrics.
-        outcomes: of those with a limit.
-    """
+    """Return the grade of a test, and in one sentence what it found and what to do next."""
     first = list(filter(None, (_worst(lines, names) for names in (_ACCURACY, _REPEATABILITY))))
     said = " and ".join(f"{name} is {1e3 * value:.2f} mm" for name, value, _ in first) + " at worst"
     if (compared := _against_limits(outcomes)) is not None:

@@ -181,14 +181,7 @@ class LimitResult:
 
 
 def read_limits(texts: Iterable[str]) -> dict[str, float]:
-    """Read NAME=LENGTH texts, such as AP=0.5mm.
-
-    Returns:
-        Name of each metric -> its limit, m.
-
-    Raises:
-        InputError: an unknown name, a name given twice, or no positive length with a unit.
-    """
+    """Read NAME=LENGTH texts, such as AP=0.5mm."""
     limits: dict[str, float] = {}
     for given in texts:
         name, _, length = given.partition("=")
@@ -209,9 +202,6 @@ def check_limits(lines: Sequence[MetricLine], limits: Mapping[str, float]) -> li
 
     Returns:
         An outcome for each line; None where its metric has no limit.
-
-    Raises:
-        InputError: a limit is of a metric that this test does not have.
     """
     known = list(dict.fromkeys(line.name for line in lines))
     for name in limits:

@@ -71,12 +71,7 @@ class Attained(NamedTuple):
 def read_rows(file: Path, columns: str | None = None) -> list[Row]:
     """Read a CSV.
 
-    Args:
-        file: the table.
-        columns: what its columns are called there, as the option --columns has it; None where they have our names.
-
-    Raises:
-        InputError: unreadable, a column missing, or a value that is no number; the message names the line.
+    ``columns``: what its columns are called there, as the option --columns has it; None where they have our names.
     """
     table = Columns.of_csv(file, read_columns(columns, _COLUMNS))
     if not table.at:

@@ -120,15 +120,7 @@ class JointTrack(Record):
 
 
 def joint_track(folder: Path, joints: int | None = None) -> JointTrack:
-    """Read joints.csv of a run.
-
-    Args:
-        folder: of the run.
-        joints: how many the arm has, whose readings are needed; None: as many as there are.
-
-    Raises:
-        InputError: missing, not a run's, or of an arm of another number of joints.
-    """
+    """Read joints.csv of a run."""
     file = folder / "joints.csv"
     table = Columns.of_csv(file)
     table.at = {_VERSION_1.get(name, name): k for name, k in table.at.items()}
@@ -145,15 +137,7 @@ def joint_track(folder: Path, joints: int | None = None) -> JointTrack:
 
 
 def attained_in(folder: Path, *, closed: bool) -> Attained:
-    """Return what a run attained.
-
-    Args:
-        folder: of the run.
-        closed: take the motions with the loop closed on vision instead of those with potentiometers alone.
-
-    Raises:
-        InputError: no run, or no motion of it is repeated.
-    """
+    """Return what a run attained."""
     segments = segments_of(folder, closed)
     if not segments:
         which = "with the loop closed" if closed else "with the joint sensors alone"
@@ -166,11 +150,7 @@ def attained_in(folder: Path, *, closed: bool) -> Attained:
 
 
 def require_known(folder: Path) -> None:
-    """Reject a run's folder that a newer armsight wrote; one that says no version is read.
-
-    Raises:
-        InputError: it is newer.
-    """
+    """Reject a run's folder that a newer armsight wrote; one that says no version is read."""
     summary = folder / "summary.json"
     found = read_json(summary) if summary.is_file() else {}
     require_version(summary, "run", found.get("version") if isinstance(found, dict) else None, VERSION)
@@ -188,11 +168,7 @@ def _reference_file(folder: Path) -> Path:
 
 
 def segments_of(folder: Path, closed: bool) -> list[PathSegment]:
-    """Cut a run into its motions and rests, by time: those with the loop closed, or those without.
-
-    Raises:
-        InputError: no run's folder, or a file of it cannot be read.
-    """
+    """Cut a run into its motions and rests, by time: those with the loop closed, or those without."""
     require_known(folder)
     file, motions = _reference_file(folder), folder / "motion.toml"
     for name in (file.name, "vision.csv", motions.name):
@@ -413,12 +389,7 @@ def _circle(group: list[PathSegment], noise: Noise) -> list[Row]:
 
 
 def reversals_of(track: JointTrack, circle: list[PathSegment]) -> list[Reversal]:
-    """Return where joints were commanded to reverse on a circle; those that reverse at about the same time are one.
-
-    Args:
-        track: commands of the joints.
-        circle: the circle, one cycle of each direction.
-    """
+    """Return where joints were commanded to reverse on a circle; those that reverse at about the same time are one."""
     reversals = []
     for segment in circle:
         reference, (_, angle) = segment.reference, _round(segment)
@@ -442,7 +413,6 @@ def _reversal_times(t_s: Array, q: Array) -> list[float]:
     """Return the times at which a joint reverses that moves by enough before and after, s.
 
     Where it stands in between, as it does between equal readings, it reverses in the middle of that.
-    ``t_s``: (N,) times, s; ``q``: (N,) angles, rad.
     """
     if not len(q):
         return []

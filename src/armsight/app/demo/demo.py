@@ -76,12 +76,7 @@ class Demo:
 
 
 def run_demo(demo: Demo, *, progress: Progress = lambda line: None) -> Report:
-    """Run the experiment in a workcell, and write its folder; the report's JSON is what summary.json holds.
-
-    Raises:
-        ArmsightError: an unknown name, a folder that cannot be written to, or the run failed; what was measured is in the
-            folder.
-    """
+    """Run the experiment in a workcell, and write its folder; the report's JSON is what summary.json holds."""
     began = time.perf_counter()
     pairs, handeyes, study_shots = _AMOUNTS[demo.quick]
     unit = None if demo.references is None else the_one(read_references(demo.references), demo.references)

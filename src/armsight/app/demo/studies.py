@@ -120,10 +120,7 @@ def _rig(width: int = _SIZE[0], baseline_m: float = _BASELINE) -> StereoRig:
 
 
 def _rendered(rig: StereoRig, seed: int, shots: int, distance_m: float, noise: float) -> tuple[list[Shot], Array]:
-    """Render shots of the body near the middle of the view; return them, and the body's poses (N, 4, 4), left camera.
-
-    The same seed gives the same tilts and positions.
-    """
+    """Render shots of the body near the middle of the view; return them, and the body's poses (N, 4, 4), left camera."""
     rng = np.random.default_rng([seed, 7])
     across = rng.uniform(-1, 1, (shots, 3)) * (0.12, 0.06, 0.05)
     rotations = rng.uniform(-1, 1, (shots, 3)) * _TILT

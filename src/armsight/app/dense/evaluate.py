@@ -25,15 +25,12 @@ class SceneResult:
     """The errors and the speed of a method on a scene.
 
     Attributes:
-        scene: its name.
-        method: its name.
         weight: the scene's, in averages.
         all_pixels: errors over all pixels with a truth.
         nonocc: over those that both cameras see.
         measured: over those that the method measured, of the ones both cameras see.
         density_percent: share of the pixels with a truth that was measured, not filled.
         within_percent: share of the measured ones both cameras see whose error is below 1.96 sigma.
-        seconds: of the second of two runs, on the clock.
         rate: millions of pixels times disparities a second.
     """
 
@@ -64,13 +61,7 @@ class SceneResult:
 
 
 def evaluate_scene(scene: MiddleburyScene, name: str, out: Path | None) -> SceneResult:
-    """Match a scene by a method and evaluate the result; with a folder, write its error map there.
-
-    Args:
-        scene: with its true disparity.
-        name: of the method.
-        out: folder of the error maps; None for none.
-    """
+    """Match a scene by a method and evaluate the result; with a folder, write its error map there."""
     method, truth = open_method(name), scene.truth
     left, right = plain_grey(scene.left, "left"), plain_grey(scene.right, "right")
     method.match(left, right, scene.search)  # once before the clock runs: what is compiled, is compiled now

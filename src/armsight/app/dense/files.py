@@ -152,7 +152,6 @@ class DenseSummary:
         median_sigma_px: of the measured disparities; None where there are none.
         disparities_px: first and last disparity that was tried.
         problem: why nothing was measured; None where something was.
-        points: of the cloud; None where there is no depth.
         median_depth_mm: of the measured pixels; None where there is no depth.
         median_depth_sigma_mm: the same of the depth's standard deviation.
     """
@@ -178,11 +177,7 @@ class DenseSummary:
 
 
 def make_folder(path: Path) -> Path:
-    """Make the folder of a result.
-
-    Raises:
-        InputError: it cannot be made.
-    """
+    """Make the folder of a result."""
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -200,15 +195,7 @@ def write_png(path: Path, image: Image) -> None:
 
 
 def write_cloud(path: Path, form: Rectification, result: Disparity, depth: Depth, image: Image) -> int:
-    """Write the measured points as a binary PLY file, and return how many there are.
-
-    Args:
-        path: where to.
-        form: how the images were rectified.
-        result: the disparities.
-        depth: their depths.
-        image: (H, W) grey or (H, W, 3) BGR, the rectified left image.
-    """
+    """Write the measured points as a binary PLY file, and return how many there are."""
     chosen = result.measured & np.isfinite(depth.depth_m)
     count = int(np.count_nonzero(chosen))
     kinds = {"<f4": "float", "u1": "uchar"}
@@ -242,14 +229,7 @@ def _vertices(
 
 
 def write_result(folder: Path, result: Disparity, form: Rectification | None, image: Image) -> DenseSummary:
-    """Write all files of a result.
-
-    Args:
-        folder: where to; it exists.
-        result: the disparities.
-        form: how the images were rectified; None where they came so, and there is no depth.
-        image: the rectified left image, for colours.
-    """
+    """Write all files of a result."""
     write_pfm(folder / "disparity.pfm", result.disparity)
     steps = np.nan_to_num(result.disparity, posinf=0) * PNG_STEPS
     write_png(folder / "disparity.png", np.rint(np.clip(steps, 0, 65535)).astype(np.uint16))

@@ -30,11 +30,7 @@ _LEAST_DISPARITY = 2.0
 
 
 def read_pair(left: Path, right: Path) -> Shot:
-    """Read the two images of a pair; PFM and TIFF files may hold floats of 0 to 255.
-
-    Raises:
-        InputError: a file is missing, no image, or holds numbers that are no grey levels.
-    """
+    """Read the two images of a pair; PFM and TIFF files may hold floats of 0 to 255."""
     return Shot(f"{left}, {right}", _read_pixels(left), _read_pixels(right))
 
 
@@ -54,17 +50,7 @@ def _read_pixels(path: Path) -> Image:
 
 
 def search_of(form: Rectification | None, max_disparity: int | None, near: float | None, shot: Shot) -> Search:
-    """Return the disparities to try for a shot.
-
-    Args:
-        form: how its images are rectified; None where they are already.
-        max_disparity: disparities below it are tried; or None.
-        near: the nearest depth, m; or None.
-        shot: the shot.
-
-    Raises:
-        InputError: a search that leaves the image.
-    """
+    """Return the disparities to try for a shot: below a given one, or as a nearest depth, m, has them."""
     if shot.left is None:
         raise InputError(f"{shot.name}: {shot.problem or 'no image'}")
     width = int(shot.left.shape[1])
@@ -83,15 +69,7 @@ def search_of(form: Rectification | None, max_disparity: int | None, near: float
 
 
 def check_near(form: Rectification, near: float) -> None:
-    """Check that a nearest depth leaves something to search.
-
-    Args:
-        form: how the images are rectified.
-        near: the nearest depth, m.
-
-    Raises:
-        InputError: the disparity at that depth is so small that all of a scene is nearer.
-    """
+    """Check that a nearest depth leaves something to search."""
     disparity = float(form.disparity_of(near))
     if disparity < _LEAST_DISPARITY:
         raise InputError(
@@ -116,14 +94,7 @@ def _in_view(result: Disparity, form: Rectification) -> Disparity:
 
 @dataclass(frozen=True)
 class PairResult:
-    """The result of one pair.
-
-    Attributes:
-        shot: name of the pair.
-        summary: shares, medians and the search.
-        seconds: of matching, on the clock.
-        folder: of its files.
-    """
+    """The result of one pair."""
 
     shot: str
     summary: DenseSummary
@@ -138,11 +109,7 @@ class PairResult:
 def run_shot(
     shot: Shot, folder: Path, form: Rectification | None, method: Method, search: Search, note: Callable[[str], None]
 ) -> PairResult:
-    """Match a shot, make a folder and write its files there.
-
-    Raises:
-        InputError: the images are no rectified pair, or are not of the rig's size.
-    """
+    """Match a shot, make a folder and write its files there."""
     if shot.left is None or shot.right is None:
         raise InputError(f"{shot.name}: {shot.problem or 'no image'}")
     left, right = shot.left, shot.right

@@ -146,11 +146,7 @@ def _checked(options: Options) -> Options:
 
 
 def calibrate(options: Options, progress: Callable[[str], None]) -> HandEyeAnswer:
-    """Read both sides, look at whether they fit, calibrate.
-
-    Raises:
-        ArmsightError: the input is wrong, or the motions leave a direction open.
-    """
+    """Read both sides, look at whether they fit, calibrate."""
     import numpy as np
 
     from armsight.app.handeye.report import HandEyeAnswer

@@ -44,14 +44,8 @@ def see_with_camera(
 ) -> Seen:
     """Measure the target in the images of one camera.
 
-    Args:
-        pattern: glob of the images, sorted as a person would.
-        camera_file: its calibration (JSON, ROS's or OpenCV's YAML), or "fit": from these images.
-        target: a board's spec or a body's file.
-        progress: called with the name of each image.
-
-    Raises:
-        InputError: no such images, of another size than the camera's, or hardly one with the target.
+    ``camera_file``: its calibration (JSON, ROS's or OpenCV's YAML), or "fit": from these images. ``target``: a board's
+    spec or a body's file.
     """
     files = sorted(map(Path, glob.glob(str(Path(pattern).expanduser()))), key=natural_key)
     if not files:
@@ -82,11 +76,7 @@ def see_with_camera(
 
 
 def fit_camera(target: Target, detections: Sequence[Detections], size: tuple[int, int]) -> Camera:
-    """Calibrate a camera from the images of a flat target.
-
-    Raises:
-        InputError: too few images with the target.
-    """
+    """Calibrate a camera from the images of a flat target."""
     seen = [d for d in detections if len(d.ids) >= 6]
     if len(seen) < MIN_IMAGES:
         why = next((f"; {each.problem}" for each in detections if each.problem is not None), "")
@@ -146,17 +136,7 @@ def _motions(target: Target) -> tuple[Array, ...]:
 def see_with_rig(
     rig_file: Path, source: Source, target: str, progress: Callable[[str], None] = lambda line: None
 ) -> Seen:
-    """Measure the target in the pairs of a rig.
-
-    Args:
-        rig_file: the rig.
-        source: its pairs of images.
-        target: a board's spec or a body's file.
-        progress: called with the name of each shot.
-
-    Raises:
-        InputError: no such files, or hardly a pair with the target.
-    """
+    """Measure the target in the pairs of a rig."""
     rig, found = StereoRig.load_trusted(rig_file), open_target(target)
     Ts, covs, names, missed, squares, times, shown = [], [], [], [], [], [], []
     by: dict[int, Array] = {}

@@ -29,8 +29,7 @@ from armsight.robot.arm_file import MOVED, undetermined
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: Points plotted at most: more only hide each other; names of full size beside a matrix; steps of removal after one another
-#: that are one row of the selection's figure; letters of the names of sources that were selected together.
+#: Points plotted at most; names of full size beside a matrix; steps of removal in a row of a figure; letters of names.
 MOST_POINTS, MOST_NAMES, MOST_REMOVED, _MOST_LETTERS = 4000, 60, 8, 45
 #: Intervals of a joint's angle over which errors are averaged, at most; poses of one on average, at least.
 _BINS, _PER_BIN = 12, 6

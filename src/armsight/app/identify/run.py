@@ -21,8 +21,7 @@ from armsight.loop.identify.placement import with_placement
 from armsight.loop.identify.validate import MIN_POSES, Errors, Validation, errors, require_alike, validate
 from armsight.robot.kinematics.arm import Arm
 
-#: Parts of the poses that are left out, one after the other, where nothing is given to validate with; with more poses than
-#: MANY, one part is enough.
+#: Parts of the poses that are left out one after the other without others to validate with; with more than MANY, one.
 FOLDS, MANY = 5, 500
 #: Residuals of poses left out that chance makes so large with this probability only show that the sigmas are too small.
 TOO_SMALL = 1e-3
@@ -59,19 +58,9 @@ def run_identify(
 ) -> Identification:
     """Identify an arm and validate it on poses left out.
 
-    Args:
-        arm: the nominal arm.
-        measured: joint angles, and measured poses of the tool.
-        lines: (N,) lines of the file that they come from.
-        other: poses to validate with; None: parts of ``measured`` are left out, one after the other.
-        other_name: what an error calls these: their file.
-        priors: as in :func:`identify`.
-        notes: of the reading.
-        progress: called with each step as text.
-
-    Raises:
-        InputError: either file's poses cannot be of this arm, or are too few.
-        CalibrationError: the poses are too alike.
+    ``measured``: joint angles, and measured poses of the tool. ``lines``: (N,) lines of the file that they come from.
+    ``other``: poses to validate with; None: parts of ``measured`` are left out, one after the other. ``other_name``:
+    what an error calls these: their file. ``priors``: as in :func:`identify`.
     """
     if other is not None:
         try:

@@ -118,11 +118,6 @@ class ArmState:
 class ArmStep(PageStep[ArmState]):
     """The arm's board, in a thread of its own; runs go to ``run``, ``run-2``, ... in the folder of the session.
 
-    Args:
-        shared: what all steps share.
-        measuring: has rig and body; is given the poses that the loop measures.
-        model: the nominal arm.
-
     Attributes:
         held: why the arm was held, until it is moved again; empty where it was not.
     """
@@ -160,11 +155,7 @@ class ArmStep(PageStep[ArmState]):
 
     @staticmethod
     def check_board(name: str | None, source: str, arm: Arm) -> None:
-        """Reject the name of a board that cannot be right.
-
-        Raises:
-            InputError: the message names those there are, or what is wrong with the file of joint angles.
-        """
+        """Reject the name of a board that cannot be right; the InputError names those there are, or the file's fault."""
         if name is None or is_real(name):
             return
         if name.startswith(LOGGED) and name != LOGGED:
@@ -586,8 +577,8 @@ class ArmStep(PageStep[ArmState]):
     def between_shots(self) -> None:
         """Wait, while a loop watches shots, until a command has followed from one, 0.1 s at most.
 
-        The loop shares the interpreter with all other threads; what is computed in the time from there to the next shot
-        delays no image's command.
+        The loop shares the interpreter with all other threads: what is computed until the next shot delays no image's
+        command.
         """
         if self._loop is not None and time.monotonic() - self._answered_s < _WATCHES_S:
             self._answered.clear()

@@ -44,11 +44,11 @@ from armsight.vision.rig import StereoRig
 STILL_PX, STILL_S, STILL_DETECTIONS = 0.8, 0.3, 3
 #: An edge spread up to this is sharp enough for a shot, px.
 _SHARP_SHOT_PX = 1.7 * SHARP_PX
-#: A pose is taken if it lowers the predicted error by this share of what the best one would, and if the board's corners are
-#: on average by such a share of its size elsewhere than in every shot before.
+#: A pose is taken for this share of the best one's gain, the board's corners this share of its size from every shot
+#: before.
 _WORTH, _OTHER_SHARE = 0.5, 0.06
-#: A person who has stood still for the first time, s, has done what is possible: then this share is enough; after the
-#: second another pose is chosen.
+#: A person who stood still for the first time, s, has done what is possible: this share is enough; then another pose is
+#: due.
 _PATIENT_S, _PATIENT_WORTH, _OTHER_POSE_S = 3.0, 0.15, 6.0
 #: First fit, fewest shots of a calibration that is called good, and folds while shots are still taken.
 FIRST_FIT, LEAST_SHOTS, _FOLDS = 4, 12, 5

@@ -41,12 +41,7 @@ class LiveShot(Record):
 
 
 class CameraCapture:
-    """The cameras of a session.
-
-    Args:
-        opening: opens the source; called in the thread.
-        failed: called with why there are no images, once for each cause.
-    """
+    """The cameras of a session; ``failed`` is called with why there are no images, once for each cause."""
 
     def __init__(self, opening: Callable[[], Source], failed: Callable[[str], None] = lambda problem: None) -> None:
         self._opening, self._say = opening, failed

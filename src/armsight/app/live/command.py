@@ -119,11 +119,7 @@ def command(http: str, sync_ms: float, as_json: bool, **given: Any) -> None:  # 
 
 
 def _with_calibration(options: SessionOptions) -> SessionOptions:
-    """Return options whose servo bus, where --board names one, has the file of --calibration.
-
-    Raises:
-        InputError: it is no such file, or the board takes none.
-    """
+    """Return options whose servo bus, where --board names one, has the file of --calibration."""
     from armsight.robot.board_registry import FEETECH, calibration_of
     from armsight.robot.boards.feetech.calibration import read_calibration
 

@@ -64,10 +64,7 @@ class PoseShown:
 
 @dataclass(frozen=True)
 class RelativeShown:
-    """The pose of a second body in the first one's frame; sigmas along the first body's axes.
-
-    What the calibration does to both alike cancels.
-    """
+    """The pose of a second body in the first one's frame, sigmas along its axes; what moves both alike cancels."""
 
     target: str
     reason: str | None = None  # why it was missed

@@ -99,11 +99,7 @@ _KINDS = {"str": str, "float": float, "bool": bool}
 
 
 def command_of(text: str) -> PageCommand:
-    """Read a command such as ``{"command": "UseBoard", "spec": "chessboard:9x6:25mm"}``.
-
-    Raises:
-        InputError: anything else; the message says what.
-    """
+    """Read a command such as ``{"command": "UseBoard", "spec": "chessboard:9x6:25mm"}``."""
     if len(text) > LONGEST:
         raise InputError(f"a command has {LONGEST} characters at most, this one {len(text)}")
     try:

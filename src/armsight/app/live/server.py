@@ -94,14 +94,7 @@ class _Client:
 
 
 class LiveServer:
-    """Serves one session, in a thread of its own.
-
-    Args:
-        session: what is served.
-        host: address to bind to.
-        port: port; 0 takes a free one, which the attribute ``port`` has once :meth:`start` has returned.
-        token: what the address must carry; None where it is bound to this computer alone.
-    """
+    """Serves one session in a thread of its own; port 0 takes a free one; without a token only this computer may come."""
 
     def __init__(
         self, session: LiveSession, host: str = "127.0.0.1", port: int = 8000, token: str | None = None

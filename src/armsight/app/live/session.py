@@ -140,11 +140,7 @@ class LiveSession:
             self.body.use_body(target)
 
     def _kept(self) -> dict[str, dict[str, Any]]:
-        """Return the settings that were kept in the folder, by name.
-
-        Raises:
-            InputError: a newer armsight wrote them, or their file is none of ours.
-        """
+        """Return the settings that were kept in the folder, by name."""
         file = self.folder / SETTINGS
         found = read_json(file) if file.exists() else {"settings": {}}
         settings = found.get("settings") if isinstance(found, dict) else None

@@ -68,11 +68,7 @@ def chart_data(poses: Sequence[ShotPose]) -> ChartData:
 
 
 def chart(poses: Sequence[ShotPose]) -> bytes:
-    """Return the strip chart of at least one shot as PNG.
-
-    Raises:
-        InputError: matplotlib is missing.
-    """
+    """Return the strip chart of at least one shot as PNG."""
     with drawing():
         return png(_figure(chart_data(poses)))
 

@@ -34,11 +34,7 @@ class Requested:
 
 
 def requested_shutters(skew: str | None, readout: str | None) -> Requested | None:
-    """Read ``--skew`` and ``--readout``; None where neither is given. Where only one is, the skew is found, no readout.
-
-    Raises:
-        InputError: not a time.
-    """
+    """Read ``--skew`` and ``--readout``; None where neither is given. Where only one is, the skew is found, no readout."""
     if skew is None and readout is None:
         return None
     found = Requested(_seconds("--skew", skew or "find"), _seconds("--readout", readout or "0ms"))
@@ -67,17 +63,11 @@ def moved_results(
 ) -> tuple[list[tuple[PoseEstimate | Missed, bool]], Shutters]:
     """Measure again with every detection moved to its shot's time.
 
-    Args:
-        rig: the calibrated pair.
-        body: what moves.
-        first: time, s, and result of every shot as measured at first.
-        requested: the shutters, or which of them are to be found.
+    ``body``: what moves. ``first``: time, s, and result of every shot as measured at first. ``requested``: the
+    shutters, or which of them are to be found.
 
     Returns:
         Of every shot the result and whether it was moved; the shutters.
-
-    Raises:
-        InputError: a shot has no time, times do not rise, or what was to be found cannot be.
     """
     if any(t_s is None and isinstance(result, PoseEstimate) for t_s, result in first):
         raise InputError(

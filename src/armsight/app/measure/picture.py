@@ -65,8 +65,8 @@ class Marks(Record):
     """The N points of a body in a measured shot; camera 0 is left, 1 right. NaN where there is none."""
 
     names: tuple[str, ...]  #: names of the points
-    #: (N, 2, 2) projection of a point, or of the centre of a disc's ellipse, at the measured pose, raw px; NaN where it was
-    #: not detected and faces away from the camera.
+    #: (N, 2, 2) projection of a point, or of its ellipse's centre, at the measured pose, raw px; NaN where it faces
+    #: away
     at: Array
     shape: Array  #: (N, 2, 3) S11, S12, S22 of a disc's ellipse at the measured pose, px^2
     found: Array  #: (N, 2, 2) detected position, raw px; of a disc the centre of its ellipse
@@ -95,14 +95,7 @@ class Marks(Record):
 
 
 def marks_of(rig: StereoRig, body: Body, discs: DiscTarget | None, estimate: PoseEstimate) -> Marks:
-    """Return the marks of a measured shot.
-
-    Args:
-        rig: the calibrated pair.
-        body: all points; the discs' come last.
-        discs: the body's plain discs, None where it has none.
-        estimate: the measured pose.
-    """
+    """Return the marks of a measured shot."""
     T, count, seen = estimate.T_left_body, len(body.points), estimate.points.seen
     at = np.stack(rig.project(transform(T, body.points)), axis=1)
     shape, bias, away = np.full((count, 2, 3), np.nan), np.zeros((count, 2, 2)), np.zeros((count, 2), bool)
@@ -258,12 +251,7 @@ def draw_shot(
 ) -> Canvas:
     """Draw a shot.
 
-    Args:
-        header: lines above the images.
-        problem: why nothing was measured; None where something was.
-        images: left and right; None where there is none.
-        sizes: (width, height) of the images that are not there, px.
-        marks: the body's points; None where nothing was measured.
+    ``header``: lines above the images. ``sizes``: (width, height) of the images that are not there, px.
 
     Returns:
         (H, WIDTH, 3) BGR picture.

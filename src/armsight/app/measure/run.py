@@ -42,8 +42,7 @@ _SYNC_S = 1e-3
 _WIDE_PX, _AGAIN = 2.0, 60
 #: What to do about repeated shots of a recording.
 _RECORDED = "they are no new measurements: leave them out, and record at the rate that the cameras really give"
-#: Newest shots, of which the notes at the end are made (a board that was rotated, a row that was never seen); counts are of
-#: all. Half: less is noted, double: twice the memory, 7 kB a shot.
+#: Newest shots, of which the notes at the end are made; half: less is noted, double: twice the memory, 7 kB a shot.
 _KEPT = 1_000
 #: s, between two looks at the health of live cameras; half: nothing, double: a warning comes later.
 _HEALTH_S = 1.0
@@ -58,14 +57,7 @@ _TABLE = (
 
 
 def measure_shots(options: MeasureOptions) -> tuple[HealthFinding, ...]:
-    """Measure the pose of a target in every shot, and print a line for each.
-
-    Returns:
-        Why the poses must not be trusted; empty where nothing says so.
-
-    Raises:
-        ArmsightError: the input is wrong, or no shot could be measured.
-    """
+    """Measure the pose of a target in every shot, and print a line for each."""
     requested = requested_shutters(options.skew, options.readout)
     _check_detections(options, requested)
     fixed = open_fixed(options.fixed, options.target)
@@ -226,11 +218,7 @@ class MeasureRun:
             self.unwritten += 1
 
     def close(self) -> None:
-        """Close the file of the poses.
-
-        Raises:
-            InputError: it does not have all rows.
-        """
+        """Close the file of the poses."""
         if self.file is not None:
             self.file.close()
         if self.unwritten:

@@ -91,12 +91,7 @@ class ImageShots:
     """Shots of images.
 
     Attributes:
-        body, discs, printed: of the target.
-        total: how many there are; None where nobody knows.
-        results: what each shot shows, as they are read.
-        recorded: whether they were taken before.
         noise: what gathers the noise of discs.
-        moves: whether its shots are moved to one time.
         skewed: filled at the end: that the cameras do not expose at one time.
     """
 
@@ -205,11 +200,7 @@ class ImageShots:
         say(unseen_row(target, [np.array(ids, np.int64) for ids in of_shots]))
 
     def mistake(self) -> str:
-        """Return what was done to the images where a missed shot can be measured once it is undone; empty otherwise.
-
-        Rotated images of two parallel cameras nearly fit the rig exchanged, and the other way round: the better fit
-        decides.
-        """
+        """Return what was done to the images where a missed shot can be measured once it is undone; empty otherwise."""
         if (shot := self._missed) is None or shot.left is None or shot.right is None:
             return ""
         if one_image(shot.left, shot.right):
@@ -226,11 +217,7 @@ class ImageShots:
 def open_shots(
     options: MeasureOptions, rig: StereoRig, requested: Requested | Shutters | None, draws: bool
 ) -> DetectedShots | ImageShots:
-    """Open the shots that options name; ``draws``: whether their images are drawn afterwards.
-
-    Raises:
-        InputError: target or source cannot be opened, or do not have what the options ask for.
-    """
+    """Open the shots that options name; ``draws``: whether their images are drawn afterwards."""
     if options.detections is not None:
         return DetectedShots(options, rig)
     return ImageShots(options, rig, requested, draws)

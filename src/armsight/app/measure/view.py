@@ -29,17 +29,7 @@ _LONGEST_NAME = 50  # a file system's 255 bytes hold that many letters of any sc
 
 
 def view_folder(directory: str | Path) -> Path:
-    """Check that pictures can be written, before anything is measured.
-
-    Args:
-        directory: the folder of the pictures; made with its parents for the first of them.
-
-    Returns:
-        The folder.
-
-    Raises:
-        InputError: matplotlib is missing, or the folder cannot be made or written to.
-    """
+    """Check that pictures can be written, before anything is measured."""
     try:
         require_matplotlib()
     except InputError:
@@ -57,12 +47,7 @@ class PictureFolder:
     ) -> None:
         """Begin a run.
 
-        Args:
-            folder: as :func:`view_folder` returned it; pictures of an earlier run are replaced shot by shot.
-            rig: the calibrated pair.
-            body: what is measured; points of discs come last.
-            discs: its plain discs, None where it has none.
-            total: how many shots there will be, None where that is not known.
+        ``body``: what is measured; points of discs come last.
         """
         self.folder, self.rig, self.body, self.discs = folder, rig, body, discs
         self._every = None if total is None else -(-total // EACH_UP_TO)
@@ -71,16 +56,7 @@ class PictureFolder:
         self._earlier: set[str] | None = None
 
     def add(self, shot: Shot, result: PoseEstimate | Missed, record: ShotPose) -> None:
-        """Write the picture of a shot, or leave it out of a long run.
-
-        Args:
-            shot: the images; a detection's shot has none.
-            result: what was measured in it.
-            record: the record of the same.
-
-        Raises:
-            InputError: the picture cannot be written.
-        """
+        """Write the picture of a shot, or leave it out of a long run."""
         if self._earlier is None:
             self._earlier = {path.name for path in self.folder.glob(f"{PREFIX}*.png")}
         number = self._shots
@@ -98,11 +74,7 @@ class PictureFolder:
         self._put(self._file_name(shot.name), cv2.imencode(".png", canvas)[1].tobytes())
 
     def finish(self, records: Sequence[ShotPose]) -> None:
-        """Write the chart of the shots so far; without a shot there is none.
-
-        Raises:
-            InputError: it cannot be written.
-        """
+        """Write the chart of the shots so far; without a shot there is none."""
         if records:
             self._put(CHART, chart(records))
 

@@ -28,10 +28,6 @@ class Recording:
     """What was stored.
 
     Attributes:
-        directory: the folder.
-        shots: number of shots in the index.
-        problems: number of shots that have no images, but a reason.
-        stopped: what stopped the recording early; None when it ended as requested.
         interrupted: whether that was an interrupt from the keyboard.
     """
 
@@ -58,9 +54,6 @@ def record(
         shots: stop after this many, those with a problem included; None is no limit.
         seconds: stop at this age of the first shot, s, by the shots' own time, or by the clock for a source without one.
         on_shot: called after each shot is stored; its ``encoded`` are the files, unless the cameras delivered others.
-
-    Returns:
-        How much is stored. An interrupt, a full disk or a failing camera raises no exception: ``stopped`` has it.
 
     Raises:
         InputError: the folder is not empty, or holds a recording already.
@@ -101,11 +94,7 @@ def _age_s(shot: Shot, first: Shot, started_s: float) -> float:
 
 
 def unused_folder(directory: str | Path) -> Path:
-    """Return a folder, not made yet, to which a recording can be written.
-
-    Raises:
-        InputError: it is not new or empty, or cannot be made or written to.
-    """
+    """Return a folder, not made yet, to which a recording can be written."""
     folder = Path(directory).expanduser()
     try:
         names = os.listdir(folder)
@@ -121,15 +110,7 @@ def unused_folder(directory: str | Path) -> Path:
 
 
 class ShotFolder:
-    """A folder of shots being written; it is made with the first shot.
-
-    Args:
-        folder: a new or empty folder.
-
-    Attributes:
-        shots: number of shots in the index.
-        problems: number of those without images.
-    """
+    """A folder of shots being written; it is made with the first shot."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -138,14 +119,7 @@ class ShotFolder:
         self.problems = 0
 
     def add(self, shot: Shot) -> Shot:
-        """Store one shot, completely or not at all.
-
-        Returns:
-            The shot with its files' bytes, unless it has those of the cameras.
-
-        Raises:
-            InputError: it cannot be written, the disk is full.
-        """
+        """Store one shot, completely or not at all."""
         index = self._opened()
         files: list[Path] = []
         encoded: list[bytes] = []

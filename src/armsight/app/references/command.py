@@ -24,16 +24,14 @@ RATE = 0.05
 UNIT = 0.2
 #: A rest is so long at least, s.
 REST_S = 0.5
-#: Readings are averaged over so long for a calibration, s; half: it takes twice as long, double: fast sweeps are cut, by
-#: 0.5 mm of a lever of 60 mm at 4.6 rad/s.
+#: Readings are averaged over so long, s; half: twice the time, double: fast sweeps are cut (0.5 mm of a lever of 60
+#: mm).
 AVERAGED_S = 0.02
-#: A sweep that rotates the tool by less is said to be small, deg; half: levers that are off by 10 mm pass, double: good
-#: sweeps are blamed.
+#: A smaller sweep is said to be small, deg; half: levers off by 10 mm pass, double: good sweeps are blamed.
 SMALL_DEG = 60.0
 #: Stamps of a sensor may be so late against those of the poses, s; half: a phone's are not found, double: more is cut off.
 DELAY_S = 0.5
-#: Errors of times left out, over their sigma, up to which a calibration is good; half: chance is a fault, double: looseness
-#: is none.
+#: Errors left out over their sigma up to which it is good; half: chance is a fault, double: looseness is none.
 HONEST = 1.5
 #: Units of the Allan deviation's coefficients, in keys of JSON.
 ALLAN = {

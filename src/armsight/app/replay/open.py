@@ -48,11 +48,7 @@ class Request:
 
 
 def replay(request: Request, say: Callable[[str], None]) -> Replayed:
-    """Replay a recording; ``say`` is given notes, a line each.
-
-    Raises:
-        InputError: not a recording, or it does not hold what the request needs.
-    """
+    """Replay a recording; ``say`` is given notes, a line each."""
     name = str(request.recording)
     if ":" not in name and not Path(name.split(",")[0]).exists():
         raise InputError(f"{name}: no such file or folder; expected a run's folder, its run.mcap or a bag")

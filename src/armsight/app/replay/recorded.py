@@ -80,11 +80,7 @@ def run_file(path: str | Path) -> Path | None:
 
 
 def read_run(path: Path) -> RecordedRun | None:
-    """Read a run.mcap; None where an MCAP file was not written by armsight.
-
-    Raises:
-        InputError: it cannot be read, or a package is missing.
-    """
+    """Read a run.mcap; None where an MCAP file was not written by armsight."""
     bag = Bag(path)
     if METADATA not in bag.metadata:
         return None

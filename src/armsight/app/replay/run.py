@@ -91,9 +91,6 @@ def replay_run(
 
     ``changed``: whether arm or estimator are others, whose estimates are not compared with the recorded ones; ``beside``: a
     reference whose readings are fused; ``own``: whether these are the run's own, which it recorded.
-
-    Raises:
-        InputError: they are, and the rig was put right during the run.
     """
     state = _RunAgain(arm, estimator, changed, beside)
     poses, live, before = list[ShotPose](), list[JointsDatum](), list[RecordedDatum]()

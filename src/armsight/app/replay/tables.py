@@ -94,11 +94,7 @@ class TableDifference:
 
 
 def compare(first: Path, second: Path) -> list[TableDifference]:
-    """Compare the tables of the same name in two folders, row by row.
-
-    Raises:
-        InputError: they have no table in common.
-    """
+    """Compare the tables of the same name in two folders, row by row."""
     names = [name for name in (POSES, LIVE) if (first / name).is_file() and (second / name).is_file()]
     if not names:
         raise InputError(f"{second}: has no {POSES} or {LIVE} to compare with those of {first}")

@@ -32,18 +32,8 @@ _FILES = {"rig": "rig.json", "body": "body.toml", "detections": "detections.csv"
 def update(run: Path, output: Path, since_s: float | None, report: Path | None) -> tuple[dict[str, Any], list[str]]:
     """Estimate the relative pose of a run's cameras again; write the rig, and a page where one is asked for.
 
-    Args:
-        run: the run's folder.
-        output: the rig file to write.
-        since_s: only shots from this time on are used, board's clock, s; None: from when the run itself found that the
-            cameras had moved, or all.
-        report: folder of the page.
-
-    Returns:
-        What was found, as JSON has it, and as lines for people.
-
-    Raises:
-        InputError: a file of the run is missing or wrong, or its shots do not determine the pose.
+    ``since_s``: only shots from this time on are used, board's clock, s; None: from when the run itself found that the
+    cameras had moved, or all.
     """
     files = {name: run / file for name, file in _FILES.items()}
     for file in files.values():

@@ -34,15 +34,7 @@ class LoggedAngles(Record):
     unused: tuple[str, ...] = ()  #: the columns that were not read
 
     def at(self, names: Sequence[str], times_s: Sequence[float | None]) -> list[Array | None]:
-        """Return the joint angles (n,), rad, at each shot; None at a shot that no row belongs to.
-
-        Args:
-            names: of the shots, in their order.
-            times_s: of the shots; None where one has none.
-
-        Raises:
-            InputError: rows and shots do not belong together.
-        """
+        """Return the joint angles (n,), rad, at each shot; None at a shot that no row belongs to."""
         if self.shots is not None:
             rows = dict(zip(self.shots, self.q, strict=True))
             if not any(name in rows for name in names):
@@ -87,12 +79,7 @@ class LoggedAngles(Record):
 
 
 def read_angles(path: str | Path, arm: Arm) -> LoggedAngles:
-    """Read the logged joint angles of an arm.
-
-    Raises:
-        InputError: unreadable, a joint is missing or too many, a field is no number, degrees came as radians, or times
-            fall.
-    """
+    """Read the logged joint angles of an arm."""
     table = read_pose_table(Path(path), arm=arm, only_joints=True)
     assert table.q is not None
     t_s = table.t_s if table.names is None else None

@@ -45,11 +45,11 @@ BAUD = 921_600
 FIRST_S = 3.0
 _WAIT_S = 0.1  # for a line: so soon a thread sees that it is to end
 _LINES_BYTES = 65_536
-#: s: stamps so far off their arrival, for so long, are of a clock that jumped; half: a stall of the network passes for a
-#: jump, double: a smaller jump leaves readings late, and a jump costs more of them.
+#: s: stamps so far off their arrival, for so long, are of a clock that jumped; half: stalls pass for jumps, double:
+#: losses.
 JUMP_S = 1.0
-#: Stamps that fall by more, or are so much later than now, s, are of a clock that jumped; half: those that overtook others
-#: on their way are, double: jumps of 80 ms are not seen.
+#: Stamps that fall by more, or are later than now, s, are of a clock that jumped; half: overtaken ones are, double: 80
+#: ms not.
 STEP_S = 0.05
 
 
@@ -58,14 +58,6 @@ class LiveReadings:
 
     A line that is no reading, or whose stamp is off by ``JUMP_S``, is left out. Where all are off for ``JUMP_S``, the clock
     jumped, as with a sensor that began anew: it is converted anew.
-
-    Args:
-        entry: its table, which says where it is: ``udp:[HOST:]PORT`` or ``serial:PORT[,BAUD]``.
-        clock: that converts the board's times to the computer's.
-        now: the computer's clock, s.
-
-    Attributes:
-        losses: what was lost since the first reading, and how often.
 
     Raises:
         InputError: the table does not say, or what comes is not its readings.
@@ -208,11 +200,7 @@ def simulated_unit(workcell: Workcell, entry: Entry, seed: int) -> Fused:
 
 
 def sync_led_bit_s(board: MotionBoard, name: str) -> float:
-    """Return how long each bit of the code lasts that a board's sync LED blinks, s; ``name``: what the user calls it.
-
-    Raises:
-        InputError: it has no LED.
-    """
+    """Return how long each bit of the code lasts that a board's sync LED blinks, s; an InputError says that it has none."""
     if not isinstance(board, Board):
         raise InputError(f"--sync-led: {name} keeps its own controller, which drives no LED on its clock")
     config = board.configuration()

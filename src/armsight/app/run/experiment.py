@@ -37,8 +37,7 @@ from armsight.robot.trajectories import Tabled, Trajectory, point_to_point
 from armsight.vision.follow.follower import Follower
 from armsight.vision.rig import Shutters, StereoRig
 
-#: Largest difference of the joints from the start of the motion before anything moves, rad; and of an arm that a controller
-#: of its own brings there, as the droop and the zeros of an SO-101 make it rest 2 to 3 degrees off.
+#: Largest difference of the joints from the motion's start, rad; and where another controller, as an SO-101's, droops.
 _START_RAD, _START_ALONE_RAD = float(np.radians(2.0)), float(np.radians(5.0))
 #: How long to wait for a board that is stopping its arm, s.
 _SLOWS_S = 3.0
@@ -48,8 +47,7 @@ _CHECKED = 200  # joint angles along a motion that are checked
 _UNKNOWN_DELAY = Delay(0.02, 0.02)
 #: Number of shots that are kept as images: a recording to try the stages on.
 KEPT_SHOTS = 12
-#: Links of an arm at rest creep within their backlash, which the potentiometers do not measure: by half of a gap of 0.2
-#: degree within seconds.
+#: Links of an arm at rest creep within their backlash, unmeasured: by half of a gap of 0.2 degree within seconds.
 PRIOR = Prior(creep_rad=float(np.deg2rad(0.05)))
 #: Time from an image's arrival to its command, s: computing time, and the mean wait for the next iteration.
 _OWN_S = 0.002 + PERIOD_S / 2
@@ -61,11 +59,7 @@ Control = Callable[[Trajectory, float, float], Controller]
 
 
 def enable(board: MotionBoard) -> None:
-    """Switch the drives on; an arm that is held since an earlier host went silent is taken over in its position.
-
-    Raises:
-        DeviceError: another fault is latched, which a person must look into; or the board rejected the command.
-    """
+    """Switch the drives on; an arm held since an earlier host went silent is taken over; other faults are a DeviceError."""
     waited_s = 0.0
     while board.status.state is BoardState.STOPPING and waited_s < _SLOWS_S:
         board.receive(_STEP_S)
@@ -89,11 +83,7 @@ def start_rad(abilities: Abilities) -> float:
 
 
 def require_start(setup: Setup, plan: MotionPlan, targets: Array) -> None:
-    """Check that the arm is where the motion starts, and that the board allows all joint angles, ``targets`` (N, n) too.
-
-    Raises:
-        ArmsightError: a joint is elsewhere, or out of the board's limits; the message has its angle and the allowed one.
-    """
+    """Check that the arm is where the motion starts, and that the board allows all joint angles, ``targets`` (N, n) too."""
     states = setup.board.receive(0.2)
     if not len(states.q):
         raise DeviceError("the board reports no joint angles: is the baud rate of its serial port right?")
@@ -201,18 +191,12 @@ def run_experiment(
 ) -> RunResult:
     """Run the experiment.
 
-    Args:
-        setup: the devices.
-        rig: the calibrated cameras.
-        plan: the motions; the arm stands at their start.
-        targets: (N, n) joint angles of the hand-eye poses, rad.
-        progress: called with a line about what is being done.
-        cover: hides the body from one time to another, board's clock, s; None where that is not possible.
-        close_loop: whether the motions are made a second time with the loop closed.
-        begun: called with the loop before the drives are switched on.
-        publisher: is given everything that is measured; it returns at once.
-        handeye: a hand-eye calibration of this set-up; None to make one by visiting the targets.
-        follow_rig: whether a rig that moved is put right where the evidence suffices; it needs a covariance.
+    ``plan``: the motions; the arm stands at their start. ``targets``: (N, n) joint angles of the hand-eye poses, rad.
+    ``cover``: hides the body from one time to another, board's clock, s; None where that is not possible.
+    ``close_loop``: whether the motions are made a second time with the loop closed. ``begun``: called with the loop
+    before the drives are switched on. ``handeye``: a hand-eye calibration of this set-up; None to make one by visiting
+    the targets. ``follow_rig``: whether a rig that moved is put right where the evidence suffices; it needs a
+    covariance.
 
     Returns:
         All that was measured, also where something ended the run early.
@@ -237,10 +221,7 @@ def run_visits(
     begun: Callable[[Loop], None] = lambda loop: None,
     look: bool = True,
 ) -> RunResult:
-    """Move the arm from a plan's start by ``work`` alone, which is given the loop; else as :func:`run_experiment`.
-
-    ``look``: whether the body must be seen before.
-    """
+    """Move the arm from a plan's start by ``work`` alone, which is given the loop; else as :func:`run_experiment`."""
     return _run(RunResult(setup, rig, plan), progress, begun, Fanout(), work, look=look)
 
 
@@ -384,9 +365,6 @@ def drive(
 
     ``control`` makes the controller of each motion, closed on vision or not; ``started`` is called with kind and duration,
     s, of each as it begins.
-
-    Raises:
-        DeviceError: the board or a camera failed.
     """
     phase, open_s = "closed_loop" if closed else "open_loop", OPEN_REST_S + 2.0 * loop.setup.board.abilities.latency_s
     for motion in plan.motions:

@@ -191,13 +191,7 @@ def _shade(plot: Axes, run: Part, *, named: bool) -> None:
 def overview_figure(
     picture: Image | None, run: Part | None, passes: tuple[PassErrors, PassErrors] | None
 ) -> Figure | None:
-    """Plot the run in one figure: a camera image, errors over time, errors at rest; None without a truth.
-
-    Args:
-        picture: (H, W, 3) BGR, with the measured pose overlaid.
-        run: the motions with potentiometers alone.
-        passes: their errors, and those with the loop closed.
-    """
+    """Plot the run in one figure: a camera image, errors over time, errors at rest; None without a truth."""
     if picture is None or run is None or run.truth is None or passes is None:
         return None
     figure = new_figure(3.9)

@@ -117,13 +117,6 @@ def finish(
 ) -> Report:
     """Write everything a run measured, and raise what ended it early.
 
-    Args:
-        result: what was measured.
-        folder: of the run.
-        truth: times (N,), s, and poses (N, 4, 4) of the tool in the base frame; None for a real arm.
-        studies: made after it.
-        workcell: returns an image (H, W, 3) BGR of the workcell from aside; None for a real arm.
-
     Raises:
         ArmsightError: what ended the run early, or that not all files could be written; those that were are complete.
         KeyboardInterrupt: the keyboard interrupted the run, or the writing.
@@ -193,10 +186,7 @@ def _columns(name: str, part: Part) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def _as_much_as_fits() -> Iterator[Callable[..., None]]:
-    """Write file after file, also after one that could not be written; the first error is raised at the end.
-
-    The block is given a function that writes a file: it calls its first argument with the others, in a thread.
-    """
+    """Write file after file, also after one that could not be written; the first error is raised at the end."""
     asked: list[Future[object]] = []
     with ThreadPoolExecutor(1) as writer:
         yield lambda write, *arguments: asked.append(writer.submit(write, *arguments))
@@ -258,12 +248,7 @@ def write_handeye(folder: Path, run: HandEyeRun, corrected: Sequence[tuple[float
 
 
 def write_shots(folder: Path, shots: Sequence[Shot]) -> None:
-    """Write kept shots as a recording in a folder to be made; it is complete or not there at all.
-
-    Raises:
-        InputError: it cannot be written, the disk is full.
-        KeyboardInterrupt: the keyboard interrupted the writing.
-    """
+    """Write kept shots as a recording in a folder to be made; it is complete or not there at all."""
     left = iter(shots)
 
     class Kept(Source):
@@ -291,12 +276,7 @@ def write_shots(folder: Path, shots: Sequence[Shot]) -> None:
 
 @contextlib.contextmanager
 def open_folder(folder: Path) -> Iterator[None]:
-    """Keep a folder to one run, and check that it can be written there, before the long work begins.
-
-    Raises:
-        InputError: it cannot be made or written to, holds an earlier run of a real arm, or shots that are not of a run, or
-            another command uses it.
-    """
+    """Keep a folder to one run, and check that it can be written there, before the long work begins."""
     check_folder(folder, problem="no run can be written here")
     moved = (folder / "summary.json").exists() and (folder / "motion.toml").exists()
     if moved and not (folder / "truth.csv").exists():
@@ -308,11 +288,7 @@ def open_folder(folder: Path) -> Iterator[None]:
 
 
 def make_room(folder: Path) -> None:
-    """Make a run's folder; remove the files of an earlier run from it, so that they are not mixed with those of this run.
-
-    Raises:
-        InputError: the folder cannot be made or written to, or a file cannot be removed.
-    """
+    """Make a run's folder; remove the files of an earlier run from it, so that they are not mixed with this run's."""
     writable_folder(folder, "no run")
     names = [f"{name}.png" for name in (*_FIGURES, "pose", "workcell", "cell")]
     names += [f"{name}.{kind}" for name in _TABLES for kind in ("csv", "parquet")]

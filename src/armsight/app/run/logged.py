@@ -97,12 +97,7 @@ class LoggedRun(Record):
 def run_logged(
     source: Source, rig: StereoRig, target: Target, arm: Arm, angles: LoggedAngles, progress: Callable[[str], None]
 ) -> LoggedRun:
-    """Measure every shot and calibrate hand and eye with the logged angles.
-
-    Raises:
-        InputError: rows and shots do not belong together.
-        CalibrationError: too few shots show the body, or the motions leave a direction open.
-    """
+    """Measure every shot and calibrate hand and eye with the logged angles."""
     names, seen, q_all = _measured(source, rig, target, angles, progress)
     rows = list(zip(names, seen, q_all, strict=True))
     unpaired = tuple(name for name, _, q in rows if q is None)

@@ -153,8 +153,7 @@ def against_truth(before: Part, covered_s: tuple[float, float] | None) -> dict[s
 def partly_uncorrected(arm: Arm, q: Array) -> bool:
     """Return whether the servo corrects the tool only in part at joint angles (n,), rad, as the arm is nearly singular.
 
-    That is where the least singular value of the Jacobian (linear rows divided by the arm's size) is below
-    ``CORRECTED_ABOVE``: from there on it reduces its correction in that direction.
+    The least singular value of the Jacobian, linear rows over the arm's size, is below ``CORRECTED_ABOVE`` there.
     """
     J = arm.jacobian(q) / np.array([arm.size_m] * 3 + [1.0, 1.0, 1.0])[:, None]
     return bool(np.linalg.svd(J, compute_uv=False)[-1] < CORRECTED_ABOVE)

@@ -72,12 +72,7 @@ class MotionPlan(Record):
 
 
 def read_motions(arm: Arm, path: str | Path = DEFAULT_MOTION) -> MotionPlan:
-    """Read a motion file and plan all of it for a nominal arm.
-
-    Raises:
-        InputError: the file cannot be read, a key or a number is not allowed, or a motion cannot be made; the message
-            names the file and the motion.
-    """
+    """Read a motion file and plan all of it for a nominal arm."""
     document = read_toml(path)
     start = _numbers(f"{path}", document.pop("start_deg", np.degrees(arm.home).tolist()), "start_deg", arm.joints)
     entries = document.pop("motion", None)

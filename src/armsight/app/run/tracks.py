@@ -120,13 +120,7 @@ class Tracks:
 
 
 class Part:
-    """The tracks of a run between two times, each made when it is asked for.
-
-    Attributes:
-        begin_s: begin, which is not included, s.
-        end_s: end, s.
-        segments: motions and rests that lie within.
-    """
+    """The tracks of a run between two times, each made when it is asked for."""
 
     def __init__(self, tracks: Tracks, begin_s: float, end_s: float, most: int | None) -> None:
         self._of, self.begin_s, self.end_s, self._most = tracks, begin_s, end_s, most
@@ -282,11 +276,7 @@ def require_pyarrow() -> None:
 
 
 def write_columns(folder: Path, name: str, parts: Iterable[dict[str, NDArray[Any]]]) -> None:
-    """Write columns as NAME.csv, part by part.
-
-    Raises:
-        InputError: a file cannot be written, the disk is full; no file is left half-written.
-    """
+    """Write columns as NAME.csv, part by part."""
     import pyarrow as pa
     from pyarrow import csv
 
@@ -305,12 +295,7 @@ def write_track(folder: Path, name: str, track: ToolTrack) -> None:
 
 
 def read_track(file: Path, more: tuple[str, ...] = ()) -> tuple[ToolTrack, Array]:
-    """Read the CSV of a track, as :func:`write_track` writes it, without its covariances; and more columns (N, k).
-
-    Raises:
-        InputError: unreadable, a column missing, no rows, a cell that is no finite number, or times that fall; the message
-            names the line.
-    """
+    """Read the CSV of a track, as :func:`write_track` writes it, without its covariances; and more columns (N, k)."""
     table = Columns.of_csv(file)
     for name in ("phase", "motion"):
         table.require(name)

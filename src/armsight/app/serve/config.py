@@ -31,13 +31,7 @@ class ServeConfig:
     Attributes:
         arguments: of `armsight measure`, without --output.
         folder: where relative paths begin: that of the file.
-        http: where /healthz and /metrics are, ``host:port``; empty for nowhere.
-        log: file of the log, empty for stderr.
-        log_mb: size at which it is begun anew, MB.
         log_files: older logs that are kept.
-        stale_s: time without a shot after which the command is started again, s.
-        retry_s: longest time between two tries, s.
-        output: file of the poses, empty for none.
     """
 
     arguments: tuple[str, ...]
@@ -56,11 +50,7 @@ class ServeConfig:
 
 
 def read_config(path: Path) -> ServeConfig:
-    """Read a file of ``armsight serve``; its relative paths begin at its own folder.
-
-    Raises:
-        InputError: it cannot be read, has an unknown key, or an option that its command rejects.
-    """
+    """Read a file of ``armsight serve``; its relative paths begin at its own folder."""
     document = read_toml(path)
     if "run" in document:
         raise InputError(f"{path}: [run] is not served: an arm must not begin to move again by itself after a loss")

@@ -22,16 +22,7 @@ METRICS = {
 
 
 def state_pages(address: str, state: Callable[[], dict[str, Any]], values: Callable[[], dict[str, float]]) -> Pages:
-    """Serve both pages.
-
-    Args:
-        address: ``host:port``; port 0 is any that is free.
-        state: returns the state; ``healthy`` is in it.
-        values: returns the metrics by name.
-
-    Raises:
-        InputError: it is no address, or something listens there already.
-    """
+    """Serve both pages."""
 
     def healthz(_: dict[str, str]) -> Answer:
         now = state()

@@ -26,11 +26,9 @@ from armsight.app.serve.config import ServeConfig
 from armsight.app.serve.page import state_pages
 from armsight.errors import InputError
 
-#: s; a child without a shot for so long after its start is started again; half: a slow computer never begins, double: a
-#: driver that hangs at the start is noticed later.
+#: s; a child without a shot for so long is started again; half: slow computers never begin, double: hangs last longer.
 _BEGIN_S = 60.0
-#: s; a child has so long to write its files; half: a slow disk loses a file, double: a child that hangs
-#: delays the end.
+#: s; a child has so long to write its files; half: a slow disk loses a file, double: a hanging child delays the end.
 _END_S = 10.0
 #: s, between two looks at the child; half: nothing, double: a camera is back later.
 _LOOK_S = 0.2
@@ -47,12 +45,7 @@ _PROGRESS = re.compile(r"[a-z ]+: \d+( of \d+)?$")
 
 
 class Service:
-    """Keeps `armsight measure` going.
-
-    Args:
-        config: what, and how.
-        report: takes each event, as an object for JSON.
-    """
+    """Keeps `armsight measure` going."""
 
     def __init__(self, config: ServeConfig, report: Callable[[dict[str, Any]], None]) -> None:
         self._config, self._report = config, report
@@ -240,11 +233,7 @@ class Service:
 
 
 def _logger(config: ServeConfig) -> logging.Logger:
-    """Return the log: a file that is begun anew when it is full, or stderr.
-
-    Raises:
-        InputError: the file cannot be written.
-    """
+    """Return the log: a file that is begun anew when it is full, or stderr."""
     logger = logging.getLogger("armsight.serve")
     logging.raiseExceptions = False  # a full disk ends no service
     try:

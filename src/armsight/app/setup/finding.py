@@ -19,8 +19,8 @@ from armsight.vision.sources.v4l2 import VideoDevice, find_cameras
 
 #: s; between two looks at the ports; half: nothing, double: a plug that is moved fast is not seen.
 _LOOK_S = 0.2
-#: A covered lens: its view is this much darker than before, and no other by so much; half: a hand before it is not enough,
-#: double: a cloud is.
+#: A covered lens: its view is this much darker, and no other by so much; half: a hand is not enough, double: a cloud
+#: is.
 COVERED, NOT_COVERED = 0.45, 0.75
 _MOVED_RAD = np.radians(3.0)  # by a hand; half: backlash and noise pass for it, double: a stiff joint is pushed far
 _FRAMES = 8  # until a camera's exposure has settled; half: too dark an image, double: slower
@@ -74,11 +74,7 @@ def find_left_and_right(
     cameras: Callable[[], Sequence[VideoDevice]] = find_cameras,
     look: Callable[[str], float] = brightness,
 ) -> str:
-    """Return the source of two cameras; ``covered`` asks a person to cover a lens, and returns once it is.
-
-    Raises:
-        DeviceError: there are not two cameras, or one gives no image.
-    """
+    """Return the source of two cameras; ``covered`` asks a person to cover a lens, and returns once it is."""
     devices = [camera.device for camera in cameras() if camera.problem is None]
     if len(devices) < 2:
         raise DeviceError(f"{len(devices)} cameras are attached, two are needed; `armsight cameras` lists them")
@@ -131,11 +127,7 @@ def _opened(port: str, kinds: Iterable[str] = KINDS) -> tuple[str, MotionBoard] 
 
 
 def find_board(say: Callable[[str], None], ports: Callable[[], Sequence[str]] = list_ports) -> str:
-    """Return the board of the arm, such as ``feetech:/dev/ttyACM0``: the only one, or whose joint or cable a person moves.
-
-    Raises:
-        DeviceError: what was plugged in does not answer.
-    """
+    """Return the arm's board, such as ``feetech:/dev/ttyACM0``: the only one, or whose joint or cable a person moves."""
     say("Looking at the ports.")
     there = ports()
     found = dict(each for port in there if (each := _opened(port)) is not None)

@@ -13,8 +13,6 @@ class SetupStep:
     """A step of a page.
 
     Attributes:
-        say: what to do before.
-        command: what is run, without ``armsight``.
         given: a file of the user's own that it takes; where there is none, see ``without``.
         without: what the words of ``given`` and all that hangs on it become: old text -> new text in all commands; empty
             where the step is left out.

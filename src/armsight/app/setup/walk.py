@@ -29,7 +29,6 @@ class SetupWalk:
     """An arm's steps on this computer.
 
     Attributes:
-        arm: its name.
         words: what the page says -> what is so here.
         done: commands of the page -> done, or left out.
         simulated: how the emulated board is called; empty with an arm.
@@ -42,11 +41,7 @@ class SetupWalk:
 
     @classmethod
     def open(cls, arm: str, begin: int | None, simulated: bool = False) -> SetupWalk:
-        """Return the walk that the folder remembers, or a new one; ``begin``: from which step, from 1.
-
-        Raises:
-            InputError: the folder is another arm's, or of a simulated walk and this is none, or its file is none of ours.
-        """
+        """Return the walk that the folder remembers, or a new one; ``begin``: from which step, from 1."""
         kept, was = cls(arm), simulated
         if FILE.exists():
             try:
@@ -93,12 +88,7 @@ class SetupWalk:
         return not step.given or step.given in self.words or step.given not in self.typed(step)
 
     def go(self, say: Callable[[str], None], result: dict[str, Any]) -> int:
-        """Do what is left; return the exit code of the step that did not go well, or 0.
-
-        Args:
-            say: shows a line to the person.
-            result: gets the state of each step.
-        """
+        """Do what is left; return the exit code of the step that did not go well, or 0."""
         steps = ARMS[self.arm]
         for number, step in enumerate(steps, start=1):
             row: dict[str, Any] = {

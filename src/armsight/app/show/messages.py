@@ -67,16 +67,7 @@ def weak(text: str) -> str:
 
 
 def require(what: str, extra: str, *modules: str) -> None:
-    """Check that packages are installed, and name all that are missing at once.
-
-    Args:
-        what: what needs them, for the message.
-        extra: armsight's extra that has them all.
-        modules: their names.
-
-    Raises:
-        InputError: one of them is missing.
-    """
+    """Check that packages are installed, and name all that are missing at once."""
     missing = [name for name in modules if importlib.util.find_spec(name) is None]
     if missing:
         names, verb = " and ".join(missing), "is" if len(missing) == 1 else "are"

@@ -85,13 +85,7 @@ def _cell(content: str) -> str:
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "") -> str:
-    """Return an HTML table.
-
-    Args:
-        head: titles of the columns, HTML.
-        rows: cells, HTML; the first of a row is its title.
-        kind: CSS class: headline, prose or numbers.
-    """
+    """Return an HTML table."""
     top = "".join(f'<th scope="col">{cell}</th>' for cell in head)
     body = "".join(f'<tr><th scope="row">{first}</th>' + "".join(map(_cell, rest)) + "</tr>\n" for first, *rest in rows)
     return f'<table class="{kind}"><thead><tr>{top}</tr></thead>\n<tbody>\n{body}</tbody></table>\n'
@@ -109,13 +103,7 @@ def folded(summary: str, body: str) -> str:
 
 
 def picture(data: bytes, description: str, *, zoom: bool = False) -> str:
-    """Return an HTML image that holds its own data.
-
-    Args:
-        data: the file's bytes, PNG or SVG.
-        description: for who cannot see it; plain text.
-        zoom: whether the mouse wheel enlarges it, by :data:`ZOOM`.
-    """
+    """Return an HTML image that holds its own data."""
     kind = "png" if data.startswith(b"\x89PNG") else "svg+xml"
     source = f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}"
     image = f'<img src="{source}" alt="{text(description)}"{_ZOOMED if zoom else ""}>'
@@ -142,15 +130,7 @@ _ZOOMED = ' style="transform-origin:0 0" draggable="false"'
 
 
 def html_page(title: str, heading: str, sub: str, sections: Mapping[str, tuple[str, str]], script: str = "") -> str:
-    """Return a page.
-
-    Args:
-        title: of the browser's window.
-        heading: the first line.
-        sub: the line below it, plain text.
-        sections: anchor -> title and HTML of each section, in order.
-        script: JavaScript to run at its end.
-    """
+    """Return a page."""
     links = "".join(f'<a href="#{anchor}">{name}</a> ' for anchor, (name, _) in sections.items())
     main = "".join(
         f'<section id="{anchor}">\n<h2>{name}</h2>\n{body}</section>\n' for anchor, (name, body) in sections.items()
@@ -166,19 +146,7 @@ def html_page(title: str, heading: str, sub: str, sections: Mapping[str, tuple[s
 
 
 def writable_folder(directory: str | Path, contents: str, advice: str = "") -> Path:
-    """Make a folder and check that files can be written to it, before long work begins.
-
-    Args:
-        directory: the folder; made with its parents where it does not exist.
-        contents: what is to be written, as the message names it: "no report".
-        advice: what to do, at the end of the message.
-
-    Returns:
-        The folder, ``~`` expanded.
-
-    Raises:
-        InputError: it cannot be made or written to.
-    """
+    """Make a folder and check that files can be written to it, before long work begins."""
     folder = Path(directory).expanduser()
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -49,11 +49,7 @@ STYLE: dict[str, Any] = {
 
 @contextlib.contextmanager
 def drawing() -> Iterator[None]:
-    """Plot within this block in the style of the reports, whatever the user's matplotlib settings, without a display.
-
-    Raises:
-        InputError: matplotlib is not installed.
-    """
+    """Plot within this block in the style of the reports, whatever the user's matplotlib settings, without a display."""
     require_matplotlib()
     import matplotlib
 
@@ -209,15 +205,9 @@ def arrows(
 ) -> None:
     """Plot enlarged vectors in the units of the axes, and a scale arrow above their right end.
 
-    Args:
-        axes: the axes; the limits of x must be set.
-        at: (N, 2) feet of the vectors.
-        vectors: (N, 2) the vectors.
-        enlarged: factor of enlargement.
-        colours: one colour, or one for each vector.
-        width: of a shaft, as a share of the width of the axes.
-        unit: of the vectors, for the scale.
-        above: height of the scale above the axes, as a share of their height.
+    ``at``: (N, 2) feet of the vectors. ``vectors``: (N, 2) the vectors. ``enlarged``: factor of enlargement.
+    ``colours``: one colour, or one for each vector. ``width``: of a shaft, as a share of the width of the axes.
+    ``unit``: of the vectors, for the scale. ``above``: height of the scale above the axes, as a share of their height.
     """
     low, high = axes.get_xlim()
     scale = nice(0.09 * abs(high - low) / enlarged)

@@ -111,8 +111,6 @@ class Report:
     """A result.
 
     Attributes:
-        name: of the command.
-        heading: first line of the page.
         sub: the line below it.
         headline: the result in one line; empty: the first section says it.
         assessed: grade and sentence: what was done, how good it is, and what to do next; None: the first section says it.
@@ -227,13 +225,7 @@ class Report:
         return folder / page.PAGE
 
     def echo(self, *, as_json: bool, written: str | None = None, **more: object) -> int:
-        """Print the result, notes on stderr, and return the exit code.
-
-        Args:
-            as_json: whether programs read it.
-            written: the files that were written, for people.
-            more: further entries of the JSON object.
-        """
+        """Print the result, notes on stderr, and return the exit code."""
         for note in self.noted("note"):
             click.echo(f"note: {note}", err=True)
         click.echo(json.dumps({**self.json(), **json_of(more)}) if as_json else self.text(styled=True))

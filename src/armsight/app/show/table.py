@@ -10,13 +10,7 @@ from armsight.app.show import page
 
 @dataclass(frozen=True)
 class TextTable:
-    """A table.
-
-    Attributes:
-        title: one line.
-        columns: titles of the columns; the first is that of the rows' names, and may be empty.
-        rows: cells of plain text, as many as there are columns.
-    """
+    """A table."""
 
     title: str
     columns: tuple[str, ...]

@@ -52,14 +52,11 @@ _LOOK_S = 0.1
 _BATCH_BYTES = 3 * LONGEST // 4
 #: s that a reached hub may store nothing before that is said; half: said while a hub begins, double: said later.
 _UNHEARD_S = 10.0
-#: s that the last events may take when the command ends; half: a slow network gets them later, double: a dead hub
-#: delays the end.
+#: s that the last events may take at the end; half: a slow network gets them later, double: a dead hub delays the end.
 _END_S = 0.5
-#: s, from a request to hold to its arrival by the cell's clock; half: clocks must agree better, double: an old request
-#: counts longer.
+#: s, from a request to hold to its arrival; half: clocks must agree better, double: an old request counts longer.
 _FRESH_S = 60.0
-#: px, the longer side of an image for the hub, and its JPEG quality; half: a rough look, double: four times the bytes
-#: (15 kB).
+#: px, longer side of an image for the hub, and JPEG quality; half: a rough look, double: four times the bytes (15 kB).
 _SIDE_PX, _JPEG = 480, 70
 #: s between two shots that are kept for who asks, how many are (7 kB each), and for how many s after a question; half:
 #: gaps where a page asks once a second, double: an answer is longer than a hub reads.
@@ -68,8 +65,7 @@ _SHOT_S, _SHOTS, _ASKED_S = 0.2, 5, 10.0
 _FINDINGS = 5
 #: s that closing may take; half: a slow hub aborts the process, double: the same.
 _CLOSE_S = 5.0
-#: A limit for the error is so many times the held-out error of the rig; half: good cells are yellow, double: bad ones
-#: are not.
+#: Times the rig's held-out error that is a limit; half: good cells are yellow, double: bad ones are not.
 _LIMIT = 3.0
 
 
@@ -112,11 +108,6 @@ def _hottest(temperatures_c: Callable[[], Array | None] | None) -> float | None:
 def tilt_and_size(rig: StereoRig, points: Array, pose: PoseEstimate) -> tuple[float, float]:
     """Say what one pose shows of its rig: a rotation of one camera changes one of the two.
 
-    Args:
-        rig: the calibrated pair.
-        points: (M, 3) of the body, m.
-        pose: measured in a shot.
-
     Returns:
         The mean signed angle of the left rays out of the plane of baseline and right ray, rad, and the size of the
         triangulated body over its drawing, less one.
@@ -133,11 +124,6 @@ def tilt_and_size(rig: StereoRig, points: Array, pose: PoseEstimate) -> tuple[fl
 
 class CellSink(Sink):
     """Sends what a command measures to the hub of its site.
-
-    Args:
-        cell: who it is.
-        published: what all data have in common.
-        mode: the command.
 
     Raises:
         InputError: zenoh is not installed, or another process of this computer is this cell.
@@ -372,11 +358,7 @@ class CellSink(Sink):
         return b"held"
 
     def _checked_hold(self, payload: bytes) -> str:
-        """Return the text of a request to hold.
-
-        Raises:
-            InputError: the cell does not allow it, moves nothing, or it is not signed, or not new.
-        """
+        """Return the text of a request to hold; an InputError says that it is not allowed, not signed or not new."""
         if not self._cell.holds or self._cell.ca is None:
             raise InputError("this cell does not allow it: holds = true and ca in its cell.toml would")
         if self._published.hold is None:

@@ -59,11 +59,7 @@ class LookedAt:
 
 
 class Messages:
-    """Makes messages; it remembers what is sent once.
-
-    Args:
-        published: rig, body and arm.
-    """
+    """Makes messages; it remembers what is sent once."""
 
     def __init__(self, published: Published) -> None:
         from foxglove_schemas_protobuf import (

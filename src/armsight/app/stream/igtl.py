@@ -30,14 +30,7 @@ _FRACTION = 1 << 32  # times are seconds and fractions of 2^-32 s
 
 
 def message(kind: str, name: str, t_s: float, body: bytes) -> bytes:
-    """Return a message of OpenIGTLink: header and body.
-
-    Args:
-        kind: TRANSFORM, POSITION or STATUS.
-        name: of the device, at most 20 characters.
-        t_s: time, s.
-        body: its content.
-    """
+    """Return a message of OpenIGTLink, of TRANSFORM, POSITION or STATUS; the name has at most 20 characters."""
     seconds = int(max(t_s, 0.0))
     stamp = (seconds << 32) | int((max(t_s, 0.0) - seconds) * _FRACTION)
     return _HEADER.pack(_VERSION, kind.encode(), name.encode()[:20], stamp, len(body), crc64(body)) + body

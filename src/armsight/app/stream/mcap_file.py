@@ -49,15 +49,7 @@ _SCHEMA = json.dumps({"type": "object"}).encode()
 
 
 class McapSink(Sink):
-    """Writes run.mcap.
-
-    Args:
-        path: the file, which must not exist.
-        published: what all data have in common; its properties become metadata.
-
-    Raises:
-        InputError: the file cannot be made, or a package is missing.
-    """
+    """Writes run.mcap, which must not exist; the properties of what is published become metadata."""
 
     def __init__(self, path: Path, published: Published) -> None:
         require_foxglove("run.mcap", "record")
@@ -134,15 +126,7 @@ class McapSink(Sink):
 
 
 class McapBeside(Sink):
-    """Writes run.mcap as :class:`McapSink` does, in a process of its own: its Python takes nothing of this one's time.
-
-    Args:
-        path: the file, which must not exist.
-        published: what all data have in common.
-
-    Raises:
-        InputError: a package is missing. What is wrong with the file ends the writing, and is its ``problem``.
-    """
+    """Writes run.mcap as :class:`McapSink` does, in its own process; what is wrong with the file is its ``problem``."""
 
     def __init__(self, path: Path, published: Published) -> None:
         require_foxglove("run.mcap", "record")
@@ -205,10 +189,7 @@ class LazyMcap:
     """run.mcap in a folder, begun with the first datum; one of an earlier run is replaced.
 
     Args:
-        folder: of the run.
-        published: what all data have in common.
         say: is given a line where the packages are missing, and then nothing is written; and what ended the writing early.
-        name: of the file.
         process: whether it is written in a process of its own, which takes a second to begin: for long runs.
     """
 

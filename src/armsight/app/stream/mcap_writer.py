@@ -44,12 +44,7 @@ class _Chunk:
 
 
 class McapWriter:
-    """Writes one file.
-
-    Args:
-        file: a new binary file; the caller closes it.
-        library: name of the program that writes.
-    """
+    """Writes one file."""
 
     def __init__(self, file: IO[bytes], library: str) -> None:
         from mcap import records
@@ -72,14 +67,7 @@ class McapWriter:
         return len(self._schemas)
 
     def register_channel(self, topic: str, encoding: str, schema: int, *, images: bool = False) -> int:
-        """Add a channel; return its number.
-
-        Args:
-            topic: its name.
-            encoding: of its messages.
-            schema: number of its schema.
-            images: whether its messages are compressed already.
-        """
+        """Add a channel; return its number; ``images``: its messages are compressed already."""
         number = len(self._channels) + 1
         channel = self._records.Channel(
             id=number, topic=topic, message_encoding=encoding, schema_id=schema, metadata={}

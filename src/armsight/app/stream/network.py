@@ -37,11 +37,7 @@ def json_line(datum: Datum, published: Published) -> bytes:
 
 
 def host_and_port(spec: str, what: str, *, host: str) -> tuple[str, int]:
-    """Read ``[HOST:]PORT``; port 0 is any that is free.
-
-    Raises:
-        InputError: not of that form.
-    """
+    """Read ``[HOST:]PORT``; port 0 is any that is free."""
     match = re.fullmatch(r"(?:(.+):)?(\d{1,5})", spec)
     if match is None or int(match[2]) > 65535:
         raise InputError(f"--stream {what}:{spec}: expected {what}:[HOST:]PORT, such as {what}:8766")
@@ -49,11 +45,7 @@ def host_and_port(spec: str, what: str, *, host: str) -> tuple[str, int]:
 
 
 def listening(host: str, port: int, what: str) -> socket.socket:
-    """Return a socket that listens.
-
-    Raises:
-        InputError: the port is in use, or not allowed.
-    """
+    """Return a socket that listens."""
     try:
         return socket.create_server((host, port))
     except OSError as error:
@@ -83,12 +75,7 @@ class _Connected:
 
 
 class TcpSink(Sink):
-    """Sends bytes to every reader that has connected.
-
-    Args:
-        published: what all data have in common.
-        listener: listens; the sink closes it.
-    """
+    """Sends bytes to every reader that has connected."""
 
     def __init__(self, published: Published, listener: socket.socket) -> None:
         super().__init__()
@@ -143,12 +130,7 @@ class TcpSink(Sink):
 
 
 class UdpSink(Sink):
-    """Sends one datagram a datum; one that is too large goes without its points.
-
-    Args:
-        published: what all data have in common.
-        address: host and port to send to.
-    """
+    """Sends one datagram a datum; one that is too large goes without its points."""
 
     def __init__(self, published: Published, address: tuple[str, int]) -> None:
         super().__init__()

@@ -17,13 +17,11 @@ from typing import Any
 
 from armsight.errors import InputError
 
-#: events a second that are kept, and as many at once after a pause; half: a burst of findings is thinned, double:
-#: twice the disk.
+#: events a second that are kept, and as many at once after a pause; half: bursts are thinned, double: twice the disk.
 _RATE, _BURST = 10.0, 100.0
 #: bytes that the number of an event takes in a message, its key included; half, double: nothing.
 _NUMBER_BYTES = 20
-#: events that wait at most; half: two days without a hub at an event a second become one, double: twice the disk (0.2
-#: GB).
+#: events that wait at most; half: days without a hub become one, double: twice the disk (0.2 GB).
 _MOST = 200_000
 
 
@@ -34,10 +32,6 @@ def state_folder() -> Path:
 
 class Outbox:
     """The events of one cell; one thread at a time may use it.
-
-    Args:
-        folder: of the cell; made where it is not there.
-        cell: its name, for messages.
 
     Attributes:
         name: which numbering this is: a new disk begins at 1 again, under another name.

@@ -24,15 +24,11 @@ class Sink:
     """A publisher with a thread. The oldest datum is dropped where more than ``limit`` wait: the latest win, counted.
 
     Args:
-        limit: how many data may wait.
         wakes: so many that wait wake the thread; fewer wait for at most ``TICK_S``. A thread that is woken for every datum
             takes the interpreter from the loop as often.
         close_s: how long :meth:`close` waits for the thread, s.
 
     Attributes:
-        taken: how many data were taken.
-        dropped: how many of them were dropped.
-        cpu_s: computing time of the thread, s.
         problem: what ended the publishing early; None where nothing did.
     """
 

@@ -26,12 +26,7 @@ STREAMS: dict[str, Callable[[str, Published], Sink]] = {
 
 
 class Streams:
-    """Publishes to several streams; with none it does nothing.
-
-    Args:
-        sinks: the streams by the user's text.
-        say: is given a line at the end for what was dropped, and for what ended a stream early.
-    """
+    """Publishes to several streams; with none it does nothing."""
 
     def __init__(self, sinks: dict[str, Sink], say: Callable[[str], None]) -> None:
         self._sinks, self._say = sinks, say

@@ -18,16 +18,7 @@ from armsight.loop.running.data import Datum, EventDatum, NoteDatum
 
 
 class FoxgloveSink(Sink):
-    """Publishes to everybody who is connected.
-
-    Args:
-        published: what all data have in common.
-        host: name or address to listen at.
-        port: to listen at; 0 is any that is free.
-
-    Raises:
-        InputError: the port is in use, or a package is missing.
-    """
+    """Publishes to everybody who is connected."""
 
     def __init__(self, published: Published, host: str, port: int) -> None:
         try:

@@ -51,11 +51,6 @@ class _RosPublisher:
 class Ros2Sink(Sink):
     """Publishes to a ROS 2 system.
 
-    Args:
-        published: what all data have in common.
-        host: of the router.
-        port: of the router.
-
     Raises:
         InputError: no router answers, the domain is no number, or a package is missing.
     """
