@@ -104,11 +104,7 @@ def read_bytes(path: str | Path, most_mb: float = DOCUMENT_MB) -> bytes:
 
 
 def read_text(path: str | Path, most_mb: float = DOCUMENT_MB) -> str:
-    """Read a text file: UTF-8, UTF-16 with its byte-order mark, or XML in the encoding that it declares.
-
-    Raises:
-        InputError: as :func:`opened`, or not text.
-    """
+    """Read a text file: UTF-8, UTF-16 with its byte-order mark, or XML in the encoding that it declares."""
     data = read_bytes(path, most_mb)
     try:
         return io.TextIOWrapper(io.BytesIO(data), _encoding(path, data)).read()
@@ -124,12 +120,7 @@ def _no_text(path: str | Path, error: UnicodeDecodeError) -> str:
 def read_json(path: str | Path, what: str = "") -> Any:  # noqa: ANN401 - whatever JSON holds
     """Read a JSON file.
 
-    Args:
-        path: the file.
-        what: it is expected to be, for the message: "a rig file".
-
-    Raises:
-        InputError: as :func:`read_text`, or not JSON; the message names the line.
+    ``what``: it is expected to be, for the message: "a rig file".
     """
     return parsed_json(read_text(path), path, what)
 
@@ -137,14 +128,7 @@ def read_json(path: str | Path, what: str = "") -> Any:  # noqa: ANN401 - whatev
 def require_version(path: str | Path, what: str, version: object, newest: int) -> None:
     """Reject what a newer armsight wrote.
 
-    Args:
-        path: the file.
-        what: it is, for the message.
-        version: as the file says; what is no number passes.
-        newest: version that this armsight knows.
-
-    Raises:
-        InputError: it is newer.
+    ``what``: it is, for the message. ``version``: as the file says; what is no number passes.
     """
     if isinstance(version, int | float) and version > newest:
         raise InputError(f"{path}: {what} version {version}, this armsight reads up to {newest}: update armsight")
@@ -171,11 +155,7 @@ def _integer(digits: str) -> int | float:
 
 
 def read_toml(path: str | Path) -> dict[str, Any]:
-    """Read a TOML file.
-
-    Raises:
-        InputError: as :func:`read_text`, or not TOML; the message names the line.
-    """
+    """Read a TOML file."""
     import tomllib
 
     text = read_text(path)
@@ -212,12 +192,6 @@ def read_table(path: str | Path) -> list[list[str]]:
 
     Cells may also be separated by semicolons or tabs, as spreadsheets write them where the comma is the decimal mark;
     numbers with a decimal comma are then returned with a point.
-
-    Args:
-        path: the file.
-
-    Raises:
-        InputError: missing, unreadable, not text or not a table, or decimal commas and points in one table.
     """
     lines = _lines(path)
     first = next(lines, "").removeprefix("\ufeff")
@@ -403,17 +377,7 @@ def write_text(path: str | Path, text: str) -> None:
 
 
 class RowFile:
-    """A CSV being written: a row is in the file, whole, once it is added, and nothing of one that failed.
-
-    Args:
-        path: the file to be; its folder must exist.
-        columns: its header.
-        replaces: whether a file that stands there is replaced; if not, that is an error.
-
-    Attributes:
-        path: the file.
-        rows: how many rows it has, without the header.
-    """
+    """A CSV being written: a row is in the file, whole, once it is added, and nothing of one that failed."""
 
     def __init__(self, path: Path, columns: Sequence[str], *, replaces: bool = False) -> None:
         self.path, self.rows, self._whole = path, 0, 0
@@ -453,20 +417,12 @@ class RowFile:
         self._whole += len(data)
 
     def add(self, cells: Sequence[object]) -> None:
-        """Append a row.
-
-        Raises:
-            InputError: the disk is full; the rows before stay.
-        """
+        """Append a row."""
         self._append(cells)
         self.rows += 1
 
     def close(self) -> None:
-        """Close the file; it outlives a crash of the computer from then on.
-
-        Raises:
-            InputError: the disk does not take it.
-        """
+        """Close the file; it outlives a crash of the computer from then on."""
         with self._named():
             try:
                 os.fsync(self._file)
@@ -475,11 +431,7 @@ class RowFile:
 
 
 def try_writing(folder: Path) -> None:
-    """Write a file in a folder and remove it.
-
-    Raises:
-        OSError: it cannot be written.
-    """
+    """Write a file in a folder and remove it."""
     import tempfile  # not above: who prints a pose writes none
 
     with tempfile.TemporaryFile(dir=folder):
@@ -524,30 +476,13 @@ def unused(path: Path) -> Path:
 
 
 def check_suffix(path: str | Path, suffix: str, what: str) -> None:
-    """Check that a file to be is named as what it will hold.
-
-    Args:
-        path: the file to be.
-        suffix: that it must have, in small or capital letters.
-        what: is written, as the message names it: "a figure of the arm".
-
-    Raises:
-        InputError: another suffix, or none.
-    """
+    """Check that a file to be is named as what it will hold."""
     if Path(path).suffix.lower() != suffix:
         raise InputError(f"{path}: {what} is written as {suffix}; give it a name that ends so")
 
 
 def check_outputs(outputs: Iterable[str | Path | None], inputs: Iterable[str | Path | None] = ()) -> None:
-    """Find out before long work whether all files of a command can be written, each apart from the others and the inputs.
-
-    Args:
-        outputs: the files to be; None is no file.
-        inputs: the files that are read; None is no file.
-
-    Raises:
-        InputError: as :func:`check_writable`, for the first that cannot be written.
-    """
+    """Find out before long work whether all files of a command can be written, each apart from others and inputs."""
     taken = list(inputs)
     for path in outputs:
         if path is not None:
@@ -557,11 +492,7 @@ def check_outputs(outputs: Iterable[str | Path | None], inputs: Iterable[str | P
 
 @contextlib.contextmanager
 def alone_in(folder: Path, command: str) -> Iterator[None]:
-    """Keep a folder, which is made, to one process of any command; one that was made and stays empty is removed again.
-
-    Raises:
-        InputError: another one uses it.
-    """
+    """Keep a folder, which is made, to one process of any command; one that was made and stays empty is removed again."""
     import fcntl  # POSIX
 
     path, used = folder / "in_use.lock", "uses it: give this one another folder, -o FOLDER"
@@ -605,18 +536,7 @@ def check_folder(
     problem: str = "nothing can be written here",
     advice: str = "",
 ) -> Path:
-    """Return a folder, ``~`` expanded, if files can be written to it, before long work; a missing one is not made.
-
-    Args:
-        path: the folder to be.
-        holding: names of files that will be written to it.
-        apart_from: files that must not be written over.
-        problem: what does not work, as the message has it: "no report can be written here".
-        advice: what to do, at the end of the message.
-
-    Raises:
-        InputError: it cannot be made or written to, or it or one of its files is one of ``apart_from``.
-    """
+    """Return a folder, ``~`` expanded, if files can be written to it, before long work; a missing one is not made."""
     _check_name(path)
     folder = Path(path).expanduser()
     try:

@@ -50,11 +50,7 @@ class Process:
         _send(self._child.stdin, (make, arguments))
 
     def __call__(self, *arguments: object) -> Any:  # noqa: ANN401 - what the function returns
-        """Call the function, and wait for what it returns.
-
-        Raises:
-            ArmsightError: the child has ended; and what the function raises.
-        """
+        """Call the function, and wait for what it returns."""
         with self._lock:
             assert self._child.stdin is not None
             assert self._child.stdout is not None
@@ -153,11 +149,7 @@ def _send(pipe: IO[bytes], content: object) -> None:
 
 
 def _receive(pipe: IO[bytes]) -> Any:  # noqa: ANN401 - what was sent
-    """Read an object.
-
-    Raises:
-        EOFError: the other side has closed.
-    """
+    """Read an object."""
     count = _LENGTH.unpack(_read(pipe, _LENGTH.size))[0]
     sizes = struct.unpack(f"<{count}q", _read(pipe, 8 * count))
     content, *arrays = [_read(pipe, size) for size in sizes]

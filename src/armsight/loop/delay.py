@@ -40,8 +40,7 @@ MAX_SIGMA_S = 2e-3
 _OUTLIER = 4.0
 #: Readings given to the filter ahead of a measurement, s.
 _AHEAD_S = 0.1
-#: Of two rigs' paths: blocks of time left out in turn; lags that are tried; steps of each; gaps of more intervals are not
-#: bridged; another lag that fits worse by less than this factor is as likely.
+#: Of two rigs' paths: blocks left out; lags tried; steps of each; gaps bridged; a lag so little worse is as likely.
 _BLOCKS, _CANDIDATES, _STEPS, _BRIDGED, _ALIKE = 8, 3, 6, 3.0, 2.0
 
 
@@ -55,12 +54,8 @@ def estimate_delay(
 ) -> Delay:
     """Find how late the camera's stamps are, and how far they scatter.
 
-    Args:
-        arm: the arm, as its table says it is.
-        states: readings from before the first measurement to after the last.
-        measurements: of the tool's pose meanwhile, in order of time; 20 or more, while the joints moved to and fro.
-        prior: how far the arm may be off.
-        sync_s: standard deviation of the time between a shot's two exposures, s.
+    ``measurements``: of the tool's pose meanwhile, in order of time; 20 or more, while the joints moved to and fro.
+    ``sync_s``: standard deviation of the time between a shot's two exposures, s.
 
     Raises:
         InputError: too few measurements, or readings that do not cover them.

@@ -20,11 +20,11 @@ from armsight.estimate.chance import chi_square_limit
 Cause = Literal["rig", "body", "fixed", "time", "lens", "joint", "estimator", "host"]
 #: Probability of a false alarm of each test within a minute, while its noise model holds.
 FALSE_ALARMS_PER_MINUTE = 1e-4
-#: Chance of a test below which what it shows widens poses, though it is not said yet; half: a change of its size costs NEES
-#: for longer, double: poses of a healthy run are too wide more often.
+#: Chance of a test below which it widens poses; half: a change costs NEES for longer, double: healthy poses are too
+#: wide.
 SUSPECTED = 0.02
-#: What displaces the tool by less, m, forbids no result: of cameras and lenses it is not said, as poses are widened by it.
-#: Half: what webcams leave after processing is said, double: a stand that shakes by 0.2 mm is not.
+#: What displaces the tool by less, m, forbids no result. Half: webcams' processing is said, double: a stand's shaking
+#: not.
 COSTS_M = 1e-4
 #: A rotation counts by what it does at this distance from the body's origin, m.
 LEVER_M = 0.1
@@ -130,14 +130,7 @@ def unseen_lines(names: Sequence[str]) -> list[str]:
 
 
 def alarm_limit(freedom: int, tests_per_s: float, hypotheses: int = 1, estimated: int | None = None) -> float:
-    """Return the chi-square of an alarm, so that FALSE_ALARMS_PER_MINUTE bounds the false ones (Bonferroni).
-
-    Args:
-        freedom: degrees of freedom.
-        tests_per_s: how often the test is made.
-        hypotheses: how many are tested each time.
-        estimated: degrees of freedom from which the noise was estimated; None where it is known.
-    """
+    """Return the chi-square of an alarm (Bonferroni); ``estimated``: degrees of freedom of the noise, if unknown."""
     chance = FALSE_ALARMS_PER_MINUTE / (60.0 * tests_per_s * hypotheses)
     if estimated is None:
         return chi_square_limit(freedom, chance)

@@ -24,8 +24,7 @@ import numpy as np
 
 #: Frames that the filter remembers: about 2 / MEMORY of the jitter's variance stays.
 MEMORY = 80
-#: Frames in a row that begin the filter, and as many that prove it; stamps that do not fit, among as many, until it begins
-#: again.
+#: Frames in a row that begin the filter, and prove it; stamps that do not fit, among as many, until it begins again.
 _LEAST, _STRANGE = 8, 3
 #: Two frames follow each other if their interval is at most so many of the shortest.
 _NEXT = 1.6
@@ -33,13 +32,12 @@ _NEXT = 1.6
 _GATE, _GATE_S = 5.0, 5e-4
 #: With a sigma above this share of the period frames cannot be counted.
 _COUNTABLE = 0.15
-#: An image that comes so much sooner after its stamp than any other, s, or so much later than the soonest, contradicts its
-#: stamp; half: a loop that was busy for as long loses its images, double: jumps of as much go to the estimator.
+#: So much sooner, or later than the soonest, an image contradicts its stamp, s; half: busy loops lose images, double:
+#: jumps pass.
 _EARLY_S, _LATE_S = 0.005, 0.25
 #: So many newest images are the others; so many that contradict in a row, and agree, are a clock that jumped.
 _OTHERS, _AGREE = 120, 4
-#: A clock whose rate is off by this is corrected, seen over double of so many seconds at least, or at once where it is off
-#: by so many times that; crystals differ by 1e-4. So many seconds are compared.
+#: A clock off by this rate is corrected, seen over double of so many seconds, or at once at so many times that.
 _RATE, _SEEN_S, _SURE, _KEPT_S = 1e-3, 3, 3.0, 20
 
 
@@ -131,7 +129,6 @@ class FrameClock:
         """Correct the rate of the clock where the soonest images of seconds come ever sooner or later.
 
         The slope is the median of those between any two seconds (Sen, 1968), of which nine in ten must agree: where few
-        images come in a second the soonest of them scatters by milliseconds, and the loop may be busy in some.
         """
         if len(self._soonest) <= _SEEN_S:
             return

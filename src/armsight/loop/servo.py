@@ -34,29 +34,23 @@ from armsight.robot.trajectories.resolved_rate import position_first
 MAX_SIGMA_M = 1e-3
 #: The correction moves no faster than this share of each joint's speed limit, so that nothing jumps.
 RATE_SHARE = 0.1
-#: At rest a joint is taken through its backlash, with this time constant, s, for an error of the tool that lasts and of
-#: which the joint would have to make up so much, m: less is vision's noise.
+#: At rest a joint is taken through its backlash, with this time constant, s, for a lasting error of so much, m.
 CROSS_S, CROSS_M = 0.3, 3e-5
-#: Over joints that move by steps the tool's error at rest is averaged for so long, s, before a change, and for so long at
-#: most while there is none; a change is made where it lowers the error by this share of the largest displacement that one
-#: step of one joint makes: less would hunt.
+#: Over joints that move by steps the error is averaged for so long, s, and so long at most, before a change that lowers
+#: it by this share of a step's largest displacement: less would hunt.
 LOOK_S, LOOK_MOST_S, WORTH_STEPS = 0.25, 1.0, 0.25
-#: Backlash that a joint must be taken through before it displaces the tool is known to the first share of itself, and how
-#: much a joint then displaces the tool to the second: the Jacobian is that of the table, not of the arm.
+#: Backlash to cross is known to the first share, what a joint displaces to the second: the Jacobian is the table's.
 GAP_SHARE, MOVE_SHARE = 0.5, 0.02
 #: In a choice between whole steps an error of 1 rad counts as much as one of this, m.
 STEP_LEVER_M = 0.05
 #: How fast the servo learns by how much joints rest off their commands, s; that changes with the load from pose to pose.
 DROOP_S = 0.2
-#: In motion the correction comes to what the estimator asks for with this time constant, s, or vision's period if longer:
-#: that is no feedback, as it hardly depends on the correction, but backlash that changes sides with every twitch would
-#: keep it twitching.
+#: In motion the correction comes to what is asked for with this time constant, s: backlash would keep it twitching.
 FOLLOW_S = 0.08
-#: A direction is corrected from this singular value of the Jacobian on (linear rows over the arm's size), and fully
-#: from that.
+#: A direction is corrected from this singular value of the Jacobian on (linear rows over the arm's size), fully from
+#: that.
 UNCORRECTED_BELOW, CORRECTED_ABOVE = 0.02, 0.04
-#: The correction is at most this, rad, and displaces the tool by at most so much from where the potentiometers alone would
-#: bring it, m: an arm that needs more is not the arm of the table.
+#: The correction is at most this, rad, and displaces the tool by at most so much, m: beyond is another arm.
 MAX_CORRECTION_RAD = np.deg2rad(5.0)
 MAX_CORRECTION_M = 0.02
 #: Joints are at rest when measured slower than this (four sigma of a smoothed speed) and commanded slower than that, rad/s.
@@ -80,8 +74,6 @@ class LoopTiming:
     """How long everything in the loop takes.
 
     Attributes:
-        period_s: between two commands, s.
-        vision_period_s: between two pose measurements, s.
         latency_s: from the middle of an exposure to the command that knows of it, s, as measured.
         response_s: from a command to the joints being there, s: the time constant of their own loop.
     """
@@ -92,11 +84,7 @@ class LoopTiming:
     response_s: float = 0.05
 
     def __post_init__(self) -> None:
-        """Check the numbers.
-
-        Raises:
-            InputError: not positive.
-        """
+        """Check the numbers."""
         for name, value in vars(self).items():
             least = 0.0
             if not (np.isfinite(value) and value > least):
@@ -142,7 +130,6 @@ class Aim(Record):
 
     Attributes:
         ahead: the joints a period from now, as the motion has them.
-        q: (2, n) angles now and ahead, rad.
         qd: (2, n) their speeds, rad/s.
         Ts_base_tool: (2, 4, 4) where they put the tool.
         most: (n,) by how much the correction of each joint may change in the period, rad.
@@ -150,7 +137,6 @@ class Aim(Record):
         jacobian: (6, n) at the goal.
         U: (6, k) of its k = min(6, n) singular values, linear rows over the arm's size, and so are ``s`` and ``Vt``.
         s: (k,).
-        Vt: (k, n).
         passed_s: since the last command, s; the period where that is not known.
         left_s: until the arm moves on, s.
     """
@@ -174,7 +160,6 @@ class ServoStep(Record):
     """One command and how it came about.
 
     Attributes:
-        command: what the board is to be sent.
         mode: what the loop is closed on.
         correction: (n,) what is added to the motion's joints, rad.
         error: (6,) from the estimated tool to its reference now, [m; rad] in base axes.
@@ -189,13 +174,7 @@ class ServoStep(Record):
 
 
 class PoseServo:
-    """Corrects the joints' commands by what is seen of the tool.
-
-    Args:
-        arm: the arm, as its table says it is; motions are planned with it.
-        timing: of the loop.
-        joints: controllers of the joints that leave an error of their own; None where they have an integral.
-    """
+    """Corrects the joints' commands by what is seen of the tool."""
 
     def __init__(self, arm: Arm, timing: LoopTiming, joints: JointLoops | None = None) -> None:
         self.timing, self._joint_loops = timing, joints
@@ -219,11 +198,8 @@ class PoseServo:
     ) -> Aim:
         """Return the reference of the next command.
 
-        Args:
-            motion: the motion under way; a next one must start where the last one ended.
-            t_s: time since its start, on the clock of the estimator's newest reading, s.
-            gravity: returns the duty (n,) that holds the arm against gravity at joint angles (n,), passed on.
-            rest_s: how long the arm rests after the motion, s, where that is known.
+        ``t_s``: time since its start, on the clock of the estimator's newest reading, s. ``gravity``: returns the duty
+        (n,) that holds the arm against gravity at joint angles (n,), passed on.
         """
         passed_s = t_s - self._last[1] if self._last is not None and self._last[0] is motion else 0.0
         self._last = motion, t_s
@@ -295,7 +271,6 @@ class PoseServo:
         """Return the joint angles (n,) that make up for an error of the tool (6,).
 
         What a singular arm cannot do is not asked of it: damping alone would let the integral wind up in that direction.
-        Fewer than six joints correct the position first.
         """
         if self._arm.joints < 6:
             return position_first(aim.jacobian / self._scale[:, None], error / self._scale, _corrected)[0]
@@ -330,7 +305,6 @@ class PoseServo:
     def _stepped(self, estimator: Estimator, aim: Aim, error: Array, arrived_s: float) -> Array:
         """Return the change (n,) over joints that move by steps: look, move by whole steps, let the joints arrive.
 
-        An integral would ask for parts of steps, which their controllers do not make, or make at once when they add up.
         Some joints go away from their goal first, to come to it from one side: no change is begun after which there is no
         time left to look.
         """
@@ -413,26 +387,9 @@ def _bounded(
 ) -> int:
     """Write a command with a changed correction, as far as the limits allow.
 
-    Args:
-        q: (2, n) the motion's joints now and ahead, rad, and so are the speeds.
-        qd: see ``q``.
-        J: (6, n) Jacobian.
-        q_min: (n,) limits of the angles, rad.
-        q_max: (n,) the same.
-        qd_max: (n,) of the speeds, rad/s.
-        most: (n,) of the change, rad.
-        most_rad: of the correction, rad.
-        most_m: of the tool's displacement by it, m.
-        period_s: in which the joints are to be there, s.
-        correction: (n,) before, rad.
-        change: (n,) asked of it, rad.
-        wished: (n,) the correction without limits of the angles.
-        now: (n,) the correction.
-        q_ref: (n,) command.
-        qd_ref: (n,) its speeds.
-
     Returns:
-        Number of joints that a limit keeps from being corrected further; beyond n where the tool's displacement is bounded.
+        Return the number of joints that a limit keeps from being corrected further; beyond n the tool's displacement is
+        bounded.
     """
     joints = q.shape[1]
     square, limited = 0.0, 0
@@ -543,8 +500,7 @@ def _corrected(s: Array) -> Array:
 def likely_joint_errors(arm: Arm, q: Array, T_base_tool: Array) -> Array:
     """Return the errors of joint readings q (n,), rad, that most likely explain a measured pose (4, 4) of the tool.
 
-    The maximum a posteriori with a prior about zero: near a singular pose an exact inverse explains a fraction of a
-    millimetre by tens of degrees.
+    The maximum a posteriori about zero: near a singular pose an exact inverse would take tens of degrees.
     """
     weights = np.repeat(1.0 / np.square(_EXPLAINED), 3)
     J, xi = arm.jacobian(q, "tool"), log_se3(inverse(arm.forward(q)) @ T_base_tool)

@@ -39,11 +39,9 @@ BITS, _FEEDBACK = 511, 4
 #: Delays of the stamps that are tried, s, as in :mod:`armsight.loop.delay`; exposures that are tried, s.
 _LAGS_S, _EXPOSURES_S = (-0.1, 0.6), (2e-4, 0.05)
 _EXPOSURE_STEPS = 12
-#: Fewest images for an estimate, and for finding the code; share of the brightness that the code must explain to be found:
-#: by chance 40 images reach half of it once in 1e9 of the lags and exposures tried.
+#: Fewest images for an estimate, and for finding the code; share of brightness it must explain (chance: 1e-9).
 LEAST, LEAST_FOUND, _EXPLAINED = 24, 40, 0.6
-#: Powers of the share of light in the response, and passes of the estimate with new weights; of each its steps,
-#: and how many of the beginnings that fit best are followed.
+#: Powers of the share of light in the response, passes with new weights, steps, beginnings that are followed.
 _POWERS, _PASSES, _STEPS, _STARTS = 3, 4, 12, 3
 #: Tukey's weights are zero beyond so many sigma; with more than this share of images there, the LED was hidden.
 _TUKEY, _HIDDEN = 6.0, 0.3
@@ -84,13 +82,7 @@ def _on_time(t_bits: Array) -> Array:
 
 
 def light(t_s: Array, exposure_s: float | Array, bit_s: float) -> Array:
-    """Return the share of the LED's light that exposures about times t_s gather, 0 to 1.
-
-    Args:
-        t_s: middle of each exposure, board's clock, s.
-        exposure_s: how long they are, s.
-        bit_s: how long each bit of the code lasts, s.
-    """
+    """Return the share of the LED's light that exposures about times t_s gather, 0 to 1."""
     half = np.asarray(exposure_s) / 2
     return np.asarray((_on_time((t_s + half) / bit_s) - _on_time((t_s - half) / bit_s)) * bit_s / (2 * half))
 
@@ -100,9 +92,7 @@ class Brightness(Record):
     """An LED in the images of one camera.
 
     Attributes:
-        stamp_s: (N,) stamps of the images, board's clock, s, rising.
         led: (N,) brightness of the LED, grey levels.
-        around: (N,) brightness around it.
     """
 
     stamp_s: Array
@@ -124,7 +114,6 @@ class Exposures(Record):
         n: (N,) numbers of the images, counted by the period, 0 in the middle.
         t_s: middle of exposure 0, board's clock, s.
         period_s: from one exposure to the next, s.
-        exposure_s: how long each is, s.
         cov: (3, 3) covariance of the three, s^2.
         jitter_s: standard deviation of the exposures about their period, s.
         contrast: sigma of the brightness that the code does not explain, over the LED's.
@@ -323,8 +312,6 @@ class SyncEstimate(Record):
         skew_s: by how much the right camera exposes its LED's row later than the left one its own, s.
         sigma_skew_s: its standard deviation.
         jitter_s: standard deviation of the skew from shot to shot, s.
-        left: the left camera's exposures.
-        right: the right camera's.
     """
 
     t_s: float
@@ -340,17 +327,7 @@ class SyncEstimate(Record):
 def estimate_sync(
     left: Brightness, right: Brightness, bit_s: float, *, near: SyncEstimate | None = None
 ) -> SyncEstimate | Missed:
-    """Estimate delay and skew from the LED's brightness in the same shots of two cameras.
-
-    Args:
-        left: in the left images.
-        right: in the right ones, with the same stamps.
-        bit_s: how long each bit of the code lasts, s.
-        near: an earlier estimate.
-
-    Returns:
-        The estimate, or why there is none; the text begins with the camera.
-    """
+    """Estimate delay and skew by the LED's brightness in the same shots of two cameras; a miss names the camera."""
     if not np.array_equal(left.stamp_s, right.stamp_s):
         raise InputError("both cameras' brightness must be of the same shots")
     found = []
@@ -384,8 +361,7 @@ _SEARCH_SHOTS, _LOOK_SHOTS, _WINDOW_S, _WINDOW_SHOTS = 48, 72, 2.0, 48
 _LOST = 4
 #: Estimates so recent, s, are pooled: clocks drift by a few ppm.
 _POOLED_S = 30.0
-#: Delay and skew have changed beyond so many sigma, and so many seconds; the delay of a sweep differs from the LED's beyond
-#: so many seconds: what the sweep's model of the arm lacks of friction and backlash is up to 1 ms.
+#: Sigmas and seconds beyond which delay and skew changed; and by which a sweep, blind to 1 ms of friction, contradicts.
 _CHANGED, _CHANGED_S, _APART_S = 5.0, 3e-4, 1.5e-3
 
 _SIDES = ("left", "right")
@@ -397,9 +373,6 @@ _Batch: TypeAlias = list[tuple[float, tuple[Any, Any]]]
 
 class SyncLedWatch:
     """Finds the LED in the images of two cameras, and follows the cameras' clock by it.
-
-    Args:
-        bit_s: how long each bit of the LED's code lasts, s.
 
     Attributes:
         estimates: what it said, window by window.
@@ -425,11 +398,7 @@ class SyncLedWatch:
         self._gathered: list[tuple[float, tuple[Any, Any]]] = []
 
     def take(self, shot: Shot) -> Callable[[], None] | None:
-        """Look at the LED in a shot; return what is to be computed now and then, for a thread: nothing waits for it.
-
-        Args:
-            shot: in the order of time, its stamp on the board's clock.
-        """
+        """Look at the LED in a shot; return what is to be computed now and then, for a thread: nothing waits for it."""
         if self._busy or shot.t_s is None or shot.left is None or shot.right is None:
             return None
         if self._gathered and shot.t_s <= self._gathered[-1][0]:

@@ -36,10 +36,7 @@ BODY = Usual("size of the body", 2e-3, 20.0)  # half, double: likewise
 def fitting_unit(length_m: float, unit_m: float, usual: Usual) -> str | None:
     """Return the unit in which a length that cannot be one would be ordinary; None where it is, or none makes it so.
 
-    Args:
-        length_m: as it was read, m.
-        unit_m: the unit that it was read in, m.
-        usual: what it is of.
+    ``unit_m``: the unit that it was read in, m.
     """
     if usual.least_m <= length_m <= usual.most_m:
         return None
@@ -52,14 +49,8 @@ def fitting_unit(length_m: float, unit_m: float, usual: Usual) -> str | None:
 def check_length(length_m: float, unit_m: float, usual: Usual, advice: str = "--unit-m {unit_m:g}") -> None:
     """Reject a length that cannot be one.
 
-    Args:
-        length_m: as it was read, m.
-        unit_m: the unit that it was read in, m.
-        usual: what it is of.
-        advice: the option that names the right unit; ``{unit_m}`` stands for it, m, ``{unit}`` for its name.
-
-    Raises:
-        InputError: what was found, what is expected, and the option that would do.
+    ``unit_m``: the unit that it was read in, m. ``advice``: the option that names the right unit; ``{unit_m}`` stands
+    for it, m, ``{unit}`` for its name.
     """
     if usual.least_m <= length_m <= usual.most_m:
         return

@@ -158,12 +158,8 @@ def columns_in(
 ) -> tuple[Columns, str | None, tuple[str, ...]]:
     """Return the columns of a file's cells by our names, the convention of its rotations, and notes.
 
-    Args:
-        path: the file.
-        cells: what it holds.
-        links: names of the joints of an arm.
-        unit: of lengths whose columns name none.
-        rotation: the convention where it is given.
+    ``links``: names of the joints of an arm. ``unit``: of lengths whose columns name none. ``rotation``: the convention
+    where it is given.
     """
     head, *body = degree_columns(path, [cells.head, *(row for _, row in cells.rows)])
     head, convention, notes = understood(path, head, links, unit, rotation or cells.rotation)

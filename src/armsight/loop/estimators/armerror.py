@@ -220,10 +220,7 @@ def offsets_by(table: Array, q: Array, unseen: Array, B: Array) -> None:
 
 @kernel
 def _adjoint(F: Frame, G: Frame, out: Array) -> None:
-    """Write Ad(F^-1 G), (6, 6), which maps small motions in the axes of G to those in the axes of F.
-
-    This is ``geometry.pose.adjoint`` compiled, on frames as tuples.
-    """
+    """Write Ad(F^-1 G), (6, 6), which maps small motions in the axes of G to those in the axes of F."""
     px, py, pz = G[9] - F[9], G[10] - F[10], G[11] - F[11]
     for row in range(3):
         fx, fy, fz = F[3 * row], F[3 * row + 1], F[3 * row + 2]
@@ -237,10 +234,7 @@ def _adjoint(F: Frame, G: Frame, out: Array) -> None:
 
 @kernel("const f8[::1], f8[::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1]")
 def pose_and_derivative(table: Array, x: Array, q: Array, unseen: Array, T: Array, H: Array) -> None:
-    """Write the tool's pose (4, 4) at readings q (n,), unseen (3, n), and its derivative (6, size) by the vector x.
-
-    The column of the delay stays zero: the delay changes no pose, only its time.
-    """
+    """Write the tool's pose (4, 4) at readings q (n,), unseen (3, n), and its derivative (6, size) by the vector x."""
     joints, size = q.shape[0], x.shape[0]
     linearity, pose = 6 * (joints + 1), size - 7
     backlash = linearity + BASIS * joints
@@ -297,8 +291,6 @@ def tangent(T: Array, T_to: Array, xi: Array) -> None:
     """Write the tangent (6,) from a pose (4, 4) to another, ``T exp(xi) = T_to``, for rotations of less than 3 rad, to xi.
 
     The rotation vector comes from its quaternion, the translation from the closed inverse of V (Sola, 2018, eq. 145, 174).
-    This is ``geometry.pose.log_se3`` compiled, for the loop. Beyond 3 rad the axis is hardly defined: the result is a
-    rotation by pi about x, which the filter rejects.
     """
     R, d = np.empty((3, 3)), np.empty(3)
     for row in range(3):

@@ -62,11 +62,7 @@ def rods(arm: Arm) -> Array:
 
 
 def masses(arm: Arm) -> tuple[Array, Array]:
-    """Return the points (K, 5) that stand for an arm's links, and what each joint has beside them (3, n).
-
-    That is the inertia of what rotates about its own axis, kg m^2, its bearing's friction, N m, both of rods of 1 kg/m, and
-    by what a torque of theirs is to be multiplied to become the lever of a unit load, 1/N.
-    """
+    """Return the points (K, 5) that stand for an arm's links; and (3, n) inertia, kg m^2, friction, N m, 1/N to a lever."""
     points = rods(arm)
     beyond = np.array([points[points[:, 0] >= i, 1].sum() for i in range(arm.joints)])
     own = beyond * 0.5 * _thickness(arm) ** 2
@@ -209,20 +205,10 @@ def float_on(
 ) -> None:
     """Step links inside their backlash from row to row of readings.
 
-    Args:
-        t: (N,) times of the readings, s.
-        q: (N, n) readings, rad.
-        memory: (N, 4, n) to be written: position and speed in half gaps, how far the links have come in that, and lever
-            of the torque of inertia, m.
-        first: first row there is.
-        begin: first row to be written.
-        end: the row after the last.
-        table: of the arm.
-        points: what stands for its links (K, 5).
-        beside: what each joint has beside them (3, n).
-        still: an arm none of whose joints is faster stands, rad/s: its links stand as well, and what is loose stays where
-            it is while its shaft creeps.
-        gap: (n,) the backlash, rad.
+    ``memory``: (N, 4, n) to be written: position and speed in half gaps, how far the links have come in that, and lever
+    of the torque of inertia, m. ``points``: what stands for its links (K, 5). ``beside``: what each joint has beside
+    them (3, n). ``still``: an arm none of whose joints is faster stands, rad/s: its links stand as well, and what is
+    loose stays where it is while its shaft creeps. ``gap``: (n,) the backlash, rad.
     """
     joints = gap.shape[0]
     motion, position, speed, half = np.empty((3, joints)), np.empty(joints), np.empty(joints), 0.5 * gap

@@ -30,16 +30,14 @@ RATE = 2e-4
 _WALK, _RATE_WALK = 3e-5, 3e-6
 #: What the model of the backlash lacks looks like an offset of so much, s (standard deviation): found on simulated motions.
 SYSTEMATIC_S = 3e-4
-#: An offset of more than so many seconds is corrected from then on, where chi-square of offset and rate is larger than the
-#: limit for so long, s; where the offset changes by other than its rate, where it is beyond so many sigmas.
+#: An offset of more seconds is corrected, at this chi-square, for so long, s; beyond so many sigmas of its rate.
 _LEAST_S, _CERTAIN, _STAYS_S, _CERTAIN_SIGMAS = 5e-4, 30.0, 0.5, 3.0
 #: From this chi-square on an offset is said to who watches the innovations: below, it is noise.
 _SAID = 14.0
 #: A measurement that an offset leaves less likely than this says nothing of it: something else is wrong.
 _GATE = chi_square_limit(6, 1e-3)
-#: Residuals are compared over about this time, s. Beyond so many sigmas the offset changes by other than its rate: it is
-#: taken to walk by that much from then on, less and less with this time constant, s. Residuals that determine an offset no
-#: better than so, s, do not say that it changed: the arm hardly moves, and what the model lacks would be taken for it.
+#: Residuals are compared over so long, s; beyond so many sigmas the offset walks, less and less with this time
+#: constant, s; residuals that determine an offset no better than so, s, say nothing.
 _WINDOW_S, _SURPRISING, _CALM_S, _SEEN_S = 2.0, 3.0, 10.0, 1e-3
 #: Innovations whose mean square exceeds their covariance widen it: mean over about this time, s.
 _EXCESS_S = 4.0
@@ -47,11 +45,6 @@ _EXCESS_S = 4.0
 
 class ClockFollower:
     """Follows offset and rate of the camera's clock.
-
-    Args:
-        size: of the filter's state.
-        delay: row of the delay in it.
-        sigma_s: standard deviation of the delay at the beginning, s.
 
     Attributes:
         since_s: time of the measurement from which on stamps are corrected, s; None while they are not.
@@ -74,10 +67,7 @@ class ClockFollower:
         return np.concatenate([known, self._b, self._corrected, self._M.ravel(), self._V.ravel()])
 
     def restore(self, state: Array | None, forgotten: slice) -> None:
-        """Go on from an earlier state; rows of the filter's state that are unknown then have no bias.
-
-        Without a state the filter knows nothing, and the clock is what is followed now.
-        """
+        """Go on from an earlier state; rows of the filter's state that are unknown then have no bias."""
         if state is None:
             self._V[:] = 0.0
             self._V[self._delay, 0] = 1.0

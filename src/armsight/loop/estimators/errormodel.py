@@ -28,16 +28,15 @@ from armsight.robot.kinematics.arm import Arm
 
 #: After so long a joint has crept wherever it could, s.
 LONGEST_CREEP_S = 4.0
-#: A joint counts as so many times as uncertain after a change of side while the filter learns from it. Without this, a
-#: change some hundredths of a second early or late would be taken for a narrower backlash.
+#: A joint counts as so many times as uncertain after a change of side while the filter learns: it may be early or late.
 LEARNING = 6.0
 
 #: Linearisations per measurement at most, and the change (m, rad) that ends them: it leaves about its square.
 ITERATIONS, SETTLED = 4, 1e-3
 #: A joint slower than this keeps its side of the backlash, rad/s.
 MOVES_RAD_S = 1e-3
-#: Covariances below this (of m, rad: 1e-20 of each) are set to zero: forgotten ones would decay to numbers so small that a
-#: processor takes a hundred times as long for each (denormals).
+#: Covariances below this (of m, rad: 1e-20 of each) are set to zero: denormals take a processor a hundred times as
+#: long.
 NOTHING = 1e-40
 
 #: Sigmas added when vision contradicts the state again and again, as after a bump: to base and tool, and the joints' zeros.
@@ -143,10 +142,7 @@ class Predicted(NamedTuple):
 
 
 def opened(joints: int) -> Array:
-    """Return the variances (size,) that are added when the filter of an arm of so many joints reopens.
-
-    What a moved rig, a slipped body or sensor, or a gear that grew looser changes: base, tool, zeros, backlash.
-    """
+    """Return the variances (size,) that are added when the filter of an arm of so many joints reopens."""
     at = layout(joints)
     sigmas = np.zeros(at.size)
     sigmas[:6] = sigmas[6 * joints : at.linearity] = np.repeat([OPEN_M, OPEN_RAD], 3)
@@ -155,10 +151,7 @@ def opened(joints: int) -> Array:
 
 
 def smoothed_anew(state: ErrorState, then: Smoothed) -> ErrorState:
-    """Return a state after the readings about its time have been smoothed again: the joints' true angles stay the same.
-
-    Other smoothing leaves other noise; a link elsewhere in its backlash is off by another rest.
-    """
+    """Return a state after the readings about its time have been smoothed again: the joints' true angles stay the same."""
     x = state.x.copy()
     _smoothed_anew(x, state.joints.q, state.joints.unseen, then.q, then.unseen)
     return state._replace(x=x, joints=then)
@@ -168,8 +161,6 @@ def bridged(noise_at: slice, before: Array, after: Array, ahead: Propagation, ba
     """Return the readings' noise (N, n) between the states before and after (N, size), and what is added to variances.
 
     The noise is bounded by both ends, as a Gauss-Markov process is: its mean between them, and what is left of its
-    variance. The rest is known from the nearer end alone: vibration faster than the cameras' rate is not bounded by
-    both ends.
     """
     near, far = ahead.kept[:, noise_at] ** 2, back.kept[:, noise_at] ** 2
     whole = np.maximum(1.0 - near * far, _MIN_SHARE)
@@ -181,11 +172,6 @@ def bridged(noise_at: slice, before: Array, after: Array, ahead: Propagation, ba
 
 class ErrorModel:
     """An arm and the error model of its potentiometers.
-
-    Args:
-        arm: the arm, as its table says it is.
-        prior: how far it may be off.
-        sigma_delay_s: how far the camera's delay may be.
 
     Attributes:
         layout: of the vector.
@@ -222,16 +208,7 @@ class ErrorModel:
     def carried(
         self, time_s: Array, travel: Array, flips: Array, was: Array, joints: Smoothed, *, learning: float = 1.0
     ) -> Propagation:
-        """Return the same for times (N,), and how far joints (N, n) and sides (N, 2, n) have come.
-
-        Args:
-            time_s: (N,) since a state, s.
-            travel: (N, n) of the joints meanwhile, rad.
-            flips: (N, 2, n) of the sides.
-            was: (N, n) what was left of a reading's variance at the state, or (1, n) at one state for all.
-            joints: at the times.
-            learning: as above.
-        """
+        """Return the same for times (N,), and how far joints (N, n) and sides (N, 2, n) have come."""
         shape = len(time_s), self.layout.size
         kept, added = np.empty(shape), np.empty(shape)
         noise = joints.variance, joints.lasts_s, was
@@ -258,13 +235,7 @@ class ErrorModel:
     ) -> Array:
         """Return the tool's poses (N, 4, 4) if readings were q (N, n), rad, moving at qd (N, n), rad/s.
 
-        Args:
-            state: the newest.
-            step: its propagation to now.
-            now: the joints, N = 1.
-            q: the readings.
-            qd: their speeds.
-            loose: (n,) which links that gravity does not load change their side, too, as their joints move.
+        ``loose``: (n,) which links that gravity does not load change their side, too, as their joints move.
         """
         Ts = np.empty((len(q), 4, 4))
         _imagined(self._table, state.x, step.kept[0], now.unseen[0], q, qd, loose, Ts)
@@ -273,14 +244,7 @@ class ErrorModel:
     def innovation(
         self, x: Array, joints: Smoothed, pose_measurement: PoseMeasurement, jitter_s: float
     ) -> tuple[Array, Array]:
-        """Return the innovation (6,) of a measurement, and the model's derivative (6, size) by x.
-
-        Args:
-            x: the state.
-            joints: at the measurement.
-            pose_measurement: the measurement.
-            jitter_s: standard deviation of its time, s.
-        """
+        """Return the innovation (6,) of a measurement, and the model's derivative (6, size) by x."""
         z, H = np.empty(6), np.empty((6, self.layout.size))
         seen = pose_measurement.T_base_tool, pose_measurement.cov_noise, jitter_s
         _innovation(self._table, x, joints.q[0], joints.qd[0], joints.unseen[0], *seen, z, H, np.empty((6, 6)))
@@ -301,15 +265,7 @@ class ErrorModel:
     ) -> tuple[Array, Array, Array]:
         """Use a measurement: overwrite ``at.x`` and ``at.P`` by state and covariance after it, and ``at.HP``.
 
-        Return the gain (size, 6), innovation (6,) and derivative (6, size) of the last linearization; ``at.HP`` is of it,
-        too. The iterated update (Bell and Cathey, 1993). Other arguments as for :meth:`innovation`.
-
-        Args:
-            at: the state before.
-            joints: at the measurement.
-            pose_measurement: the measurement.
-            jitter_s: standard deviation of its time, s.
-            learns_delay: whether the delay is corrected; if not, it stays as it is, and so does its variance.
+        ``learns_delay``: whether the delay is corrected; if not, it stays as it is, and so does its variance.
         """
         K, z, H = np.empty((self.layout.size, 6)), at.z.copy(), at.H.copy()
         now = joints.q[0], joints.qd[0], joints.unseen[0]
@@ -354,11 +310,7 @@ def _forget(
     kept: Array,
     added: Array,
 ) -> None:
-    """Write into kept and added (N, size) what times (N,), travel (N, n) and flips (N, 2, n) do.
-
-    Of the readings' noise: ``variance`` and ``lasts`` (N, n) as in ``Smoothed``, ``was`` (N or 1, n) the variance at the
-    state.
-    """
+    """Write into kept and added (N, size) what times (N,), travel (N, n) and flips (N, 2, n) do."""
     rest_travel, pose_travel, creep, flip, flip_float, reading = forgets
     joints, pose_at = travel.shape[1], sigmas.shape[0] - 7
     kept[:], added[:] = 1.0, 0.0
@@ -427,7 +379,6 @@ def _tracked(
     """Write poses (N, 4, 4) by a state propagated to readings q (N, n), and H (K P K + A) H' (N, 6, 6), to Ts and own.
 
     K and A stand in kept and added (N, size): A has the rest, the readings' noise and the pose alone (:func:`_forget`).
-    The same with what all measurements share, to covs.
     """
     size, joints = x.shape[0], q.shape[1]
     moved, H, HP = np.empty(size), np.empty((6, size)), np.empty((6, size))

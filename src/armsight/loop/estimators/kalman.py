@@ -56,29 +56,25 @@ from armsight.robot.kinematics.arm import Arm
 CHANCE = 1e-6
 #: So many outliers in a row that agree with each other are then used: no marker is mistaken the same way so often.
 STUBBORN = 6
-#: A measurement that would take base, tool, zeros or backlash so many standard deviations from the table, of the prior and
-#: of what a reopened filter allows, is an outlier: no arm is so far off, but stamps may be; half: rigs knocked by 40 mm are
-#: not followed, double: wrong stamps take the tool twice as far.
+#: More standard deviations of base, tool, zeros or backlash are an outlier; half: rigs knocked by 40 mm are not
+#: followed, double: wrong stamps take the tool twice as far.
 FURTHEST = 8.0
 #: States kept for late measurements, s.
 HISTORY_S = 1.0
-#: Measurements newer than the joints' readings are kept waiting for so long, s; half: slow boards lose some, double: more
-#: memory where the joints' readings stop.
+#: Newer measurements wait for readings for so long, s; half: slow boards lose some, double: more memory.
 WAITING_S = 0.5
 #: Measurements of so long after a time serve to smooth it, at least, s; half: worse tracks, double: half as cheap.
 AHEAD_S = 0.3
 _GATE = chi_square_limit(6, CHANCE)
 #: The tool's acceleration is the difference of its twists so long before and after, s; half: noisier, double: bends cut.
 APART_S = 0.01
-#: Windows of an inertial unit that no image ends are at least so long, s; half: twice the cost, double: impacts are said
-#: late.
+#: Windows without an image are at least so long, s; half: twice the cost, double: impacts are said late.
 WINDOW_S = 0.04
-#: While windows are used, a link is loose against its potentiometer by one sigma of so many rad, which lasts so long, s:
-#: in its backlash it keeps its speed when the shaft stops, and stands when that begins. Half: joints overrule what was
+#: While windows are used a link is loose by one sigma of so many rad, for so long, s. Half: joints overrule what was
 #: felt, double: they bound it later.
 LOOSE_RAD, LOOSE_S = 1.5e-3, 0.3
-#: Images in a row whose errors are alike, as markers fall on pixels alike: while windows are used, so many count as one.
-#: Half: attitudes are claimed twice as well as they are, double: speeds are learned later.
+#: Images in a row that count as one while windows are used; half: attitudes are claimed twice as well, double: late
+#: speeds.
 ALIKE = 5.0
 
 
@@ -111,9 +107,6 @@ class KalmanEstimator:
     """Fuses potentiometers and vision.
 
     Args:
-        arm: the arm, as its table says it is.
-        prior: how far it may be off.
-        delay: how late the camera's stamps are.
         learns_delay: whether the delay is corrected, as far as its sigma allows. If not, its sigma is used, and what the
             model misses of the backlash cannot be taken for delay; a clock that goes wrong is followed.
 
@@ -147,8 +140,7 @@ class KalmanEstimator:
         self.clock = None if learns_delay else ClockFollower(at.size, at.delay, delay.sigma_s)
         self._reference: Array | None = None
         self._waiting: list[PoseMeasurement | Taken | Until] = []
-        # The inertial unit, what was known without it, images and windows in a row against it, the one that they have
-        # rejected, and what became of the newest window.
+        # The inertial unit, what was known without it, what contradicts it in a row, and the newest window.
         no_reference: Reference | None = None
         self._unit: Strapdown | None = None
         self._without: Remembered | None = None
@@ -405,10 +397,7 @@ class KalmanEstimator:
         return by_state(self._model, state, t_s, joints, step)
 
     def smoothed(self, t_s: Array) -> Track:
-        """Return the poses of the tool at (N,) times, rising, with the measurements after them used, too: for the record.
-
-        Times newer than the newest measurement are as in :meth:`track`.
-        """
+        """Return the poses of the tool at (N,) times, rising, with the measurements after them used, too."""
         return self.blended(self.intervals(t_s))
 
     def intervals(self, t_s: Array) -> list[Interval]:
@@ -647,10 +636,7 @@ class KalmanEstimator:
     def _motion(
         self, x: Array, T: Array, by_state: Array, joints: Smoothed, t_s: float, inertial: bool
     ) -> tuple[ToolMotion, Array, Array]:
-        """Return how the tool moves by a state, and what the readings' noise makes of its twist and acceleration (6, 6).
-
-        The acceleration is the difference of the twists a little before and after; zero for references that do not ask.
-        """
+        """Return how the tool moves by a state, and what the readings' noise makes of its twist and acceleration (6, 6)."""
         by_speed = by_state[:, self._at.zeros] * self._arm.direction
         # The variance that a parabola leaves of its slope at its end is 192/(9 SPAN^2) of that of its value.
         moves = (

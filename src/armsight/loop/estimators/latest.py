@@ -13,13 +13,7 @@ from armsight.robot.kinematics.arm import Arm
 
 
 class LatestEstimator:
-    """Holds the newest measurement until the next; potentiometers alone before the first.
-
-    Args:
-        arm: the arm, as its table says it is.
-        prior: how far the arm may be off, for the covariance before the first measurement.
-        delay: how late the camera's stamps are.
-    """
+    """Holds the newest measurement until the next; potentiometers alone before the first."""
 
     def __init__(self, arm: Arm, *, prior: Prior | None = None, delay: Delay) -> None:
         self._arm, self._delay = arm, delay

@@ -58,10 +58,6 @@ class Mounting(Record):
         T_base_tool = T_base_rig T_rig_body T_tool_body^-1; with right tangents z of the first, b of the second and x of
         T_tool_body its own is Ad(T_tool_body) (Ad(T_rig_body^-1) z + b - x).
 
-        Args:
-            pose: where the body is in the rig.
-            t_s: the middle of the exposure as the camera stamps it, s.
-
         Raises:
             InputError: ``t_s`` is no number.
         """
@@ -108,20 +104,7 @@ def _carry(
     noise: Array,
     shared: Array,
 ) -> None:
-    """Write what :meth:`Mounting.pose_measurement` computes to T, noise and shared; the covariance common is used up.
-
-    Args:
-        T_rig_body: (4, 4) the measured pose.
-        cov_noise: (6, 6) its noise.
-        common: (6, 6) the rest of its covariance; that of the mounting is added.
-        T_base_rig: (4, 4) the mounting.
-        T_body_tool: (4, 4) the mounting.
-        to_tool: (6, 6) the adjoint of T_tool_body.
-        cov: (12, 12) covariance of the mounting.
-        T: (4, 4) of the tool.
-        noise: (6, 6) noise of the tool's pose.
-        shared: (6, 6) its covariance that all shots share.
-    """
+    """Write what :meth:`Mounting.pose_measurement` computes to T, noise and shared; the covariance common is used up."""
     by_mounting = np.zeros((6, 12))  # [Ad(T_rig_body^-1), -I]
     for i in range(3):
         for j in range(3):

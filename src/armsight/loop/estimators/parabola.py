@@ -10,11 +10,9 @@ import numpy as np
 from armsight.data import Array
 from armsight.kernels import kernel
 
-#: Readings within this time are smoothed together, s. The noise falls with its root; what a jerk of 60 rad/s^3 (most of
-#: table-top arms) leaves of error at its end is 60 * SPAN^3 / 120, here 6e-5 rad.
+#: Readings within this time are smoothed together, s; a jerk of 60 rad/s^3 leaves 6e-5 rad at its end.
 SPAN_S = 0.049
-#: Where as many follow as went before it is up to this, s: a centred parabola is not led astray by jerk. Of accelerations
-#: that leaves a sixth of the noise, and of what passes between two measurements, which hold the rest, a third.
+#: Where as many follow as went before it is up to this, s: jerk does not move a centred parabola.
 LONG_SPAN_S = 2 * SPAN_S
 #: Fewest readings for a parabola; fewer are averaged.
 PARABOLA = 5
@@ -38,11 +36,7 @@ def window(t: Array, first: int, count: int, at: float, length: float) -> tuple[
 
 @kernel
 def fit(t: Array, q: Array, low: int, high: int, at: float, motion: Array) -> float:
-    """Lay parabolas through rows low to high of q (N, n); write angles, speeds, accelerations at a time to motion (3, n).
-
-    Returns:
-        What is left of a reading's variance in the angles.
-    """
+    """Lay parabolas through rows low to high of q (N, n); write motion (3, n) at a time, return the variance left."""
     n = high - low + 1
     s1 = s2 = s3 = s4 = 0.0
     for k in range(low, high + 1):

@@ -23,18 +23,15 @@ from armsight.loop.estimators.backlash_dynamics import float_on, loose, masses
 from armsight.loop.estimators.parabola import LONG_SPAN_S, PARABOLA, SPAN_S, fit, span, window
 from armsight.robot.kinematics.arm import Arm
 
-#: A joint that shows no motion within this time around (or, where it is the newest, before) a time stands still there, s,
-#: and is averaged over it: the parabola's noise at its end is eight times the mean's.
+#: A joint that shows no motion within this time stands still, s, and is averaged over it.
 STILL_SPAN_S = 0.3
 #: What counts as motion, in standard deviations: of the two halves' means, and of parabola and mean.
 _MOTION = 3.0
 #: Readings kept, s.
 KEPT_S = 2.0
-#: Dead zone before a joint counts as moved, in standard deviations of a smoothed newest reading. Less, and noise changes
-#: the sides of narrow gaps; more, and the sides change late.
+#: Dead zone before a joint counts as moved, sigmas of a reading; half: noise changes sides, double: sides change late.
 _DEAD = 5.0
-#: Within the dead zone a joint's position settles to its readings with this time constant, s: slow corrections count as
-#: moves.
+#: Within the dead zone a joint's position settles to its readings with this time constant, s.
 _SETTLE_S = 0.3
 #: Travel over which a joint changes the side of its backlash until that is known, rad: the middle of what gears have.
 GAP_RAD = np.deg2rad(0.2)
@@ -44,9 +41,8 @@ MIN_GAP_RAD = np.deg2rad(0.05)
 _STILL = 4.0
 #: So often links float anew through the rows that are not settled yet, s.
 _AGAIN_S = 0.012
-#: Residuals of a parabola show motion that it does not follow (backlash that is crossed, a stop at once) where their sum
-#: of squares exceeds its mean by so many standard deviations, and that of their differences is less than so many times it:
-#: 2 is white noise, however large.
+#: Residuals show motion that no parabola follows where their squares exceed the mean by so many sigmas, and are no
+#: noise.
 _MISFIT, _WHITE = 4.0, 1.5
 #: The period that counts where a reading stands alone, s.
 _MIN_PERIOD_S = 1e-3
@@ -180,7 +176,6 @@ def _shortened(
 
     Those of parabolas over half of the span, a quarter of it and so on, and at last of a line between the two readings
     around the time. Speeds stay those of the whole span. Noise that residuals show is counted; ``noise`` (n,) becomes its
-    variance, in those of a reading.
     """
     noise[:] = 1.0
     low, high = window(t, first, count, at, length)
@@ -315,7 +310,6 @@ class Readings:
     """The last seconds of the potentiometers.
 
     Args:
-        sigma_rad: noise of one reading, rad.
         arm: whose joints they are.
         rounded_rad: what readings are rounded to where their noise does not exceed it, rad; 0: to nothing.
     """
@@ -339,11 +333,7 @@ class Readings:
 
     @property
     def span_s(self) -> tuple[float, float]:
-        """The oldest and the newest time kept, s.
-
-        Raises:
-            InputError: no reading has come yet.
-        """
+        """The oldest and the newest time kept, s."""
         if not self._count:
             raise InputError("the estimator has no potentiometer readings yet; give it joints() first")
         return float(self._t[self._first]), float(self._t[self._first + self._count - 1])
@@ -397,11 +387,7 @@ class Readings:
             self._gone_s, self._settled = self._t[end - 1], settled
 
     def at(self, t_s: Array) -> Smoothed:
-        """Return the joints at (N,) times within those kept.
-
-        Raises:
-            InputError: not within them.
-        """
+        """Return the joints at (N,) times within those kept."""
         oldest, newest = self.span_s
         at, n, j = np.array(t_s, dtype=float), len(t_s), self._joints
         one, sides, unseen, empty = (n, j), (n, 2, j), (n, 3, j), np.empty

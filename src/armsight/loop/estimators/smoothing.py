@@ -46,12 +46,7 @@ class Interval(NamedTuple):
 
 
 def intervals(states: list[ErrorState], t_s: Array) -> list[Interval]:
-    """Return times (N,), rising, grouped by the measurements around them.
-
-    Args:
-        states: the filter's, oldest first.
-        t_s: the times, s.
-    """
+    """Return times (N,), rising, grouped by the measurements around them."""
     ends = [state for state in states if state.pose_measurement is not None]
     at, found = np.searchsorted([state.t_s for state in ends], t_s), list[Interval]()
     for k in np.unique(at).tolist():
@@ -61,11 +56,7 @@ def intervals(states: list[ErrorState], t_s: Array) -> list[Interval]:
 
 
 def smoothed_back(states: list[ErrorState]) -> list[ErrorState]:
-    """Return states with the measurements after them used, as far as their steps are known (Bierman, 1973: by adjoints).
-
-    Args:
-        states: of a filter with an inertial unit, oldest first.
-    """
+    """Return states with the measurements after them used, as far as their steps are known (Bierman, 1973: by adjoints)."""
     found = list[ErrorState]()
     adjoint, information, steps = np.zeros(0), np.zeros((0, 0)), tuple[StateStep, ...]()
     for state in reversed(states):
@@ -98,13 +89,7 @@ def _before(step: StateStep, K: int, a: Array) -> Array:
 
 
 def blended(model: ErrorModel, readings: Readings, parts: list[Interval]) -> Track:
-    """Return the poses of the tool at the times of intervals, in their order.
-
-    Args:
-        model: the arm's.
-        readings: the potentiometers', which must still be kept.
-        parts: the intervals, one at least.
-    """
+    """Return the poses of the tool at the times of intervals, in their order."""
     tracks: list[Track] = []
     for inner, some in groupby(_merged(parts), lambda part: part.after is not None):
         if inner:

@@ -43,8 +43,7 @@ OPEN = 0.9
 #: The noise of a channel may be this many times less, or more, than was said.
 LEAST, MOST = 1e-3, 1e3
 
-#: Degree of the polynomial; half: corners are cut, by 2 % of the acceleration at 4.6 rad/s and 30 poses a second, double:
-#: noise of the acceleration ten times as large.
+#: Degree of the polynomial; half: corners are cut by 2 %, double: noise of the acceleration ten times as large.
 DEGREE = 5
 #: Poses that one is laid through at least, on both sides together, and the least span, s.
 LEAST_POSES, SPAN_S = 10, 0.08
@@ -297,11 +296,7 @@ class PosePath:
         return bool(inside and np.diff(self._t[max(low - 1, 0) : high + 1]).max(initial=0.0) <= GAP_S)
 
     def __call__(self, t_s: float) -> ToolMotion:
-        """Return the motion at a time, s.
-
-        Raises:
-            InputError: no poses around it.
-        """
+        """Return the motion at a time, s."""
         t = self._t
         k = int(np.searchsorted(t, t_s))
         low, high = max(k - LEAST_POSES // 2, 0), min(k + LEAST_POSES // 2, len(t))

@@ -37,7 +37,6 @@ class Distance(Reference):
         p_tool: (3,) the point that is measured, tool, m.
         offset: (A,) what each range reads beyond the scaled distance, m.
         scale: (A,) of each range, 1 where it is right.
-        names: of the anchors; empty: 1, 2, ...
     """
 
     anchors: Array
@@ -146,14 +145,8 @@ def follow_ranges(
 ) -> RangePath:
     """Follow a point by ranges.
 
-    Args:
-        anchors: where they are, with offset and scale.
-        t_s: (N,) times, s, rising.
-        channel: (N,) the anchor of each range.
-        z: (N,) ranges, m.
-        start: (3,) about where it begins, m.
-        noise: of the sensor and the body; None: ultra-wideband on something that drives.
-        upright: acceleration along z over that in the plane; 1 for what flies.
+    ``start``: (3,) about where it begins, m. ``noise``: of the sensor and the body; None: ultra-wideband on something
+    that drives. ``upright``: acceleration along z over that in the plane; 1 for what flies.
     """
     smoother = _Smoother(anchors, t_s, channel, z, start, upright)
     path, noise = None, noise or RangeNoise()

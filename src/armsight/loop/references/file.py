@@ -40,8 +40,7 @@ INERTIAL_COLUMNS = tuple(
     f"{sensor}_{axis}_{unit}" for sensor, unit in (("gyro", "rad_s"), ("accelerometer", "m_s2")) for axis in "xyz"
 )
 _MOST_MB = 200  # of a recording
-#: Numbers at the end of a message of ``sensor_msgs/Imu``: orientation, angular velocity and acceleration, each with its
-#: covariance (9); and where among them a reading stands.
+#: Numbers at the end of a ``sensor_msgs/Imu``, each with its covariance (9), and where among them a reading stands.
 _IMU_BYTES, _IMU_VALUES = 37 * 8, np.r_[13:16, 25:28]
 
 
@@ -50,10 +49,7 @@ class Entry(Record):
     """A reference of the file.
 
     Attributes:
-        reference: as far as the file knows it.
-        kind: of sensor.
         sensor_class: what it is like.
-        source: its recording; None where none is named.
         live: where it is read in a run; None where that is not said.
         rate_hz: readings a second, as the file says; None where it does not.
         calibrated: whether the file has its parameters.
@@ -143,11 +139,7 @@ def written(entry: Entry, folder: Path) -> str:
 
 
 def read_recording(path: Path) -> tuple[Array, Array]:
-    """Return times (N,), s, and values (N, 6) of an inertial unit: rad/s, then m/s2.
-
-    Raises:
-        InputError: the file, the line and what was expected.
-    """
+    """Return times (N,), s, and values (N, 6) of an inertial unit: rad/s, then m/s2."""
     if path.is_dir() or path.suffix.lower() in SUFFIXES:
         return _of_bag(Bag(path))
     columns = Columns.of_csv(path) if path.suffix.lower() not in (".jsonl", ".ndjson") else _json_lines(path)
@@ -165,11 +157,7 @@ def _of_bag(bag: Bag) -> tuple[Array, Array]:
 
 
 def reading_of(message: BagMessage) -> tuple[float, Array]:
-    """Return the time, s, and the reading (6,), rad/s and m/s2, of a message of ``sensor_msgs/Imu``.
-
-    Raises:
-        InputError: it is too short.
-    """
+    """Return the time, s, and the reading (6,), rad/s and m/s2, of a message of ``sensor_msgs/Imu``."""
     stamp = message.stamp_ns() or message.arrival_ns
     if len(message.data) < _IMU_BYTES:
         raise InputError(f"{message.topic}: message {message.index + 1} is cut short: {len(message.data)} bytes")

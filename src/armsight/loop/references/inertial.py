@@ -91,10 +91,8 @@ class Inertial(Reference):
     def of(name: str, kind: str = "mpu-6050", T_tool_sensor: Array | None = None) -> Inertial:
         """Return one of a class, nothing of it calibrated.
 
-        Args:
-            name: what people call it.
-            kind: of :data:`INERTIAL_CLASSES`.
-            T_tool_sensor: (4, 4) its mounting, roughly; None: unknown, the identity.
+        ``kind``: of :data:`INERTIAL_CLASSES`. ``T_tool_sensor``: (4, 4) its mounting, roughly; None: unknown, the
+        identity.
 
         Raises:
             InputError: no such class.

@@ -65,7 +65,6 @@ class Samples(Record):
     """Samples of an inertial unit, in order of time.
 
     Attributes:
-        t_s: (N,) when, s, as its clock stamps them; its delay is still in them.
         z: (N, 6) angular velocity, rad/s, and specific force, m/s2, as read.
         density: (6,) of their noise, per sqrt(Hz).
     """
@@ -136,10 +135,7 @@ def _raise_density(t: Array, z: Array, first: int, newest: int, end: float, out:
 
 @kernel("f8[::1], f8[:, ::1], i8, i8, f8, f8, f8[::1]")
 def _preintegrate(t: Array, z: Array, first: int, last: int, begin: float, end: float, out: Array) -> bool:
-    """Write a window, see :meth:`Strapdown.window`, of rows first to last of t (N,), z (N, 6), if complete.
-
-    The newest sample is held as row last + 1.
-    """
+    """Write a window, see :meth:`Strapdown.window`, of rows first to last of t (N,), z (N, 6), if complete."""
     R, a, b = np.eye(3), np.empty(6), np.empty(6)
     v, p, rotated = np.zeros(3), np.zeros(3), np.empty((3, 3))
     if last < first or begin < t[first] or end <= begin or end >= t[last] + HELD_S:
@@ -220,15 +216,8 @@ def _skew_times(a: Array, A: Array) -> Array:
 def _constraint(felt: Array, mount: Array, Ts: Array, y: Array, by: Array, by_y: Array, r: Array, noise: Array) -> None:
     """Write residual and velocity at the end (9,), and their noise (9, 9); derivatives by the tool's tangents, and by y.
 
-    Args:
-        felt: (34,) a window.
-        mount: (9, 3) rotation of the mounting; lever; up, and its derivative by the tilt, both times gravity.
-        Ts: (2, 4, 4) poses of the tool at begin and end.
-        y: (B,) velocity, delay, parameters.
-        by: (9, 12) to be written, zero.
-        by_y: (9, B) to be written, zero.
-        r: (9,) to be written.
-        noise: (9, 9) to be written, zero.
+    ``felt``: (34,) a window. ``mount``: (9, 3) rotation of the mounting; lever; up, and its derivative by the tilt,
+    both times gravity. ``by``: (9, 12) to be written, zero.
     """
     D, dv, dp, mean, change, density = felt[0], felt[10:13], felt[13:16], felt[16:22], felt[22:28], felt[28:34]
     M, lever, up = mount[:3], mount[3], mount[4]
@@ -334,10 +323,7 @@ def _advance(
     z: Array,
     S: Array,
 ) -> None:
-    """Overwrite x, P, y, C, Y by the state after a window; write gain (K + B, 6), D (9, K), by_y (9, B), residual and S.
-
-    Arguments are as for :meth:`Strapdown.advanced` and :func:`_constraint`.
-    """
+    """Overwrite x, P, y, C, Y by the state after a window; write gain, D, by_y, residual and S."""
     K, B = len(x), len(y)
     r, by, W, ends = np.empty(9), np.zeros((9, 12)), np.zeros((9, 9)), np.zeros((6, K))
     D[:] = by_y[:] = 0.0
@@ -423,11 +409,7 @@ def _subtract(
 
 
 class Strapdown:
-    """An inertial unit's samples of the last seconds, and how they bear on the filter.
-
-    Args:
-        sensor: the unit, as its calibration says; the mounting must be known.
-    """
+    """An inertial unit's samples of the last seconds, and how they bear on the filter."""
 
     def __init__(self, sensor: Inertial) -> None:
         self.sensor, self._density = sensor, np.zeros(6)
@@ -489,12 +471,7 @@ class Strapdown:
     def started(self, before: Navigated | None, t_s: float, T: Array, twist: Array, rows: int) -> Navigated:
         """Return velocity and parameters where a window begins and the velocity is known by the joints alone.
 
-        Args:
-            before: what was known; None: nothing.
-            t_s: when, s.
-            T: (4, 4) pose of the tool.
-            twist: (6,) its motion by the joints, tool axes.
-            rows: of the arm's state, K.
+        ``T``: (4, 4) pose of the tool. ``rows``: of the arm's state, K.
         """
         size = _PARAMETERS + len(self.sensor.cov)
         y, C, Y = np.zeros(size), np.zeros((rows, size)), np.zeros((size, size))

@@ -54,9 +54,6 @@ class StreamCheck(Record):
 
     Attributes:
         rate_hz: readings a second, by the median period.
-        jitter_s: spread of the periods: half the width of their middle 68 %, s.
-        gaps: pauses.
-        longest_gap_s: the longest pause, s.
         doubled: share of the rows that repeat the row before.
         frozen_s: the longest time in which no column changed, s.
         saturated: columns that stand at their greatest or least value for a while, and no coarse step apart from the next.
@@ -85,7 +82,6 @@ class Settling(NamedTuple):
         stops: after which a vibration was seen.
         frequency_hz: of it.
         damping: of critical.
-        amplitude_m: of the displacement right after the stop.
         time_s: from the stop until the amplitude is below ``SETTLED_M``.
     """
 
@@ -98,11 +94,6 @@ class Settling(NamedTuple):
 
 def check_stream(t_s: Array, z: Array, source: str) -> StreamCheck:
     """Return what a stream is like.
-
-    Args:
-        t_s: (N,) times, s.
-        z: (N, k) values.
-        source: its file, for messages.
 
     Raises:
         InputError: too short, no numbers, or times that run backwards.

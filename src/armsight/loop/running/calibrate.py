@@ -115,12 +115,7 @@ class VisitedPose(Record):
 
 
 def find_mounting(loop: Loop, q_start: Array, targets: Array, progress: Progress) -> HandEyeRun:
-    """Visit joint angles (N, n), rad, from where the arm stands (n,), measure the body at rest, calibrate hand and eye.
-
-    Raises:
-        CalibrationError: too few poses were seen.
-        DeviceError: the board or a camera failed.
-    """
+    """Visit joint angles (N, n), rad, from where the arm stands (n,), measure the body at rest, calibrate hand and eye."""
     visited: list[VisitedPose] = []
     missed: list[str] = []
     rows: list[slice] = []
@@ -153,11 +148,7 @@ def _again(visited: VisitedPose, shots: Sequence[Seen]) -> VisitedPose:
 
 
 def visit(loop: Loop, q_from: Array, q_to: Array, name: str) -> VisitedPose | Missed:
-    """Move from joint angles (n,), rad, to others, and measure the body at rest; ``name`` is the pose's in the log.
-
-    Raises:
-        DeviceError: the board or a camera failed.
-    """
+    """Move from joint angles (n,), rad, to others, and measure the body at rest; ``name`` is the pose's in the log."""
     way, log, setup = point_to_point(loop.setup.arm, q_from, q_to), loop.log, loop.setup
     settle_s = SETTLE_S + 2.0 * setup.board.abilities.latency_s
     loop.go(way, settle_s, RunSegment("calibration", name, "joints"), watch=False)
@@ -173,11 +164,7 @@ def visit(loop: Loop, q_from: Array, q_to: Array, name: str) -> VisitedPose | Mi
 
 
 def handeye_of(arm: Arm, visited: Sequence[VisitedPose], missed: tuple[str, ...], quick: bool = False) -> HandEyeRun:
-    """Calibrate hand and eye of a nominal arm from four poses at least; ``missed``: where the body was not, and why.
-
-    Raises:
-        CalibrationError: the motions leave a direction open, or the arm's table is grossly wrong.
-    """
+    """Calibrate hand and eye of a nominal arm from four poses at least; ``missed``: where the body was not, and why."""
     q = np.array([each.q for each in visited])
     Ts_left_body, cov = np.array([each.T_left_body for each in visited]), np.array([each.cov for each in visited])
     require_fitting(arm, q, Ts_left_body)
@@ -190,10 +177,6 @@ def find_delay(loop: Loop, q_start: Array, q_middle: Array) -> Delay:
     """Sweep the joints about a pose (n,), rad, where the arm then stands; estimate the images' delay and the shutters.
 
     The loop's mounting is known; its shutters and its delay are set.
-
-    Raises:
-        CalibrationError: the sweep does not determine the delay.
-        DeviceError: the board or a camera failed.
     """
     arm, log = loop.setup.arm, loop.log
     way = point_to_point(arm, q_start, q_middle)

@@ -53,8 +53,7 @@ from armsight.vision.markers.calibrated_board import is_print
 from armsight.vision.pose.shutter import Motion, TimedShot, measure_with_motion
 from armsight.vision.rig import Shutters, StereoRig
 
-#: How long one thread may hold the interpreter lock, s. An iteration of the loop takes the lock back about twelve times;
-#: with Python's default of 5 ms it would last longer than a board waits for commands.
+#: How long one thread may hold the interpreter lock, s: an iteration takes it about twelve times.
 SWITCH_S = 2e-4
 _Result = TypeVar("_Result")
 
@@ -75,10 +74,7 @@ def beside(work: Callable[[], _Result], meanwhile: Callable[[Callable[[], bool]]
 
 
 class Watch:
-    """Measures shots in a thread: a search of the whole image takes longer than the loop may pause.
-
-    :meth:`take` waits ``patience_s`` for a result, s; a later one is returned in the next iteration.
-    """
+    """Measures shots in a thread: a search of the whole image takes longer than the loop may pause."""
 
     def __init__(self, measure: Callable[[Shot], PoseEstimate | Missed], patience_s: float) -> None:
         self._measure, self._patience_s = measure, patience_s
@@ -133,16 +129,13 @@ def steady(*, in_time: bool) -> Iterator[None]:
 STALLED_S = 0.5
 #: Upper bound of the time to search an image for the body, on a computer under load, s.
 SEARCH_S = 2.0
-#: What a search of two images takes in a simulation, s: on hardware it takes 0.02 to 0.06 and commands continue beside it
-#: (:class:`Watch`); so they do in lock-step, where no time passes during a computation.
+#: What a search of two images takes in a simulation, s: on hardware 0.02 to 0.06, and commands continue beside it.
 SIMULATED_SEARCH_S = 0.06
-#: Lag of the fused track, s: by then the pose measurements before and after a time have arrived, even where the body was
-#: hidden for half a second. The loop does not wait for them: it uses the live track.
+#: Lag of the fused track, s: measurements about a time have arrived then, even of a body hidden for half a second.
 RECORD_LAG_S = 0.6
 _RECORD_EVERY_S = 0.02  # interval of the fused track that is noted at once: cheaper than every iteration
 _WRITE_EVERY_S = 0.1  # interval that is computed at once, after a command was sent: cheaper still
-#: The motion of the body about an exposure is a cubic through the newest live estimates so near to it, s. Their errors are
-#: correlated for longer than that: the scatter about the cubic shows this share of them.
+#: Live estimates within so long, s, make the body's motion about an exposure; their scatter shows this share of errors.
 _MOTION_S, _SCATTER_SHARE = 0.03, 0.25
 #: Searches for the sync LED before it is given up, two steps each, and the longest time for them, s.
 _LED_TRIES, _LED_S = 4, 60.0
@@ -158,7 +151,6 @@ class Loop:
     """Runs controllers on a board, with cameras.
 
     The constructor receives nothing; :meth:`open` returns a loop that has its first reading. It takes a setup, what
-    measures the body, the log to append to, and what estimates the pose of the tool.
     """
 
     def __init__(self, setup: Setup, follower: Follower, log: Log, estimator: KalmanEstimator) -> None:
@@ -195,8 +187,8 @@ class Loop:
         self._fixed_work: Future[None] | None = None
         self._fixed_s = self._health_s = -np.inf
         self._health_notes = HealthNotes()
-        # Of the fused track: the time up to which its intervals are noted, the time up to which it is computed, the noted
-        # intervals that are not computed yet, and the times of the readings that are not all noted.
+        # Of the fused track: up to when intervals are noted, and computed; those noted alone; readings that are not
+        # noted.
         self._noted_s = self._written_s = -np.inf
         self._noted: list[Interval] = []
         self._read = deque[Array]()
@@ -212,11 +204,7 @@ class Loop:
     def open(
         cls, setup: Setup, follower: Follower, log: Log, estimator: KalmanEstimator, publisher: Publisher | None = None
     ) -> Loop:
-        """Return a loop that has received the first joint reading; arguments as for the class, and a publisher.
-
-        Raises:
-            DeviceError: the board sends none.
-        """
+        """Return a loop that has received the first joint reading; arguments as for the class, and a publisher."""
         loop = cls(setup, follower, log, estimator)
         loop.publisher = publisher or Fanout()
         while not log.joints:
@@ -424,18 +412,7 @@ class Loop:
         return shot
 
     def run(self, controller: Controller, duration_s: float, segment: RunSegment, *, watch: bool = True) -> None:
-        """Let a controller command the joints for some time, s; the segment is logged with its times.
-
-        Args:
-            controller: computes the commands.
-            duration_s: how long, s.
-            segment: the entry of the log.
-            watch: whether shots are measured.
-
-        Raises:
-            DeviceError: the board left the enabled state (the message has its faults), the cameras stalled, or a device
-                was disconnected.
-        """
+        """Let a controller command the joints for some time, s; the segment is logged with its times."""
         begin_s = self.t_s
         self._iterate(controller, lambda: self.t_s - begin_s >= duration_s - 1e-9, segment, watch=watch)
 
@@ -526,10 +503,7 @@ class Loop:
             self._fixed_work = self._fixed_pool.submit(look)
 
     def _follow_rig(self) -> None:
-        """Put the rig right once the evidence suffices; on hardware that is computed in a thread.
-
-        Not while that thread measures fixed bodies: their poses are of one rig, and go to the watch of that rig.
-        """
+        """Put the rig right once the evidence suffices; on hardware that is computed in a thread."""
         if self._fixed_work is not None and not self._fixed_work.done():
             return
         if self._rig_work is not None and self._rig_work.done():
@@ -580,10 +554,7 @@ class Loop:
         self._measure_fixed = [measurer(rig, each) for each in self.setup.fixed]
 
     def put_cameras_right(self) -> bool:
-        """Put the cameras right before anything depends on their poses; return whether poses in the log were measured anew.
-
-        All poses since the cameras moved are measured again, and nothing needs to be doubted: the tests begin anew.
-        """
+        """Put the cameras right before anything depends on their poses; return whether logged poses were measured anew."""
         watch = None if self.rig_follower is None else self.health.cameras_moved()
         since_s = None if watch is None else watch.moved_since_s()
         if self.rig_follower is None or since_s is None:

@@ -50,9 +50,6 @@ class HostClock:
     arrives quickly restores it. How fast they drift is the slope of the line under all minima of the last ``_WINDOW_S``
     that is highest in their middle (Moon, Skelly and Towsley, "Estimation and removal of clock skew from network delay
     measurements", 1999), so that a host that is busy for seconds does not move the offset by as much as any clock drifts.
-
-    Args:
-        now: the host's clock, s; the one that stamps the images.
     """
 
     def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
@@ -93,11 +90,7 @@ class HostClock:
         return float(np.clip(rate + _SCATTER_S / (t_s[-1] - t_s[0]), -DRIFT, DRIFT))
 
     def on_board(self, shot: Shot) -> Shot:
-        """Return a shot with its time on the board's clock; a reading must have been heard before.
-
-        Raises:
-            DeviceError: no live camera stamped it, by this computer's clock.
-        """
+        """Return a shot with its time on the board's clock; a reading must have been heard before."""
         if shot.t_s is None and shot.problem is not None:
             return shot
         t_s = shot.t_s if shot.t_s is not None and math.isfinite(shot.t_s) else None
@@ -165,13 +158,7 @@ class FusedRow:
 class Fused:
     """A unit in an estimator.
 
-    Args:
-        entry: its table.
-        source: where its readings come from.
-        losses: what is lost of them, and how often; a thread of the source may add to it.
-
     Attributes:
-        entry: as given.
         windows: used so far, outliers included.
         outliers: of them.
         impacts: times of those, s: what was felt within the 40 ms before, the joints do not explain; together within
@@ -272,11 +259,7 @@ class Fused:
 
 
 def recorded(entry: Entry) -> Fused:
-    """Return a unit whose readings are those of its recording.
-
-    Raises:
-        InputError: it is not calibrated, or its recording cannot be read.
-    """
+    """Return a unit whose readings are those of its recording."""
     if not entry.calibrated or entry.source is None:
         lacks = "source" if entry.calibrated else "parameters"
         raise InputError(
@@ -295,11 +278,7 @@ def recorded(entry: Entry) -> Fused:
 
 
 def the_one(entries: list[Entry], where: object) -> Entry:
-    """Return the one reference that is fused.
-
-    Raises:
-        InputError: there are several.
-    """
+    """Return the one reference that is fused."""
     first, *others = entries
     if others:
         raise InputError(
@@ -330,13 +309,7 @@ class Setup:
 
 
 class LiveShots:
-    """Reads a source in a thread and keeps the newest shot, so that the control loop never waits for a camera.
-
-    Nothing is read before :meth:`start`.
-
-    Args:
-        source: the cameras; :meth:`close` closes them.
-    """
+    """Reads a source in a thread and keeps the newest shot, so that the control loop never waits for a camera."""
 
     def __init__(self, source: Source) -> None:
         self._source = source
@@ -390,11 +363,7 @@ class LiveShots:
         return rate if _RATES_HZ[0] <= rate <= _RATES_HZ[1] else None
 
     def poll(self) -> Shot | None:
-        """Return the newest shot not returned yet, or None.
-
-        Raises:
-            DeviceError: a camera was disconnected, or the source has ended.
-        """
+        """Return the newest shot not returned yet, or None."""
         with self._lock:
             shot, self._newest = self._newest, None
         if shot is None and self._failure is not None:
