@@ -51,6 +51,8 @@ class Info:
     K: np.ndarray
     R: np.ndarray
     P: np.ndarray
+    binning: tuple = (0, 0)
+    roi: tuple = (0, 0, 0, 0)
 
 
 @dataclass
@@ -159,9 +161,9 @@ def _ros_message(store, sent, ros1):
         return types[kind](header, h, w, encoding, 0, image.nbytes // h, image.view(np.uint8).ravel()), kind
     if isinstance(what, Info):
         kind = "sensor_msgs/msg/CameraInfo"
-        roi = types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
+        roi = types["sensor_msgs/msg/RegionOfInterest"](*what.roi, False)
         arrays = [np.asarray(x, float).ravel() for x in (what.D, what.K, what.R, what.P)]
-        return types[kind](header, what.size[1], what.size[0], what.model, *arrays, 0, 0, roi), kind
+        return types[kind](header, what.size[1], what.size[0], what.model, *arrays, *what.binning, roi), kind
     if isinstance(what, Joints):
         none = np.zeros(0)
         kind = "sensor_msgs/msg/JointState"

@@ -441,6 +441,28 @@ def test_camera_info_of_a_stereo_pair_is_the_rig(tmp_path, container, model):
         bag_rig(Bag(alone))
 
 
+@pytest.mark.parametrize("container", ["ros1", "mcap"])
+def test_camera_info_of_a_window_of_the_sensor_is_of_its_images(tmp_path, container):
+    """Its matrices are of the whole sensor, images of its window (x, y, height, width), binned."""
+    rig = ordinary_rig("brown5")
+    R1, R2, P1, P2, _ = rectification(rig)
+    sent = [Sent(f"/stereo/{side}/camera_info", EPOCH_NS, info(camera, R, P))
+            for side, camera, R, P in (("left", rig.left, R1, P1), ("right", rig.right, R2, P2))]  # fmt: skip
+    sent[0].content.binning, sent[0].content.roi = (2, 2), (100, 40, 400, 800)
+    sent[1].content.binning = (4, 2)
+    found = open_rig(f"bag:{write_bag(tmp_path / 'a', container, sent)}")
+    width, height = rig.right.image_size_px
+    assert [camera.image_size_px for camera in found.cameras] == [(400, 200), (width // 4, height // 2)]
+    np.testing.assert_allclose(found.T_left_right, rig.T_left_right, atol=1e-12)
+    points = np.array([[0.1, 0.05, 1.0], [-0.2, 0.1, 1.5], [0.0, -0.1, 0.8]])
+    np.testing.assert_allclose(found.left.project(points), (rig.left.project(points) - [100, 40]) / 2, atol=1e-9)
+    np.testing.assert_allclose(found.right.project(points), rig.right.project(points) / [4, 2], atol=1e-9)
+    assert any("binned 2 x 2" in note for note in found.provenance["notes"])
+    sent[0].content.roi = (100, 40, 4000, 800)
+    with pytest.raises(InputError, match="no window of its"):
+        open_rig(f"bag:{write_bag(tmp_path / 'b', container, sent)}")
+
+
 def test_joints_and_transforms_are_streams(tmp_path):
     names = ["b", "a"]
     static = pose(exp_so3(np.array([0.1, 0.2, 0.3])), np.array([0.0, 0.0, 0.5]))

@@ -144,7 +144,33 @@ def _read_one(document: Document, options: ImportOptions) -> tuple[Camera, Array
     T_rect_camera, said = rigid(R, -np.linalg.solve(P[:, :3], P[:, 3]), "rectification_matrix")
     if not word:
         said.append("no distortion_model; plumb_bob assumed, as ROS does")
-    return camera, T_rect_camera, notes + said
+    camera, windowed = _windowed(camera, document)
+    return camera, T_rect_camera, notes + said + windowed
+
+
+def _windowed(camera: Camera, document: Document) -> tuple[Camera, list[str]]:
+    """Return the camera of the images that a driver publishes, a window of the sensor (roi) and binned, and a note.
+
+    A camera_info's size and matrices are those of the sensor's whole image (sensor_msgs/CameraInfo); the window comes off
+    first, then the principal point is divided by the binning, as image_geometry does. R and the pose stay.
+    """
+    roi = found(document, ("roi",)) or {}
+    keys, (width, height) = ("x_offset", "y_offset", "width", "height"), camera.image_size_px
+    numbers = [found(document, ("binningx",)), found(document, ("binningy",)), *(roi.get(key) for key in keys)]
+    whole = [int(number or 0) for number in numbers]
+    binning, offset, size = np.maximum(whole[:2], 1), np.array(whole[2:4]), np.array(whole[4:])
+    size = np.where(size > 0, size, camera.image_size_px)
+    if (binning == 1).all() and not offset.any() and (size == (width, height)).all():
+        return camera, []
+    if min(whole) < 0 or (offset + size > (width, height)).any():
+        raise InputError(f"roi {roi} is no window of its {width} x {height} px, or binning is negative")
+    fxy, centre = camera.intrinsics[:2] / binning, (camera.intrinsics[2:] - offset) / binning
+    width_px, height_px = (int(number) for number in size // binning)
+    note = (
+        f"its images are {width_px} x {height_px} px: the window of {size[0]} x {size[1]} at ({offset[0]}, {offset[1]}), "
+        f"binned {binning[0]} x {binning[1]}, of a sensor of {width} x {height}"
+    )
+    return Camera((width_px, height_px), camera.model, np.hstack([fxy, centre]), camera.distortion), [note]
 
 
 def _matrix_of(document: Document, key: str, shape: tuple[int, int]) -> Array:

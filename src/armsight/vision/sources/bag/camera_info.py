@@ -65,7 +65,11 @@ def _document(message: Decoded) -> dict[str, Foreign]:
         values = getattr(message, name) if hasattr(message, name) else getattr(message, name.lower())
         return [float(value) for value in values]
 
+    roi = getattr(message, "roi", None)
     return {
+        "binning_x": int(getattr(message, "binning_x", 0)),
+        "binning_y": int(getattr(message, "binning_y", 0)),
+        "roi": {key: int(getattr(roi, key, 0)) for key in ("x_offset", "y_offset", "width", "height")},
         "image_width": int(message.width),
         "image_height": int(message.height),
         "distortion_model": _MODELS.get(str(message.distortion_model), str(message.distortion_model)),
