@@ -37,11 +37,14 @@ from armsight import firmware  # noqa: E402
 from armsight.app.board.selftest import DRIVEN, BoardTestRig  # noqa: E402
 from armsight.firmware import build  # noqa: E402
 from armsight.firmware.elf import read_elf  # noqa: E402
-from armsight.robot.board_registry import configured, open_emulator  # noqa: E402
+from armsight.robot.board_registry import configured  # noqa: E402
 from armsight.robot.boards.configuration import gains_array, lab_configuration  # noqa: E402
 from armsight.robot.boards.emulated import EmulatedLink  # noqa: E402
-from armsight.robot.boards.qemu import PROGRAM  # noqa: E402
-from armsight.robot.boards.unicorn import UnicornEmulator  # noqa: E402
+from armsight.robot.boards.emulators import (  # noqa: E402
+    PROGRAM,
+    UnicornEmulator,
+    open_emulator,
+)
 from armsight.sim.joints import JointPlant  # noqa: E402
 from board_faults import LINK_TICKS, Campaign, limits  # noqa: E402
 

@@ -32,9 +32,9 @@ import numpy as np  # noqa: E402
 from armsight.app.board.bringup import Bringup  # noqa: E402
 from armsight.data import JointCommand  # noqa: E402
 from armsight.errors import ArmsightError  # noqa: E402
-from armsight.robot.board_registry import open_emulator  # noqa: E402
 from armsight.robot.boards.board import Board  # noqa: E402
 from armsight.robot.boards.emulated import EmulatedLink  # noqa: E402
+from armsight.robot.boards.emulators import open_emulator  # noqa: E402
 from armsight.robot.boards.frames import ANSWER  # noqa: E402
 from armsight.sim.boards.workshop import WorkshopPerson, drawn_workshop, swapped  # noqa: E402
 from armsight.sim.joints import COUNTS_PER_RAD, ZERO_COUNTS  # noqa: E402

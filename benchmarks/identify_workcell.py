@@ -23,8 +23,9 @@ from armsight.loop.identify.identify import identify
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.plan import plan_joints
 from armsight.robot.arm_file import open_arm
-from armsight.robot.board_registry import configured, open_emulator
+from armsight.robot.board_registry import configured
 from armsight.robot.boards.emulated import EmulatedLink
+from armsight.robot.boards.emulators import open_emulator
 from armsight.robot.kinematics.arm import Arm
 from armsight.robot.trajectories import point_to_point
 from armsight.sim.workcell.arm import imperfections, sample_arm

@@ -16,7 +16,7 @@ from _pytest.runner import runtestprotocol
 from hypothesis import settings
 
 from armsight.errors import DeviceError, InputError
-from armsight.robot.board_registry import open_emulator
+from armsight.robot.boards.emulators import open_emulator
 from made_once import begin, made_once
 
 ROOT = Path(__file__).resolve().parent.parent

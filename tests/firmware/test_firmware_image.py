@@ -13,7 +13,7 @@ from armsight import firmware
 from armsight.errors import DeviceError, InputError
 from armsight.firmware import build
 from armsight.firmware.elf import read_elf
-from armsight.robot.board_registry import open_emulator
+from armsight.robot.boards.emulators import open_emulator
 
 #: What every board's linker script keeps free for the stack.
 STACK_BYTES = 8 * 1024

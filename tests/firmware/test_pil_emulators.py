@@ -12,7 +12,7 @@ from armsight.app.board.selftest import DRIVEN, run_scenario
 from armsight.errors import DeviceError, InputError
 from armsight.firmware import build
 from armsight.firmware.elf import read_elf
-from armsight.robot.board_registry import open_emulator
+from armsight.robot.boards.emulators import open_emulator
 
 #: What a small Cortex-M4F has; the board's linker script gives the image no more.
 FLASH_BYTES, RAM_BYTES = 64 * 1024, 32 * 1024

@@ -6,9 +6,10 @@ import pytest
 from armsight.data import Missed, Shot
 from armsight.loop.estimators import Delay
 from armsight.loop.sync_led import Brightness, SyncLedWatch, code, estimate_sync, led_findings, light, with_led
-from armsight.robot.board_registry import configured, open_emulator
+from armsight.robot.board_registry import configured
 from armsight.robot.boards.configuration import lab_configuration, pin_number
 from armsight.robot.boards.emulated import EmulatedLink
+from armsight.robot.boards.emulators import open_emulator
 from armsight.sim.joints import JointPlant
 from armsight.vision.rig import Shutters
 

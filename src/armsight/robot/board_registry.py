@@ -2,17 +2,16 @@
 
 ``,baud=N`` behind a port is its baud rate, where that is not its kind's; FILE.json is LeRobot's calibration of the servos.
 
-Here is the registry of the emulators that run our firmware, and of the arms that keep their own controller.
+Here is the registry of the arms that keep their own controller.
 :func:`open_board` opens a board with our firmware, whose gains and configuration can be changed;
 :func:`open_motion_board` any that moves an arm.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
-from armsight import firmware
 from armsight.errors import InputError
 from armsight.robot.boards.ar4 import board as ar4_board
 from armsight.robot.boards.ar4.board import Ar4Board
@@ -21,36 +20,15 @@ from armsight.robot.boards.board import Board
 from armsight.robot.boards.configuration import Configuration, lab_configuration
 from armsight.robot.boards.contract import MotionBoard
 from armsight.robot.boards.emulated import EmulatedLink
+from armsight.robot.boards.emulators import EMULATORS, open_emulator
 from armsight.robot.boards.feetech import board as feetech_board
 from armsight.robot.boards.feetech import bus as feetech_bus
 from armsight.robot.boards.feetech.board import FeetechBoard
 from armsight.robot.boards.feetech.bus import ServoBus
 from armsight.robot.boards.feetech.calibration import read_calibration
-from armsight.robot.boards.host import HostEmulator
-from armsight.robot.boards.link import Emulator, Plant
-from armsight.robot.boards.qemu import QemuEmulator
+from armsight.robot.boards.link import Plant
 from armsight.robot.boards.serial import BAUD, SerialLink, require_port
-from armsight.robot.boards.unicorn import UnicornEmulator
 from armsight.robot.kinematics.arm import Arm
-
-#: Name -> what opens the emulator of a file, and the file the package carries for it.
-EMULATORS: Mapping[str, tuple[Callable[[Path], Emulator], Callable[[], Path]]] = {
-    "unicorn": (UnicornEmulator.open, firmware.image),
-    "qemu": (QemuEmulator.open, firmware.image),
-    "host": (HostEmulator.open, firmware.host_library),
-}
-
-
-def open_emulator(name: str, image: Path | None = None) -> Emulator:
-    """Start an emulator with a fresh board, on the package's image (for host: library) or another one.
-
-    InputError: there is none, or what it needs is not installed. DeviceError: the firmware was not built.
-    """
-    if name not in EMULATORS:
-        raise InputError(f"no emulator {name!r}; there are {', '.join(EMULATORS)}")
-    make, built = EMULATORS[name]
-    return make(image or built())
-
 
 EMULATED, SERIAL = "emulated:", "serial:"
 FEETECH, AR4 = "feetech:", "ar4:"

@@ -11,9 +11,8 @@ from armsight.app.board import selftest as board_selftest
 from armsight.app.board.flash import FLASHED, PROGRAMMERS
 from armsight.app.board.selftest import DRIVEN
 from armsight.firmware import build, host_library
-from armsight.robot.board_registry import EMULATORS
 from armsight.robot.boards.codes import BoardState, Fault
-from armsight.robot.boards.host import HostEmulator
+from armsight.robot.boards.emulators import EMULATORS, HostEmulator
 from cli_runs import assert_rejected
 
 HOST = ("--board", "emulated:host")

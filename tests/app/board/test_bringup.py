@@ -16,12 +16,12 @@ from armsight.app.board.bringup import Bringup, TerminalOperator
 from armsight.app.board.command import command
 from armsight.app.board.found import Found, JointFound
 from armsight.errors import DeviceError, InputError
-from armsight.robot.board_registry import open_emulator
 from armsight.robot.boards.board import Board
 from armsight.robot.boards.board_file import read_configuration
 from armsight.robot.boards.codes import Reaction, SensorKind
 from armsight.robot.boards.configuration import check_configuration, gains_array
 from armsight.robot.boards.emulated import EmulatedLink
+from armsight.robot.boards.emulators import open_emulator
 from armsight.robot.boards.identification import dead_spots, fit_swing
 from armsight.sim.boards.workshop import Wiring, WorkshopPerson, drawn_encoders, drawn_workshop, swapped
 from armsight.sim.encoders import EncodedPlant, EncoderFault

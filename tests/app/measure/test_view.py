@@ -19,7 +19,7 @@ from armsight.geometry.pose import inverse, transform
 from armsight.geometry.rotation import euler_zyx, exp_so3
 from armsight.vision.discs.bias import expect
 from armsight.vision.markers.targets import open_body
-from armsight.vision.pose.locate_discs import locate_composite
+from armsight.vision.pose.measure import locate_composite
 from armsight.vision.pose.shot_pose import ShotPose, shot_pose
 from armsight.vision.rig import StereoRig
 from cli_runs import assert_rejected

@@ -10,12 +10,13 @@ from armsight.app.run.motion_file import QUICK, read_motions
 from armsight.data import JointCommand
 from armsight.errors import DeviceError, InputError
 from armsight.robot.arm_file import open_arm
-from armsight.robot.board_registry import configured, open_emulator
+from armsight.robot.board_registry import configured
 from armsight.robot.boards.board import Board
 from armsight.robot.boards.codes import BoardState, Fault, Reaction
 from armsight.robot.boards.configuration import lab_configuration
 from armsight.robot.boards.contract import Abilities
 from armsight.robot.boards.emulated import EmulatedLink
+from armsight.robot.boards.emulators import open_emulator
 from armsight.sim.joints import JointPlant, PotFault
 
 ARM = open_arm("six_r")

@@ -14,7 +14,7 @@ from firmware_pil import Host
 from armsight import firmware
 from armsight.errors import InputError
 from armsight.firmware.elf import read_elf
-from armsight.robot.board_registry import open_emulator
+from armsight.robot.boards.emulators import open_emulator
 
 RETURN = 0x3FFE0
 STACKED = 26 * 4 + 8

@@ -13,11 +13,12 @@ import pytest
 from armsight.data import JointCommand
 from armsight.errors import DeviceError
 from armsight.firmware import dialect
-from armsight.robot.board_registry import configured, open_emulator
+from armsight.robot.board_registry import configured
 from armsight.robot.boards import serial
 from armsight.robot.boards.board_file import configuration_text
 from armsight.robot.boards.configuration import CONFIG, CONFIG_VERSION
 from armsight.robot.boards.emulated import EmulatedLink
+from armsight.robot.boards.emulators import open_emulator
 from armsight.sim.joints import JointPlant
 
 

@@ -6,11 +6,11 @@ from board_rigs import ScriptedLink, Speaker, hold, host_board, keep_on
 
 from armsight.data import JointCommand
 from armsight.errors import DeviceError, InputError
-from armsight.robot.board_registry import open_emulator
 from armsight.robot.boards.board import Board
 from armsight.robot.boards.codes import BoardState, Command, ConfigSource, Fault, Limited, Rejection
 from armsight.robot.boards.configuration import CONFIG, gains_array, lab_configuration
 from armsight.robot.boards.emulated import EmulatedLink
+from armsight.robot.boards.emulators import open_emulator
 from armsight.sim.joints import JointPlant, PotFault
 
 ZERO = np.zeros(6)

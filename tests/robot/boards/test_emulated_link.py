@@ -5,10 +5,11 @@ import pytest
 from board_rigs import hold, host_board
 
 from armsight.errors import DeviceError, InputError
-from armsight.robot.board_registry import EMULATORS, configured, open_board, open_emulator
+from armsight.robot.board_registry import configured, open_board
 from armsight.robot.boards.board import Board
 from armsight.robot.boards.codes import BoardState, Fault
 from armsight.robot.boards.emulated import EmulatedLink
+from armsight.robot.boards.emulators import EMULATORS, open_emulator
 from armsight.robot.boards.frames import ANSWER, ANSWER_MAGIC, REQUEST, REQUEST_MAGIC, VERSION
 from armsight.sim.joints import JointPlant
 

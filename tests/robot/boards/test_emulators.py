@@ -9,13 +9,10 @@ from firmware_build import board_image
 
 from armsight.errors import DeviceError, InputError
 from armsight.firmware import build
-from armsight.robot.board_registry import open_emulator
-from armsight.robot.boards import qemu
+from armsight.robot.boards import emulators
 from armsight.robot.boards.emulated import EmulatedLink
+from armsight.robot.boards.emulators import HostEmulator, QemuEmulator, UnicornEmulator, open_emulator
 from armsight.robot.boards.frames import ANSWER, REQUEST
-from armsight.robot.boards.host import HostEmulator
-from armsight.robot.boards.qemu import QemuEmulator
-from armsight.robot.boards.unicorn import UnicornEmulator
 from armsight.sim.joints import JointPlant
 
 COMPILERS = ("zig", "gcc")
@@ -64,8 +61,8 @@ def test_a_missing_qemu_is_reported(monkeypatch, images):
 
 
 def test_an_emulation_that_ends_is_reported_with_its_own_text(tmp_path):
-    if not shutil.which(qemu.PROGRAM):
-        pytest.skip(f"{qemu.PROGRAM} is not installed")
+    if not shutil.which(emulators.PROGRAM):
+        pytest.skip(f"{emulators.PROGRAM} is not installed")
     broken = tmp_path / "none.elf"
     broken.write_bytes(b"\x7fELF nothing more")
     emulator = QemuEmulator.open(broken)

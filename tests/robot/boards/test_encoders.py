@@ -9,11 +9,12 @@ from board_rigs import written
 
 from armsight.data import JointCommand
 from armsight.errors import ArmsightError, InputError
-from armsight.robot.board_registry import configured, open_emulator
+from armsight.robot.board_registry import configured
 from armsight.robot.boards.board_file import configuration_text, read_configuration
 from armsight.robot.boards.codes import Command, Fault, SensorKind
 from armsight.robot.boards.configuration import lab_configuration
 from armsight.robot.boards.emulated import EmulatedLink
+from armsight.robot.boards.emulators import open_emulator
 from armsight.robot.boards.reports import BoardAbilities
 from armsight.sim.encoders import EncodedPlant, EncoderFault, Encoders
 from armsight.sim.joints import JointPlant, drawn_model

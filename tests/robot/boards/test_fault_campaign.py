@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from armsight.robot.board_registry import open_emulator
+from armsight.robot.boards.emulators import open_emulator
 from armsight.robot.boards.frames import ANSWER, REQUEST
 
 PATH = Path(__file__).resolve().parents[3] / "benchmarks" / "board_faults.py"

@@ -11,7 +11,7 @@ from armsight.data import Correspondences
 from armsight.geometry.pose import exp_se3, inverse, log_se3, pose, transform
 from armsight.geometry.rotation import exp_so3
 from armsight.vision.discs.bias import bias_normals, centred, expect, visible
-from armsight.vision.pose.locate_discs import locate_discs
+from armsight.vision.pose.measure import locate_discs
 from asserts import assert_jacobian
 from disc_rims import disc_ellipses
 from disc_views import PLATE, SHAPE_NOISE, discs_of, hd_rig, someplace, views

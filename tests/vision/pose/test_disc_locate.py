@@ -13,8 +13,7 @@ from armsight.geometry.rotation import euler_zyx, exp_so3
 from armsight.vision.discs.bias import expect
 from armsight.vision.markers.targets import Composite
 from armsight.vision.pose.locate import locate
-from armsight.vision.pose.locate_discs import locate_composite, locate_discs
-from armsight.vision.pose.measure import measure
+from armsight.vision.pose.measure import locate_composite, locate_discs, measure
 from armsight.vision.triangulate import triangulate
 from disc_views import PLATE, SIZE, discs_of, hd_rig, someplace, views
 from views import both_pixels

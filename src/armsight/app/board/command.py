@@ -284,9 +284,10 @@ def bringup(
     from armsight.app.show.page import writable_folder
     from armsight.app.show.plotting import require_matplotlib
     from armsight.files import check_folder
-    from armsight.robot.board_registry import SERIAL, emulator_name, open_emulator
+    from armsight.robot.board_registry import SERIAL, emulator_name
     from armsight.robot.boards.board import Board
     from armsight.robot.boards.emulated import EmulatedLink
+    from armsight.robot.boards.emulators import open_emulator
     from armsight.sim.boards.workshop import WorkshopPerson, drawn_encoders, drawn_workshop
 
     def echo(line: str) -> None:

@@ -21,11 +21,12 @@ from armsight import firmware
 from armsight.data import Array, JointCommand
 from armsight.errors import ArmsightError, DeviceError
 from armsight.firmware.elf import read_elf
-from armsight.robot.board_registry import SERIAL, configured, emulator_name, open_emulator, serial_port
+from armsight.robot.board_registry import SERIAL, configured, emulator_name, serial_port
 from armsight.robot.boards.board import Board
 from armsight.robot.boards.codes import BoardState, Command, Fault, Rejection
 from armsight.robot.boards.configuration import JOINTS, gains_array
 from armsight.robot.boards.emulated import EmulatedLink
+from armsight.robot.boards.emulators import open_emulator
 from armsight.robot.boards.link import Emulator, Link
 from armsight.robot.boards.serial import BAUD, SerialLink
 from armsight.sim.joints import JointPlant, PotFault

@@ -9,5 +9,5 @@ In: a board's name (``emulated:unicorn``, ``emulated:qemu``, ``emulated:host``, 
 - ``wire``: messages over a link; ``codes``, ``configuration``, ``reports``: what their numbers mean;
 - ``link``: the contracts of a link, of an emulator and of the plant at an emulated board's motors;
 - ``serial``: the link to a real board; ``emulated``: the link to an emulated one, ``frames`` its memory layout;
-- ``unicorn``, ``qemu``, ``host``: the emulators that run the firmware.
+- ``emulators``: what runs the firmware on this computer.
 """

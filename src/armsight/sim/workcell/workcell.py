@@ -21,10 +21,11 @@ from armsight.errors import InputError
 from armsight.geometry.pose import exp_se3, pose, transform
 from armsight.geometry.rotation import exp_so3
 from armsight.robot.arm_file import open_arm
-from armsight.robot.board_registry import configured, open_emulator, slowed
+from armsight.robot.board_registry import configured, slowed
 from armsight.robot.boards.configuration import JOINTS
 from armsight.robot.boards.contract import MotionBoard
 from armsight.robot.boards.emulated import EmulatedLink
+from armsight.robot.boards.emulators import open_emulator
 from armsight.robot.boards.link import TICK_S
 from armsight.robot.kinematics.arm import Arm
 from armsight.sim.camera.stages import CameraPipeline

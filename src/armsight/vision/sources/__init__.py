@@ -4,8 +4,7 @@ The contract is in ``vision/source.py``; :func:`open_source` opens a spec.
 
 - Recordings: ``folder.py``, ``pairs.py`` (two globs of images), ``video.py``, ``bag/`` (of ROS and Foxglove),
   ``lerobot.py``.
-- Live cameras: ``usb.py``, ``url.py``, with ``timing.py`` (pairing by time stamp) and ``capture.py`` (OpenCV's
-  capture).
+- Live cameras: ``usb.py``, ``url.py``, with ``capture.py`` (OpenCV's capture, pairing by time stamp).
 - ``v4l2.py``: the attached cameras and their formats, for ``armsight cameras``.
 """
 
