@@ -19,11 +19,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "loop"
 
 from worn_arm import poses, worn
 
-from armsight.app.identify.run import MANY, run_identify
+from armsight.app.identify.run import run_identify
 from armsight.loop.identify.identify import identify
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.read import read_poses
-from armsight.loop.identify.validate import validate
+from armsight.loop.identify.validate import MANY, validate
 from armsight.robot.arm_file import open_arm
 from identify_handeye import eth_pairs, kuka2
 from identify_worn import UNSEEN, worn_arms

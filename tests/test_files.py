@@ -16,6 +16,7 @@ from armsight.errors import InputError
 from armsight.files import (
     RowFile,
     alone_in,
+    check_folder,
     check_readable,
     check_writable,
     read_json,
@@ -270,6 +271,25 @@ def test_rows_are_in_their_file_whole_or_not_at_all(tmp_path):
     rows.add(["z", None])
     rows.close()
     assert (path.read_text(), rows.rows) == ('a,b\n"x,y",1.5\nz,\n', 2)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows keeps a file that is open")
+def test_rows_for_a_file_that_was_deleted_are_an_error(tmp_path):
+    rows = RowFile(tmp_path / "poses.csv", ("a",))
+    rows.add((1,))
+    rows.path.unlink()
+    with pytest.raises(InputError, match=r"poses\.csv: cannot be written: it was deleted meanwhile"):
+        rows.add((2,))
+    assert rows.rows == 1
+
+
+@pytest.mark.parametrize("name", ["table.csv", "Report.HTML"])
+def test_a_folder_of_results_has_no_files_name(tmp_path, name):
+    with pytest.raises(InputError, match="several files come of it; give a folder, such as"):
+        check_folder(tmp_path / name)
+    (tmp_path / name).mkdir()
+    assert check_folder(tmp_path / name) == tmp_path / name
+    assert check_folder(tmp_path / "v1.2") == tmp_path / "v1.2"
 
 
 def test_tables_are_read_as_cells(tmp_path):

@@ -186,6 +186,7 @@ def test_pictures_to_a_rig_to_a_table(boards):
     again = armsight.read_pose_table(boards / "poses.csv")
     np.testing.assert_allclose(again.Ts, [each.T_left_body for each in table], atol=1e-9)
     assert table.to_pandas()["x_m"].tolist() == columns["x_m"].tolist()
+    assert table.to_pandas("mm")["x_mm"].tolist() == table.columns("mm")["x_mm"].tolist()
     one = measure(rig, open_target(BOARD), open_source(str(boards / "board"))[0])
     np.testing.assert_allclose(one.position_mm, 1e3 * np.array([columns[f"{axis}_m"][0] for axis in "xyz"]), atol=1e-9)
     for name in SHARED:

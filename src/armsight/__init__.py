@@ -44,9 +44,10 @@ if TYPE_CHECKING:
     from armsight.loop.handeye.handeye import HandEye
     from armsight.loop.handeye.handeye import calibrate_handeye as handeye
     from armsight.loop.identify.corrected import Corrected, open_corrected
-    from armsight.loop.identify.identify import Identified, identify
+    from armsight.loop.identify.identify import Identified
     from armsight.loop.identify.measured import Measured
     from armsight.loop.identify.read import read_poses
+    from armsight.loop.identify.validate import identify_held_out as identify
     from armsight.loop.identify.validate import validate
     from armsight.robot.arm_file import open_arm
     from armsight.robot.kinematics.arm import Arm
@@ -122,12 +123,12 @@ _HOME = {
     "Follower": "armsight.vision.follow.follower",
     **dict.fromkeys(("HandEye", "handeye"), "armsight.loop.handeye.handeye"),
     **dict.fromkeys(("Corrected", "open_corrected"), "armsight.loop.identify.corrected"),
-    **dict.fromkeys(("Identified", "identify"), "armsight.loop.identify.identify"),
+    "Identified": "armsight.loop.identify.identify",
     "Measured": "armsight.loop.identify.measured",
     "read_poses": "armsight.loop.identify.read",
     "read_pose_table": "armsight.tables.poses",
     "time_between": "armsight.loop.delay",
-    "validate": "armsight.loop.identify.validate",
+    **dict.fromkeys(("identify", "validate"), "armsight.loop.identify.validate"),
     "open_arm": "armsight.robot.arm_file",
     "open_board": "armsight.vision.markers.board",
     **dict.fromkeys(("open_body", "open_target"), "armsight.vision.markers.targets"),
@@ -137,7 +138,7 @@ _HOME = {
     "open_source": "armsight.vision.sources",
 }
 #: Public name -> its name at home, where they differ.
-_THERE = {"handeye": "calibrate_handeye"}
+_THERE = {"handeye": "calibrate_handeye", "identify": "identify_held_out"}
 
 
 def __getattr__(name: str) -> Any:  # noqa: ANN401 - a module's names are of any type

@@ -78,6 +78,7 @@ def opened(path: str | Path, most_mb: float | None = None) -> IO[bytes]:
 
 
 #: Not to wait for the other end of a pipe, nor become the owner of a terminal.
+_FILES = frozenset((".csv", ".html", ".json", ".mcap", ".parquet", ".pdf", ".png", ".toml", ".tum", ".txt", ".xlsx"))
 _AT_ONCE = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0)
 
 
@@ -410,6 +411,8 @@ class RowFile:
             try:
                 if os.write(self._file, data) < len(data):
                     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+                if not os.fstat(self._file).st_nlink:
+                    raise OSError(errno.ENOENT, "it was deleted meanwhile")
             except OSError:
                 with contextlib.suppress(OSError):
                     os.ftruncate(self._file, self._whole)
@@ -417,7 +420,7 @@ class RowFile:
         self._whole += len(data)
 
     def add(self, cells: Sequence[object]) -> None:
-        """Append a row."""
+        """Append a row; InputError where the disk is full, where the rows before stay, or the file was deleted."""
         self._append(cells)
         self.rows += 1
 
@@ -539,6 +542,8 @@ def check_folder(
     """Return a folder, ``~`` expanded, if files can be written to it, before long work; a missing one is not made."""
     _check_name(path)
     folder = Path(path).expanduser()
+    if folder.suffix.lower() in _FILES and not os.path.lexists(folder):
+        raise InputError(f"-o {path}: {problem}: several files come of it; give a folder, such as {folder.stem}")
     try:
         whole = Path(os.path.abspath(folder))  # a/../b is b, also where there is no a yet
         there = next(p for p in (whole, *whole.parents) if os.path.lexists(p))

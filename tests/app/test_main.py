@@ -22,6 +22,8 @@ from strategies import ordinary_rig
     [
         (("nothing",), ["no such command 'nothing'", "armsight -h"]),
         (("calibrte",), ["no such command 'calibrte': did you mean calibrate?"]),
+        (("hub", "nothere"), ["no such command 'nothere'; known are clocks, hold, keys, push"]),
+        (("rig", "poses.png"), ["no such command 'poses.png'; known are export, import, show, update"]),
         (("arm", "shw", "ur3"), ["no such command 'shw': did you mean show?", "armsight arm -h"]),
         (("arm", "show", "ur33"), ["arm 'ur33' is unknown: did you mean ur3", "known are"]),
         (("identify", "poses.csv"), ["no such command 'poses.csv': a file follows an option, --data poses.csv"]),

@@ -18,6 +18,9 @@ def test_columns_are_read_under_other_names(tmp_path):
     assert read_columns(None, ("a",)) == {}
     with pytest.raises(InputError, match=r"table\.csv: line 1: no column 'J3' for q2_rad; there are J1, J2, x_m, X"):
         Columns.of_csv(path, {"q2_rad": "J3"})
+    known = [f"q{k}_{unit}" for k in range(1, 8) for unit in ("rad", "deg")]
+    with pytest.raises(InputError, match=r"'q3_grad'; known are q3_rad, [^,]+, [^,]+, [^,]+, \S+ and 9 more$"):
+        read_columns("q3_grad=J3", known)
     for text, said in (
         ("q1_rad", "expected NAME=COLUMN"),
         ("q9=J9", "unknown name 'q9'; known are q1_rad"),

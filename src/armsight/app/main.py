@@ -157,7 +157,7 @@ def _run(arguments: list[str], at_exit: list[Callable[[int, str], None]]) -> tup
         return code if isinstance(code, int) else 0, ""
     except (click.exceptions.Abort, KeyboardInterrupt) as error:
         if isinstance(error.__context__, EOFError):
-            return 2, UNANSWERED
+            return 2, f"{UNANSWERED}, or with --yes where there is one"
         click.echo("armsight: interrupted", err=True)
         return 130, ""
     except click.exceptions.NoArgsIsHelpError as error:  # a group by itself: its help
@@ -200,7 +200,7 @@ def _meant(name: str, context: click.Context) -> str:
     options = [option.opts[0] for option in context.command.params if isinstance(option.type, click.Path)]
     if options and ("." in name or os.sep in name):
         return f": a file follows an option, {options[0]} {name}"
-    return ""
+    return f"; known are {', '.join(known)}" if context.parent is not None else ""
 
 
 def _meant_extra(extra: list[str], context: click.Context) -> str:

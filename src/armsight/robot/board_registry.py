@@ -126,7 +126,7 @@ def emulator_name(name: str) -> str:
         raise InputError(
             f"{name} keeps its own controller: it has no gains, no configuration and no self-test of armsight's firmware"
         )
-    emulator = name.removeprefix(EMULATED)
+    emulator = name.removeprefix(EMULATED) or next(iter(EMULATORS))
     if not name.startswith(EMULATED) or emulator not in EMULATORS:
         known = ", ".join(f"{EMULATED}{each}" for each in EMULATORS)
         own = " and ".join(f"{kind}{follows}" for kind, follows in OWN_CONTROLLERS.items())

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from armsight.errors import InputError
+from armsight.errors import InputError, nearest
 from armsight.files import DECIMAL_COMMA, TABLE_MB, natural_key, read_table, read_text
 from armsight.tables.lengths import NUMBER, number
 from armsight.tables.nested import BY_COUNT, PACKED, document_rows, is_document, is_packed
@@ -91,7 +91,7 @@ def read_columns(text: str | None, known: Collection[str]) -> Mapping[str, str] 
         if name == "_" and in_order:
             name = f"_{len(columns)}"
         elif name not in known:
-            raise InputError(f"--columns {text}: unknown name {name!r}; known are {', '.join(known)}")
+            raise InputError(f"--columns {text}: unknown name {name!r}; known are {nearest(name, known)}")
         if name in columns or theirs in columns.values():
             raise InputError(f"--columns {text}: {part} repeats a name")
         columns[name] = theirs
@@ -286,7 +286,7 @@ def renamed(path: Path, head: list[str], columns: Mapping[str, str] | Sequence[s
         return list(columns or head)
     for name, theirs in columns.items():
         if theirs not in head:
-            raise InputError(f"{path}: line {line}: no column {theirs!r} for {name}; there are {', '.join(head)}")
+            raise InputError(f"{path}: line {line}: no column {theirs!r} for {name}; there are {nearest(theirs, head)}")
     given = {theirs: name for name, theirs in columns.items()}
     return [given.get(name, f"({name})" if name in columns else name) for name in head]
 

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from armsight.data import Array
-from armsight.errors import InputError
+from armsight.errors import InputError, nearest
 from armsight.files import is_long, long_rows, read_table
 from armsight.geometry.rotation import nearest_rotation
 from armsight.tables.cells import Rows, renamed
@@ -261,7 +261,7 @@ class Columns:
         """Raise an InputError where a column is missing; those that are there count as used."""
         for name in names:
             if name not in self.at:
-                raise InputError(f"{self.path}: line 1: column {name} is missing; there are {', '.join(self.at)}")
+                raise InputError(f"{self.path}: line 1: column {name} is missing; there are {nearest(name, self.at)}")
         self.used.update(names)
 
     def texts(self, name: str) -> list[str]:

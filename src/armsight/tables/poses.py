@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array, Record
-from armsight.errors import InputError
+from armsight.errors import InputError, nearest
 from armsight.files import columns_unused
 from armsight.geometry.pose import pose
 from armsight.tables.cells import Cells, Rows, read_cells, read_columns
@@ -106,7 +106,7 @@ def read_pose_table(
     q = table.joints(names) if names else None
     if only_joints and q is None:
         raise InputError(
-            f"{path}: line 1: no joint angles: q1_deg .. or q1_rad .. are needed; there are {', '.join(table.at)}"
+            f"{path}: line 1: no joint angles: q1_deg .. or q1_rad .. are needed; there are {nearest('q1_deg', table.at)}"
         )
     nothing = np.zeros((len(table.rows), 0))
     numbers, written, convention, unit_m, of_joints = nothing, nothing, "", 1.0, False
@@ -237,7 +237,7 @@ def _suffix(table: Columns) -> str:
         )
     raise InputError(
         f"{table.path}: line 1: no positions: x_m y_m z_m or x_mm y_mm z_mm are needed, or, with --model, joints q1_rad .. "
-        f"or q1_deg ..; there are {', '.join(list(table.at)[:10])}: --columns x_m=NAME,... gives yours"
+        f"or q1_deg ..; there are {nearest('x_m', table.at)}: --columns x_m=NAME,... gives yours"
     )
 
 

@@ -18,14 +18,15 @@ from identify_files import arm_toml, poses_csv, tracked_csv
 from scipy.spatial.transform import Rotation
 from worn_arm import worn
 
+import armsight
 from armsight.app.identify.report import headline
 from armsight.errors import InputError
 from armsight.geometry.pose import pose
 from armsight.loop.identify.corrected import Corrected
+from armsight.loop.identify.identify import Errors, Validation
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.model import Model
 from armsight.loop.identify.read import read_measured, read_poses
-from armsight.loop.identify.validate import Errors, Validation
 from armsight.robot.arm_file import open_arm, read_arm_toml
 from armsight.robot.models import MODELS
 from cli_runs import assert_rejected, run, said_of
@@ -235,7 +236,7 @@ def test_a_wrong_file_to_validate_with_is_rejected_before_the_fit(tmp_path, caps
     def never(*arguments, **options):
         raise AssertionError("fitted before the file was looked at")
 
-    monkeypatch.setattr("armsight.app.identify.run.identify", never)
+    monkeypatch.setattr("armsight.loop.identify.validate.identify", never)
     answer = said(capsys, "--arm", "six_r", "--data", data, "--validate", other)
     assert_rejected(answer, str(other), said_of_it)
     missing = said(capsys, "--arm", "six_r", "--data", data, "--validate", tmp_path / "none.csv")
@@ -410,3 +411,6 @@ def test_sigmas_known_to_be_too_small_are_said_first_and_widened(tmp_path, capsy
     assert f"are {over:.2f} times as large as predicted" in note
     sigmas = [{p["name"]: p["sigma"] for p in run.lines[0]["parameters"]} for run in (plain, wide)]
     assert sigmas[1]["a2"] == pytest.approx(over * sigmas[0]["a2"])
+    found = armsight.identify(armsight.open_arm("six_r"), read_poses(data), other=read_poses(loud))
+    assert found.value("a2")[1] == pytest.approx(sigmas[1]["a2"])  # one computation for both
+    assert found.held_out.scale == pytest.approx(over)

@@ -8,6 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from worn_arm import distance_m, poses, truth_of, worn
 
+import armsight
 from armsight.errors import CalibrationError, InputError
 from armsight.estimate.select import Folds
 from armsight.geometry.pose import inverse, log_se3
@@ -377,9 +378,10 @@ def test_another_arm_is_reported(scene):
 def test_wrong_arguments_are_named_and_what_was_read_is_taken(scene):
     w, measured, found, _ = scene
     for call, words in (
-        (lambda: identify("ur10", measured), r'arm is a str; expected open_arm\("ur10"\)'),
-        (lambda: identify(w.nominal, "poses.csv"), r'poses is a str; expected read_poses\("poses.csv"\)'),
-        (lambda: validate(w.nominal, measured), "identified is a Arm"),
+        (lambda: armsight.identify("ur10", measured), r'arm is a str; expected open_arm\("ur10"\)'),
+        (lambda: armsight.identify(w.nominal, "poses.csv"), r'measured is a str; expected read_poses\("poses.csv"\)'),
+        (lambda: armsight.identify(w.nominal, measured, other=1), "other is a int"),
+        (lambda: validate(w.nominal, measured), "found is a Arm"),
     ):
         with pytest.raises(InputError, match=words):
             call()

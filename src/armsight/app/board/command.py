@@ -62,7 +62,7 @@ _board = click.option(
     default="emulated:unicorn",
     show_default=True,
     metavar="BOARD",
-    help="emulated:unicorn, emulated:qemu, emulated:host, serial:PORT, feetech:PORT[,LEROBOT.json] or ar4:PORT; ,baud=N "
+    help="emulated: (unicorn, qemu or host behind it), serial:PORT, feetech:PORT[,LEROBOT.json] or ar4:PORT; ,baud=N "
     "behind a port.",
 )
 _compiler = click.option("--compiler", metavar="NAME", help="zig or gcc; by default the first one that is installed.")

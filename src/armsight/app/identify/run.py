@@ -6,27 +6,17 @@ In: the nominal arm and measured poses. Out: an :class:`Identification`, whose R
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import chdtri
 
 from armsight.data import Array, Record
-from armsight.errors import CalibrationError, InputError
-from armsight.loop.identify.identify import ALIKE, Identified, identify
-from armsight.loop.identify.measured import Measured, visits
-from armsight.loop.identify.misread import check_plausible, find_step, without_tool
-from armsight.loop.identify.model import Model
-from armsight.loop.identify.placement import with_placement
-from armsight.loop.identify.validate import MIN_POSES, Errors, Validation, errors, require_alike, validate
+from armsight.loop.identify.identify import ALIKE, Identified, Validation
+from armsight.loop.identify.measured import Measured
+from armsight.loop.identify.misread import find_step, without_tool
+from armsight.loop.identify.validate import identify_held_out
 from armsight.robot.kinematics.arm import Arm
 
-#: Parts of the poses that are left out one after the other without others to validate with; with more than MANY, one.
-FOLDS, MANY = 5, 500
-#: Residuals of poses left out that chance makes so large with this probability only show that the sigmas are too small.
-TOO_SMALL = 1e-3
-#: Few poses to validate with that are further from the nominal arm than this, m, are not of it: no arm is so inaccurate.
-FAR_M = 0.1
 #: What is written.
 FILES = ("corrected.toml", "corrected.urdf", "zeros.toml", "parameters.csv", "identify.json", "report.html")
 
@@ -62,77 +52,17 @@ def run_identify(
     ``other``: poses to validate with; None: parts of ``measured`` are left out, one after the other. ``other_name``:
     what an error calls these: their file. ``priors``: as in :func:`identify`.
     """
-    if other is not None:
-        try:
-            _check_other(arm, measured, other)
-        except InputError as error:
-            raise InputError(f"{other_name}: {error}") from None
-    found = identify(arm, measured, priors=priors, progress=progress)
-    if other is not None:
-        held_out, poses = validate(found, other), other.q
-        how = f"{len(other)} poses of another file"
-        how += ", base and tool fitted anew" if held_out.placement_refitted else ""
-    else:
-        held_out, poses, how = _left_out(arm, measured.rows(found.solution.used), priors, progress)
-        how += f", {len(found.left_out)} taken for mistakes apart" if len(found.left_out) else ""
+    found = identify_held_out(arm, measured, other=other, priors=priors, progress=progress, other_name=other_name)
+    held_out = found.held_out
+    assert held_out is not None  # it is evaluated
     said = _notes(arm, found, measured, lines)
-    over, numbers = held_out.residual_over_predicted, len(poses) * measured.size
-    if over**2 > chdtri(numbers, TOO_SMALL) / numbers:
-        found = replace(found, cov=over**2 * found.cov)
+    if held_out.scale > 1:
         said.insert(
             0,
-            f"residuals of poses left out are {over:.2f} times as large as predicted: the arm does something that the "
-            f"model does not know; all sigmas are made {over:.2f} times as large",
+            f"residuals of poses left out are {held_out.scale:.2f} times as large as predicted: the arm does something "
+            f"that the model does not know; all sigmas are made {held_out.scale:.2f} times as large",
         )
-    return Identification(arm, measured, found, held_out, poses, how, lines, (*said, *notes))
-
-
-def _check_other(arm: Arm, measured: Measured, other: Measured) -> None:
-    """Reject poses to validate with that cannot be of the arm, before anything is fitted.
-
-    Fewer than MIN_POSES are evaluated in the set-up of ``measured``.
-    """
-    require_alike(other, measured.points, measured.R_rig_body is not None)
-    if len(other) >= MIN_POSES:
-        try:
-            check_plausible(without_tool(arm), other)
-        except InputError as error:
-            raise InputError(f"the poses to validate with: {error}") from None
-        return
-    check_plausible(without_tool(arm), measured)  # or its placement means nothing
-    model, x = with_placement(Model.of(without_tool(arm), measured, backlash=False).with_features(()), measured)
-    off = float(np.median(errors(model, x, other).position_m))
-    if off > FAR_M:
-        raise InputError(
-            f"the {len(other)} poses to validate with are {1e3 * off:.0f} mm from where the arm reaches at their angles: "
-            f"other joints, or another set-up, for which {MIN_POSES} poses are needed"
-        )
-
-
-def _left_out(
-    arm: Arm, measured: Measured, priors: Mapping[str, float] | None, progress: Callable[[str], None]
-) -> tuple[Validation, Array, str]:
-    """Identify without a part of the poses, and validate on it; with few poses once for every part."""
-    which = visits(measured.q)
-    shuffled = np.random.default_rng(0).permutation(int(which.max()) + 1)
-    parts = [np.flatnonzero(np.isin(which, part)) for part in np.array_split(shuffled, min(FOLDS, len(shuffled)))]
-    tried, done = parts if len(measured) <= MANY else parts[:1], []
-    for i, part in enumerate(tried, 1):
-        progress(f"error on poses left out, part {i} of {len(tried)}")
-        try:
-            others = measured.rows(np.setdiff1d(np.arange(len(which)), part))
-            done.append(validate(identify(arm, others, priors=priors), measured.rows(part)))
-        except (InputError, CalibrationError) as error:
-            raise CalibrationError(f"too few poses to leave a fifth of them out: {error}") from None
-    over = float(np.sqrt(np.mean([v.residual_over_predicted**2 for v in done])))
-    nominal, identified = (
-        Errors(*map(np.concatenate, zip(*each, strict=True)))
-        for each in ([v.nominal for v in done], [v.identified for v in done])
-    )
-    rows, again = np.concatenate(tried), len(which) - len(shuffled)
-    how = f"{len(rows)} poses left out" + (" in five rounds" if len(tried) > 1 else " of the fit")
-    how += f", {again} of them visits of another's pose, with which they are left out" if again else ""
-    return Validation(nominal, identified, False, over), measured.q[rows], how
+    return Identification(arm, measured, found, *held_out[:3], lines, (*said, *notes))
 
 
 def _notes(arm: Arm, found: Identified, measured: Measured, lines: Array) -> list[str]:

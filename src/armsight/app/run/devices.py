@@ -257,7 +257,7 @@ def open_devices(devices: Devices) -> Iterator[Setup]:
         if source.startswith(SIM):
             from armsight.sim.workcell.workcell import Workcell
 
-            emulator = "unicorn" if board == EMULATED else emulator_name(board)
+            emulator = emulator_name(board)
             cameras = source.removeprefix(SIM) or _SIM_CAMERAS
             led = devices.sync_led
             workcell = stack.enter_context(
@@ -270,9 +270,10 @@ def open_devices(devices: Devices) -> Iterator[Setup]:
         shots = LiveShots(open_source(source))
         stack.callback(shots.close)
         shots.start()
-        rate_hz = shots.rate_hz()  # before the board is opened: what it says meanwhile would pile up
-        if rate_hz is None:
-            click.echo(f"note: the times of the shots show no rate of the cameras: {_RATE_HZ:g} Hz is taken", err=True)
+        rate_hz, stamped = shots.rate_hz()  # before the board is opened: what it says meanwhile would pile up
+        if not stamped:
+            taken = f"{_RATE_HZ:g} Hz is taken" if rate_hz is None else f"they come at {rate_hz:.1f} Hz, which is taken"
+            click.echo(f"note: the times of the shots show no rate of the cameras: {taken}", err=True)
         opened = stack.enter_context(open_motion_board(board))
         require_joints(opened, board, devices.arm)
         bit_s = sync_led_bit_s(opened, f"--board {board}") if devices.sync_led else None

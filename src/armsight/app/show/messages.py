@@ -20,7 +20,7 @@ UNTRUSTED = 3
 
 
 #: What is wrong where a question is asked and the standard input is closed.
-UNANSWERED = "nobody answers, as the standard input is closed: run it at a terminal, or with --yes where there is one"
+UNANSWERED = "nobody answers, as the standard input is closed: run it at a terminal"
 
 
 @dataclass(frozen=True)

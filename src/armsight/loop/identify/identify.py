@@ -9,16 +9,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array, Record
-from armsight.errors import CalibrationError, InputError, require
+from armsight.errors import CalibrationError, InputError, nearest
 from armsight.geometry.pose import left_jacobian
 from armsight.loop.identify.fit import Mask, Solution, covariance, fit, joint_noise, prior_sigma, with_joint_noise
-from armsight.loop.identify.measured import Measured, Read, measured_of
+from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.misread import check_plausible, without_tool
 from armsight.loop.identify.model import PLENTY, SENSOR, Model, Parameter
 from armsight.loop.identify.observable import Observed, observed
@@ -35,6 +35,48 @@ ROUNDS = 3  # rounds of fitting everything and attributing what is left to the j
 POSES = 300  # over which the tool's displacement is averaged; half, double: its sigma is 4%, 2% uncertain
 CORRELATED = 0.9  # correlations larger than this are reported
 _TABLE = ("offset", "d", "a", "alpha", "beta")
+
+
+class Errors(NamedTuple):
+    """Distances between the predicted and the measured tool."""
+
+    position_m: Array  #: (N, K) of every point
+    angle_rad: Array  #: (N,) of the body's rotation; empty with points only
+
+    def summary(self) -> dict[str, float]:
+        """Return mean_m, rms_m and max_m, and of full poses also mean_rad, rms_rad and max_rad."""
+        out: dict[str, float] = {}
+        for name, e in (("m", self.position_m), ("rad", self.angle_rad)):
+            if e.size:
+                out |= {f"mean_{name}": float(e.mean()), f"rms_{name}": float(np.sqrt(np.mean(e**2)))}
+                out[f"max_{name}"] = float(e.max())
+        return out
+
+
+class Validation(NamedTuple):
+    """Nominal and identified arm on one set of poses."""
+
+    nominal: Errors  #: errors of the nominal arm, its base and tool fitted to the same poses as the identified one's
+    identified: Errors  #: errors of the identified arm
+    placement_refitted: bool  #: whether base and tool were fitted to these very poses
+    residual_over_predicted: float  #: RMS residual over the predicted sigma; 1 where the sigmas are honest
+
+    def __repr__(self) -> str:
+        """Return the mean errors of both arms, mm, and whether the sigmas are honest."""
+        mean, nominal = (1e3 * float(each.position_m.mean()) for each in (self.identified, self.nominal))
+        return (
+            f"Validation({len(self.identified.position_m)} poses: {mean:.3f} mm mean, nominal arm {nominal:.3f} mm; "
+            f"residual over sigma {self.residual_over_predicted:.2f})"
+        )
+
+
+class LeftOut(NamedTuple):
+    """How an identified arm does on poses that it was not fitted to."""
+
+    validation: Validation  #: nominal and identified arm on those
+    q: Array  #: (H, n) their joint angles, rad
+    how: str  #: which poses those are, as text
+    scale: float = 1.0  #: by how much their residuals made all sigmas larger; 1 where chance explains them
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +99,7 @@ class Identified(Record):
             moved.
         joint_sigma_rad: (n,) scatter of each joint from pose to pose, rad; zero where the instrument's covariance is
             not known, because the joints' and the instrument's share cannot be separated then.
+        held_out: how it does on poses left out; None where none were.
     """
 
     model: Model
@@ -70,13 +113,15 @@ class Identified(Record):
     cov_everything: Array
     moved: Array
     joint_sigma_rad: Array
+    held_out: LeftOut | None = None
 
     def __repr__(self) -> str:
         """Return how many numbers were fitted, and from how many poses."""
         used, free, weak = self.solution.used, self.solution.free, undetermined(*self.moved_all_over())
+        left_out = self.held_out and f"; left out: {self.held_out.validation!r}"
         return (
             f"Identified({self.model.arm.name}, {int(free.sum())} of {len(free)} numbers fitted, {int(used.sum())} of "
-            f"{len(used)} poses used{weak and f'; {weak}'}; columns() lists them, armsight.validate tests them on others)"
+            f"{len(used)} poses used{weak and f'; {weak}'}{left_out or ''}; columns() lists them)"
         )
 
     def __str__(self) -> str:
@@ -101,7 +146,7 @@ class Identified(Record):
             InputError: the arm has no such parameter.
         """
         if name not in self.model.names:
-            raise InputError(f"{self.model.arm.name} has no parameter {name}; it has {', '.join(self.model.names)}")
+            raise InputError(f"{self.model.arm.name} has no parameter {name}; it has {nearest(name, self.model.names)}")
         k = self.model.names.index(name)
         value, variance = self.solution.x[k], self.cov[k, k]
         for first, rotation, side in self.model.rotations(self.solution.x):
@@ -187,29 +232,15 @@ def value_text(p: Parameter, value: float) -> str:
 
 def identify(
     arm: Arm,
-    measured: Measured | Read,
+    measured: Measured,
     *,
     priors: Mapping[str, float] | None = None,
     progress: Callable[[str], None] = lambda line: None,
 ) -> Identified:
-    """Identify an arm from poses.
+    """Fit an arm to all poses.
 
-    Args:
-        arm: the nominal arm; where base and tool are is found from the data.
-        measured: joint angles, and where the tool was measured, as ``read_poses`` returns them.
-        priors: sigma by name of a parameter or a kind, instead of ``fit.SIGMA``; 0 keeps one at its nominal value.
-        progress: called with the name of each step as it begins.
-
-    Returns:
-        Every number with its sigma: ``columns()`` is a table for pandas, ``validate`` says how far off it is on other
-        poses, ``Corrected.of`` makes an arm of it that computes and is saved.
-
-    Raises:
-        InputError: too few poses, or data that cannot be of this arm; the message says what would make them fit.
-        CalibrationError: poses so alike that not even base and tool are observable.
+    Args, errors: as :func:`~armsight.loop.identify.validate.identify_held_out`, which also evaluates it.
     """
-    require("identify(arm, poses)", "arm", arm, isinstance(arm, Arm), 'open_arm("ur10")')
-    measured = measured_of("identify(arm, poses)", measured)
     model, x, prior, seen = _begun(arm, measured, priors, progress)
     progress("base and tool")
     placement = _of(model, PLACEMENT) & seen.free

@@ -126,8 +126,8 @@ class Read(NamedTuple):
         return f"Read({len(self.measured)} {seen} of {self.measured.q.shape[1]} joints; notes={self.notes!r})"
 
 
-def measured_of(call: str, poses: Measured | Read) -> Measured:
+def measured_of(call: str, poses: Measured | Read, name: str = "measured") -> Measured:
     """Return the poses of what was read."""
     poses = poses.measured if isinstance(poses, Read) else poses
-    require(call, "poses", poses, isinstance(poses, Measured), 'read_poses("poses.csv")')
+    require(call, name, poses, isinstance(poses, Measured), 'read_poses("poses.csv")')
     return poses

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array
-from armsight.errors import InputError
+from armsight.errors import InputError, nearest
 from armsight.loop.handeye.recording import matched_rows
 from armsight.loop.identify.measured import Measured, Read
 from armsight.robot.kinematics.arm import Arm
@@ -203,7 +203,7 @@ def _joints(table: Columns, arm: ArmJoints | None) -> list[str]:
         most = 6 if arm is None else len(arm.joint_names)
         raise InputError(
             f"{table.path}: line 1: no joint angles; columns q1_rad .. q{most}_rad or q1_deg .. q{most}_deg are needed, "
-            f"there are {', '.join(list(table.at)[:8])}"
+            f"there are {nearest('q1_deg', table.at)}"
         )
     if not FEWEST_JOINTS <= len(joints) <= MOST_JOINTS:
         raise InputError(

@@ -1,4 +1,4 @@
-"""Validation: the error of the predicted tool pose on poses that the arm was not fitted to.
+"""Validation: the error of the predicted tool pose on poses that the arm was not fitted to, and what it makes of sigmas.
 
 Where the poses were taken in another set-up (the tracker moved, another target), base and tool are fitted again, for the
 nominal arm as for the identified one, and ``placement_refitted`` says so.
@@ -6,56 +6,33 @@ nominal arm as for the identified one, and ``placement_refitted`` says so.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 
 import numpy as np
+from scipy.special import chdtri
 
 from armsight.data import Array
-from armsight.errors import InputError, require
+from armsight.errors import CalibrationError, InputError, require
 from armsight.estimate.solve import covariances
 from armsight.loop.identify.fit import fit, linear_of, variances_of, with_joint_noise
-from armsight.loop.identify.identify import Identified
-from armsight.loop.identify.measured import Measured, Read, measured_of
+from armsight.loop.identify.identify import Errors, Identified, LeftOut, Validation, identify
+from armsight.loop.identify.measured import Measured, Read, measured_of, visits
+from armsight.loop.identify.misread import check_plausible, without_tool
 from armsight.loop.identify.model import Model
 from armsight.loop.identify.placement import with_placement
 from armsight.loop.identify.selection import PLACEMENT
+from armsight.robot.kinematics.arm import Arm
 
 OTHER = 5.0  # another set-up: the error is this many times that with base and tool fitted again,
 OTHER_M = 0.02  # and this far, m: no arm moves so far by itself between two recordings of one set-up
 MIN_POSES = 10  # poses needed to fit base and tool again
-
-
-class Errors(NamedTuple):
-    """Distances between the predicted and the measured tool."""
-
-    position_m: Array  #: (N, K) of every point
-    angle_rad: Array  #: (N,) of the body's rotation; empty with points only
-
-    def summary(self) -> dict[str, float]:
-        """Return mean_m, rms_m and max_m, and of full poses also mean_rad, rms_rad and max_rad."""
-        out: dict[str, float] = {}
-        for name, e in (("m", self.position_m), ("rad", self.angle_rad)):
-            if e.size:
-                out |= {f"mean_{name}": float(e.mean()), f"rms_{name}": float(np.sqrt(np.mean(e**2)))}
-                out[f"max_{name}"] = float(e.max())
-        return out
-
-
-class Validation(NamedTuple):
-    """Nominal and identified arm on one set of poses."""
-
-    nominal: Errors  #: errors of the nominal arm, its base and tool fitted to the same poses as the identified one's
-    identified: Errors  #: errors of the identified arm
-    placement_refitted: bool  #: whether base and tool were fitted to these very poses
-    residual_over_predicted: float  #: RMS residual over the predicted sigma; 1 where the sigmas are honest
-
-    def __repr__(self) -> str:
-        """Return the mean errors of both arms, mm, and whether the sigmas are honest."""
-        mean, nominal = (1e3 * float(each.position_m.mean()) for each in (self.identified, self.nominal))
-        return (
-            f"Validation({len(self.identified.position_m)} poses: {mean:.3f} mm mean, nominal arm {nominal:.3f} mm; "
-            f"residual over sigma {self.residual_over_predicted:.2f})"
-        )
+#: Parts of the poses that are left out one after the other without others to validate with; with more than MANY, one.
+FOLDS, MANY = 5, 500
+#: Residuals of poses left out that chance makes so large with this probability only show that the sigmas are too small.
+TOO_SMALL = 1e-3
+#: Few poses to validate with that are further from the nominal arm than this, m, are not of it: no arm is so inaccurate.
+FAR_M = 0.1
 
 
 def errors(model: Model, x: Array, measured: Measured) -> Errors:
@@ -69,15 +46,10 @@ def errors(model: Model, x: Array, measured: Measured) -> Errors:
 def validate(found: Identified, measured: Measured | Read) -> Validation:
     """Evaluate an identified arm on poses that it was not fitted to.
 
-    Args:
-        found: the identified arm.
-        measured: other poses, as ``read_poses`` returns them; points or full poses as it was identified with.
-
-    Raises:
-        InputError: another number of points, or points instead of poses.
+    ``measured``: other poses, as ``read_poses`` returns them; points or full poses as it was identified with (InputError).
     """
-    call = "validate(identified, poses)"
-    require(call, "identified", found, isinstance(found, Identified), "what identify(arm, poses) returns")
+    call = "validate(found, measured)"
+    require(call, "found", found, isinstance(found, Identified), "what identify(arm, measured) returns")
     measured = measured_of(call, measured)
     require_alike(measured, found.model.points, found.model.full)
 
@@ -122,3 +94,101 @@ def _over(model: Model, found: Identified, x: Array, measured: Measured) -> floa
     C = covariances(linear, variances_of(linear, found.solution.noise)) + by_fit
     squares = np.einsum("ni,nij,nj->", linear.e, np.linalg.inv(C), linear.e)
     return float(np.sqrt(squares / linear.e.size))
+
+
+def identify_held_out(
+    arm: Arm,
+    measured: Measured | Read,
+    *,
+    other: Measured | Read | None = None,
+    priors: Mapping[str, float] | None = None,
+    progress: Callable[[str], None] = lambda line: None,
+    other_name: str = "other",
+) -> Identified:
+    """Identify an arm from poses, as ``armsight identify`` does: fifths of them are left out, to know how good it is.
+
+    Args:
+        arm: the nominal arm; where base and tool are is found from the data.
+        measured: joint angles, and where the tool was measured, as ``read_poses`` returns them.
+        other: poses to validate with, instead of those left out.
+        priors: sigma by name of a parameter or a kind, instead of ``fit.SIGMA``; 0 keeps one at its nominal value.
+        progress: called with the name of each step as it begins.
+        other_name: what an error calls ``other``: its file.
+
+    Returns:
+        Every number with its sigma, as large as the residuals of the poses left out show it to be (``held_out``):
+        ``columns()`` is a table for pandas, ``validate`` says how far off it is on more poses, ``Corrected.of`` makes an
+        arm of it that computes and is saved.
+
+    Raises:
+        InputError: too few poses, or data that cannot be of this arm; the message says what would make them fit.
+        CalibrationError: poses so alike that not even base and tool are observable, or too few to leave some out.
+    """
+    call = "identify(arm, measured)"
+    require(call, "arm", arm, isinstance(arm, Arm), 'open_arm("ur10")')
+    measured = measured_of(call, measured)
+    if other is not None:
+        other = measured_of(call, other, "other")
+        try:
+            _check_other(arm, measured, other)
+        except InputError as error:
+            raise InputError(f"{other_name}: {error}") from None
+    found = identify(arm, measured, priors=priors, progress=progress)
+    if other is None:
+        held_out = _left_out(arm, measured.rows(found.solution.used), priors, progress)
+        apart = f", {len(found.left_out)} taken for mistakes apart" if len(found.left_out) else ""
+    else:
+        held_out = LeftOut(validate(found, other), other.q, f"{len(other)} poses of another file")
+        apart = ", base and tool fitted anew" if held_out.validation.placement_refitted else ""
+    over, numbers = held_out.validation.residual_over_predicted, len(held_out.q) * measured.size
+    scale = over if over**2 > chdtri(numbers, TOO_SMALL) / numbers else 1.0
+    held_out = held_out._replace(how=held_out.how + apart, scale=scale)
+    return replace(found, cov=scale**2 * found.cov, held_out=held_out)
+
+
+def _check_other(arm: Arm, measured: Measured, other: Measured) -> None:
+    """Reject poses to validate with that cannot be of the arm, before anything is fitted.
+
+    Fewer than MIN_POSES are evaluated in the set-up of ``measured``.
+    """
+    require_alike(other, measured.points, measured.R_rig_body is not None)
+    if len(other) >= MIN_POSES:
+        try:
+            check_plausible(without_tool(arm), other)
+        except InputError as error:
+            raise InputError(f"the poses to validate with: {error}") from None
+        return
+    check_plausible(without_tool(arm), measured)  # or its placement means nothing
+    model, x = with_placement(Model.of(without_tool(arm), measured, backlash=False).with_features(()), measured)
+    off = float(np.median(errors(model, x, other).position_m))
+    if off > FAR_M:
+        raise InputError(
+            f"the {len(other)} poses to validate with are {1e3 * off:.0f} mm from where the arm reaches at their angles: "
+            f"other joints, or another set-up, for which {MIN_POSES} poses are needed"
+        )
+
+
+def _left_out(
+    arm: Arm, measured: Measured, priors: Mapping[str, float] | None, progress: Callable[[str], None]
+) -> LeftOut:
+    """Identify without a part of the poses, and validate on it; with few poses once for every part."""
+    which = visits(measured.q)
+    shuffled = np.random.default_rng(0).permutation(int(which.max()) + 1)
+    parts = [np.flatnonzero(np.isin(which, part)) for part in np.array_split(shuffled, min(FOLDS, len(shuffled)))]
+    tried, done = parts if len(measured) <= MANY else parts[:1], []
+    for i, part in enumerate(tried, 1):
+        progress(f"error on poses left out, part {i} of {len(tried)}")
+        try:
+            others = measured.rows(np.setdiff1d(np.arange(len(which)), part))
+            done.append(validate(identify(arm, others, priors=priors), measured.rows(part)))
+        except (InputError, CalibrationError) as error:
+            raise CalibrationError(f"too few poses to leave a fifth of them out: {error}") from None
+    over = float(np.sqrt(np.mean([v.residual_over_predicted**2 for v in done])))
+    nominal, identified = (
+        Errors(*map(np.concatenate, zip(*each, strict=True)))
+        for each in ([v.nominal for v in done], [v.identified for v in done])
+    )
+    rows, again = np.concatenate(tried), len(which) - len(shuffled)
+    how = f"{len(rows)} poses left out" + (" in five rounds" if len(tried) > 1 else " of the fit")
+    how += f", {again} of them visits of another's pose, with which they are left out" if again else ""
+    return LeftOut(Validation(nominal, identified, False, over), measured.q[rows], how)

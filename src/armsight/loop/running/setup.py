@@ -316,7 +316,7 @@ class LiveShots:
         self._lock = threading.Lock()
         self._newest: Shot | None = None
         self._failure: ArmsightError | None = None
-        self._times = deque[float](maxlen=RATE_SHOTS)
+        self._times = deque[tuple[float, float]](maxlen=RATE_SHOTS)  # when shots were taken, and when they came, s
         self._ended = threading.Event()
         self._thread: threading.Thread | None = None
 
@@ -340,12 +340,13 @@ class LiveShots:
                 return
             with self._lock:
                 self._newest = shot
-            self._times.append(np.nan if shot.t_s is None else shot.t_s)
+            self._times.append((np.nan if shot.t_s is None else shot.t_s, time.monotonic()))
 
-    def rate_hz(self) -> float | None:
-        """Wait for the first shots, and return how many come a second, by the median of the times between them.
+    def rate_hz(self) -> tuple[float | None, bool]:
+        """Wait for the first shots, and return how many are taken a second, by the median of the times between them.
 
-        Times that are missing or do not rise are not used; None where the others show no rate that cameras have.
+        Times that are missing or do not rise are not used. Where the others show no rate that cameras have, it is how many
+        come a second, and the second is False; None where that is no such rate either.
 
         Raises:
             DeviceError: a camera was disconnected, or hardly a shot comes.
@@ -357,10 +358,12 @@ class LiveShots:
             raise self._failure or DeviceError(
                 f"{len(times)} shots came in {RATE_S:g} s: are both cameras there, and uncovered?"
             )
-        apart_s = np.diff(times)
-        rising = apart_s[np.isfinite(apart_s) & (apart_s > 0)]
-        rate = 1.0 / float(np.median(rising)) if len(rising) >= _FEWEST_SHOTS - 1 else 0.0
-        return rate if _RATES_HZ[0] <= rate <= _RATES_HZ[1] else None
+        for apart_s, stamped in zip(np.diff(times, axis=0).T, (True, False), strict=True):
+            rising = apart_s[np.isfinite(apart_s) & (apart_s > 0)]
+            rate = 1.0 / float(np.median(rising)) if len(rising) >= _FEWEST_SHOTS - 1 else 0.0
+            if _RATES_HZ[0] <= rate <= _RATES_HZ[1]:
+                return rate, stamped
+        return None, False
 
     def poll(self) -> Shot | None:
         """Return the newest shot not returned yet, or None."""

@@ -283,10 +283,10 @@ class ShotPoses:
 
         return pyarrow.table(self.columns()).__arrow_c_stream__(requested_schema)
 
-    def to_pandas(self) -> Any:  # noqa: ANN401 - pandas is no dependency
-        """Return pandas' DataFrame of the columns; InputError where pandas is not installed."""
+    def to_pandas(self, lengths: str = "m") -> Any:  # noqa: ANN401 - pandas is no dependency
+        """Return pandas' DataFrame of the :meth:`columns`; InputError where pandas is not installed."""
         try:
-            return importlib.import_module("pandas").DataFrame(self.columns())
+            return importlib.import_module("pandas").DataFrame(self.columns(lengths))
         except ImportError:
             raise InputError("pandas is not installed: pip install pandas; columns() is the same table") from None
 

@@ -11,7 +11,7 @@ from armsight.robot.boards.codes import Alarm, BoardState, Command
 from armsight.robot.boards.feetech.board import FeetechBoard
 from armsight.robot.boards.feetech.bus import ServoBus
 from armsight.robot.boards.feetech.calibration import NAMES, read_calibration, write_offsets
-from armsight.robot.boards.feetech.registers import RAD_PER_COUNT
+from armsight.robot.boards.feetech.registers import MIDDLE, MODE, MODEL, POSITION_MODE, RAD_PER_COUNT, STS3215, TORQUE
 from armsight.sim.boards.device import SteppedLink
 from armsight.sim.boards.so101 import So101Bus, So101Mechanics
 from armsight.tables.columns import degree_columns
@@ -203,8 +203,43 @@ def test_some_noise_is_asked_again_and_never_read_as_an_angle():
 
 
 def test_too_much_noise_is_one_line():
+    noisy = NoisyDevice(device := So101Bus.made(), 0.4, seed=1)
+    noisy.write = device.write  # questions come through
     with pytest.raises(DeviceError, match="feetech:PORT: bytes come, but no whole answer"):
-        opened(NoisyDevice(So101Bus.made(), 0.25, seed=1))
+        opened(noisy)
+
+
+class LateDevice:
+    """A device whose answers arrive late, all by as much: a busy computer, a slow adapter."""
+
+    def __init__(self, device, late_s):
+        self.device, self.late_s, self._coming = device, late_s, []
+
+    t_s = property(lambda self: self.device.t_s)
+    write = property(lambda self: self.device.write)
+
+    def read(self):
+        self._coming.append((self.t_s + self.late_s, self.device.read()))
+        come = [data for due, data in self._coming if due <= self.t_s]
+        self._coming = [each for each in self._coming if each[0] > self.t_s]
+        return b"".join(come)
+
+    def step(self):
+        self.device.step()
+
+
+@pytest.mark.parametrize("late_s", [0.035, 0.07, 0.1, 0.15])
+def test_late_answers_are_no_fault_and_answer_no_other_question(late_s):
+    device = So101Bus.made(load=unloaded)
+    board, _ = opened(late := LateDevice(device, 0.0))
+    board.enable()
+    late.late_s = late_s
+    for _ in range(4):
+        counts = board.bus.states(board.calibration.ids).counts
+        assert counts - MIDDLE == pytest.approx(device.servos.shaft[:5] / RAD_PER_COUNT, abs=1.0)
+        assert board.bus.read(1, MODEL) == STS3215
+        assert [board.bus.read(1, each) for each in (MODE, TORQUE)] == [POSITION_MODE, 1]
+    assert board.broken_messages > 0
 
 
 def lerobot(tmp_path, **changes):

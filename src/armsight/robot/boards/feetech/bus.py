@@ -1,8 +1,9 @@
 """Questions to the servos of a bus and their answers; and what is wrong with a bus whose answers do not come.
 
 In: a :class:`~armsight.robot.boards.link.Link` and registers. Out: numbers, or one :class:`~armsight.errors.DeviceError`
-that says which id does not answer. Nothing waits longer than its time limit: an answer comes within milliseconds or not at
-all, and a question is asked ``TRIES`` times, because one disturbed byte spoils it.
+that says which id does not answer. A question is asked up to four times, because one disturbed byte spoils it, and waited
+for twice as long each time: a servo answers within milliseconds, a program that emulates one when it gets to run. Waits are
+counted in polls, so that a host that is late itself takes nothing from the servos' time.
 """
 
 from __future__ import annotations
@@ -27,10 +28,10 @@ from armsight.robot.boards.feetech.registers import (
 from armsight.robot.boards.link import Link
 
 BAUD = 1_000_000
-#: How long answers may take: USB adapters hold bytes back for up to 16 ms.
-ANSWER_S = 0.03
+#: How long answers may take at each try, s: USB adapters hold bytes back for up to 16 ms; with the last one, the double of
+#: an answer's 130 ms on two cores with four busy programs, an unplugged servo is named after 0.45 s.
+_WAITS_S = (0.03, 0.06, 0.12, 0.24)
 _POLL_S = 0.0005
-TRIES = 4
 LOOKED_FOR = range(1, 13)  # ids that are looked for where an expected one does not answer
 
 
@@ -59,10 +60,6 @@ class ServoBus:
         """Let time pass; what comes meanwhile answers nothing."""
         self._link.read(wait_s)
 
-    def ping(self, id: int) -> bool:
-        """Return whether a servo answers to an id, broken or not."""
-        return any(self._heard(packet(id, Instruction.PING)) for _ in range(2))
-
     def read(self, id: int, register: Register) -> int:
         """Return what a register of a servo holds, or raise DeviceError: it does not answer."""
         question = packet(id, Instruction.READ, bytes((register.address, register.width)))
@@ -83,10 +80,7 @@ class ServoBus:
         self._link.write(sync_write(register.address, values))
 
     def meet(self, ids: Sequence[int]) -> None:
-        """Check that each id answers, alone and as an STS3215; else DeviceError."""
-        silent = [id for id in ids if not self.ping(id)]
-        if silent:
-            self._explain(silent)
+        """Check that all ids answer, each alone as an STS3215; else DeviceError."""
         self.states(ids)
         for id in ids:
             if (model := self.read(id, MODEL)) != STS3215:
@@ -107,41 +101,48 @@ class ServoBus:
 
     def _asked(self, question: bytes, ids: Sequence[int], count: int) -> dict[int, StatusPacket]:
         """Ask until all of these ids have answered with ``count`` bytes; say what is wrong where they do not."""
-        for _ in range(TRIES):
-            answers = self._ask(question, ids, count)
+        silent = False
+        for wait_s in _WAITS_S:
+            before = self._bytes
+            answers = self._ask(question, ids, count, wait_s)
             if len(answers) == len(ids):
+                if silent:
+                    self.wait(wait_s)  # late answers to the tries before would answer the next question
                 return answers
+            silent |= self._bytes == before
         self._explain([id for id in ids if id not in answers])
 
-    def _ask(self, question: bytes, ids: Sequence[int], count: int) -> dict[int, StatusPacket]:
+    def _ask(self, question: bytes, ids: Sequence[int], count: int, wait_s: float) -> dict[int, StatusPacket]:
         """Ask once and return the whole answers of these ids; without those that came twice."""
         self._link.read(0.0)  # what came late answers nothing
         self._reader.clear()
         self._link.write(question)
         answers: dict[int, StatusPacket] = {}
-        until = self.now() + ANSWER_S
-        while len(answers) < len(ids) and self.now() < until:
+        for _ in range(round(wait_s / _POLL_S)):
             data = self._link.read(_POLL_S)
             self._bytes += len(data)
             for answer in self._reader.take(data):
                 if answer.id in ids and len(answer.parameters) == count:
                     answers[answer.id] = answer
+            if len(answers) == len(ids):
+                break
         self.lost += len(ids) - len(answers)
         return answers
 
-    def _heard(self, question: bytes) -> bytes:
+    def _heard(self, question: bytes, wait_s: float) -> bytes:
         """Return all bytes that a question is answered with."""
         self._link.read(0.0)
         self._link.write(question)
-        data, until = b"", self.now() + ANSWER_S
-        while not data and self.now() < until:
-            data = self._link.read(_POLL_S)
-        self._bytes += len(data)
-        return data + self._link.read(2 * _POLL_S) if data else data
+        for _ in range(round(wait_s / _POLL_S)):
+            if data := self._link.read(_POLL_S):
+                self._bytes += len(data)
+                return data + self._link.read(2 * _POLL_S)
+        return b""
 
     def _explain(self, silent: Sequence[int]) -> NoReturn:
         """Raise what is wrong where these ids did not answer whole."""
-        found = {id: self._quality(id) for id in LOOKED_FOR}
+        self.wait(_WAITS_S[-1])
+        found = {id: self._quality(id, _WAITS_S[-1 if id in silent else 0]) for id in LOOKED_FOR}
         answering = [id for id, whole in found.items() if whole]
         broken = [id for id, whole in found.items() if whole is False]
         if not answering and self._bytes:
@@ -168,15 +169,16 @@ class ServoBus:
                 f"{self.name}: no servo answers as id {_listed(lost)} ({there}): is its cable plugged in, and its id set?"
             )
         raise DeviceError(
-            f"{self.name}: id {_listed(silent)} answers now and then only: is a plug loose, or the wire disturbed?"
+            f"{self.name}: id {_listed(silent)} answers now and then only: is a plug loose, the wire disturbed, or this"
+            " computer too busy?"
         )
 
-    def _quality(self, id: int) -> bool | None:
+    def _quality(self, id: int, wait_s: float) -> bool | None:
         """Return True where an id gives a whole answer, False where only broken ones, None where none."""
         question = packet(id, Instruction.READ, bytes((POSITION.address, STATE_BYTES)))
         heard = False
-        for _ in range(TRIES):
-            data = self._heard(question)
+        for _ in _WAITS_S:
+            data = self._heard(question, wait_s)
             if not data:
                 if not heard:
                     return None
