@@ -160,6 +160,12 @@ def test_all_late_images_are_reported_with_a_unit_as_without():
     assert len(beside[0]) == len(looks)
 
 
+def test_the_delays_sigma_does_not_vanish_with_a_unit():
+    q, _, looks, *imu = world(231, 0.6, 0.5)
+    given = Delay(0.0, 4e-4)
+    assert go(q, looks, *imu, delay=given).learned().delay.sigma_s == pytest.approx(given.sigma_s)
+
+
 def test_while_the_delay_is_learned_a_unit_changes_nothing_and_the_delay_is_as_close_as_its_sigma_says():
     off_by, squares = [], []
     for seed in range(4):

@@ -11,6 +11,7 @@ docs/concepts/loop.md.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import replace
@@ -427,14 +428,16 @@ class KalmanEstimator:
         armerror.offsets_by(self._arm.table, now.q[0], now.unseen[0], by)
         by[np.arange(self._at.joints), self._at.zeros] = self._arm.direction
         by[:, self._at.noise] = 0.0  # of the arm, not of the moment
-        sigma = np.sqrt(np.diag(P))
+        delay_s = math.sqrt(P[self._at.delay, self._at.delay])
+        if self._unit is not None:  # then it is each image's noise, not in the state
+            delay_s = math.hypot(delay_s, self._delay.sigma_s)
         return Learned(
             by @ x,
             np.sqrt(np.einsum("ij,jk,ik->i", by, P, by)),
             self._widths @ x,
             np.sqrt(np.diag(self._widths @ P @ self._widths.T)),
             now.unseen[0, 0],
-            replace(self._delay, delay_s=self._delay_s(self.span_s[1], x), sigma_s=float(sigma[self._at.delay])),
+            replace(self._delay, delay_s=self._delay_s(self.span_s[1], x), sigma_s=delay_s),
         )
 
     def _backlash(self) -> Array:
