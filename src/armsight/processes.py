@@ -149,7 +149,6 @@ def _send(pipe: IO[bytes], content: object) -> None:
 
 
 def _receive(pipe: IO[bytes]) -> Any:  # noqa: ANN401 - what was sent
-    """Read an object."""
     count = _LENGTH.unpack(_read(pipe, _LENGTH.size))[0]
     sizes = struct.unpack(f"<{count}q", _read(pipe, 8 * count))
     content, *arrays = [_read(pipe, size) for size in sizes]

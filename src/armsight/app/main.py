@@ -82,7 +82,6 @@ class _Sections(click.Group):
         return list(COMMANDS)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write the commands, section by section."""
         longest = max(map(len, COMMANDS))
         for title, commands in SECTIONS.items():
             with formatter.section(title):

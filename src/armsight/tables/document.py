@@ -128,7 +128,6 @@ def _with_matrices(name: str, value: Foreign) -> Foreign:
 
 
 def _unpacked(data: bytes, path: str | Path) -> bytes:
-    """Return what gzip packed."""
     most = int(DOCUMENT_MB * 1e6)
     try:
         packed = zlib.decompressobj(31)
@@ -250,7 +249,6 @@ class _Yaml:
         self._anchors: dict[str, tuple[Foreign, int]] = {}
 
     def documents(self) -> list[Foreign]:
-        """Return all documents."""
         return [
             self._value(next(self._events), 0) for event in self._events if isinstance(event, yaml.DocumentStartEvent)
         ]
@@ -353,7 +351,6 @@ def _toml_or_ini(text: str, path: str | Path) -> dict[str, Foreign]:
 
 
 def _xml(data: bytes, path: str | Path) -> Foreign:
-    """Return what OpenCV's XML holds."""
     try:
         root = ElementTree.fromstring(data)
     except ElementTree.ParseError as error:

@@ -307,7 +307,6 @@ def _no_options(texts: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def _number(text: str, name: str) -> float:
-    """Read one number."""
     try:
         value = float(text)
     except ValueError:

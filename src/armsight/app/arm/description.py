@@ -188,14 +188,12 @@ def _angles_json(q: Array) -> dict[str, Any]:
 
 
 def _pose_json(T: Array) -> dict[str, Any]:
-    """Return a pose: the matrix, and mm and degrees."""
     angles, singular = euler_zyx(T[:3, :3])
     found = {"T_base_tool": T.tolist(), "position_mm": (1e3 * T[:3, 3]).tolist()}
     return {**found, "euler_zyx_deg": np.degrees(angles).tolist(), "pitch_singular": singular}
 
 
 def _pose_text(T: Array) -> str:
-    """Return a pose as text: position and Euler angles."""
     angles, singular = euler_zyx(T[:3, :3])
     xyz, zyx = (", ".join(map(_fixed, values)) for values in (1e3 * T[:3, 3], np.degrees(angles)))
     note = " (singular: of the angles about z and x only both together are determined)" if singular else ""
@@ -203,5 +201,4 @@ def _pose_text(T: Array) -> str:
 
 
 def _matrix(values: Array) -> list[str]:
-    """Return a matrix as lines."""
     return ["  " + " ".join(f"{v + 0.0:11.6f}" for v in row) for row in np.round(values, 9)]

@@ -277,7 +277,6 @@ def evaluate_arm(folder: Path, arm: Arm, *, progress: Callable[[str], None] = la
 
 
 def _summary(folder: Path) -> dict[str, Any]:
-    """Return summary.json of a run, empty where there is none."""
     path = folder / "summary.json"
     found = read_json(path) if path.is_file() else {}
     return found if isinstance(found, dict) else {}
@@ -328,14 +327,12 @@ def _displacements(arm: Arm, rests: RestPoses, found: Identified) -> tuple[Array
 
 
 def _rms_mm(values: Array) -> float:
-    """Return the RMS length of vectors (N, 3), m, in mm."""
     return 1e3 * float(np.sqrt((values**2).sum(axis=1).mean()))
 
 
 def _joint(
     arm: Arm, i: int, rests: RestPoses, found: Identified, lever: Array, backlash: dict[str, Any], latency: float | None
 ) -> JointFigures:
-    """Return the figures of one joint."""
     deg, zero, once = float(np.degrees(1.0)), _zero(arm, i, rests, found), None
     waves = [f"wave{i + 1}_{phase}1" for phase in ("sin", "cos")]
     free = [w for w in waves if w in found.model.names and found.solution.free[found.model.names.index(w)]]

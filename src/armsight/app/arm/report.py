@@ -120,7 +120,6 @@ def remarks(report: ArmReport) -> list[str]:
 
 
 def _map_figure(report: ArmReport, figure: FigureBase) -> None:
-    """Plot the error over the workspace, from above and from the side."""
     size = 1e3 * np.linalg.norm(report.off, axis=1)
     enlarged = 0.08 * float(np.ptp(report.at[:, :2], axis=0).max()) / max(float(np.quantile(size, 0.9)) / 1e3, 1e-9)
     both = figure.subplots(1, 2)
@@ -134,7 +133,6 @@ def _map_figure(report: ArmReport, figure: FigureBase) -> None:
 
 
 def _parts_figure(report: ArmReport, figure: FigureBase) -> None:
-    """Plot the parts of the error: shares, and what each remedy would leave."""
     left, right = figure.subplots(1, 2)
     names = [name for name, part in report.parts.items() if part.determined][::-1]
     rows = np.arange(len(names))
@@ -149,7 +147,6 @@ def _parts_figure(report: ArmReport, figure: FigureBase) -> None:
 
 
 def _joints_figure(report: ArmReport, figure: FigureBase) -> None:
-    """Plot readings less commands against the gravity load's lever of each joint."""
     for i, axes in enumerate(panels(figure, len(report.joints))):
         axes.scatter(1e3 * report.lever[:, i], np.degrees(report.lag[:, i]), s=8, color=BLUE)
         slope = report.joints[i].droop_deg_per_m
@@ -165,7 +162,6 @@ def _joints_figure(report: ArmReport, figure: FigureBase) -> None:
 
 
 def _drift_figure(report: ArmReport, figure: FigureBase) -> None:
-    """Plot how far the pose that came most often went from where it was first."""
     axes = figure.subplots()
     axes.plot(60 * report.drift[:, 0], report.drift[:, 1], color=BLUE, marker="o", markersize=3)
     axes.set(title=f"one pose, {report.cycles} times", xlabel="min", ylabel="mm from the first visit")
@@ -223,7 +219,6 @@ def write_report(report: Report, found: ArmReport, folder: Path) -> None:
 
 
 def _text_page(report: Report) -> Figure:
-    """Return a page of text for the PDF."""
     figure = new_figure(_PAGE)
     figure.set_layout_engine(None)
     lines = "\n".join(textwrap.fill(line, 150, subsequent_indent="  ") for line in report.text().split("\n"))
@@ -234,7 +229,6 @@ def _text_page(report: Report) -> Figure:
 
 
 def _figure(report: ArmReport, name: str) -> Figure:
-    """Return a figure by itself."""
     _, height, draw = _FIGURES[name]
     figure = new_figure(height)
     draw(report, figure)
@@ -242,7 +236,6 @@ def _figure(report: ArmReport, name: str) -> Figure:
 
 
 def _figures_page(report: ArmReport) -> Figure:
-    """Return a page with all figures for the PDF."""
     figure = new_figure(_PAGE)
     heights = [height for _, height, _ in _FIGURES.values()]
     parts = figure.subfigures(len(heights), 1, squeeze=False, height_ratios=heights, hspace=0.05)[:, 0]
@@ -253,7 +246,6 @@ def _figures_page(report: ArmReport) -> Figure:
 
 
 def _pdf(figures: Sequence[Figure]) -> bytes:
-    """Return figures as the pages of a PDF: the same figures, the same bytes."""
     from matplotlib.backends.backend_pdf import PdfPages
 
     data = io.BytesIO()

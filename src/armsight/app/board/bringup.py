@@ -270,7 +270,6 @@ class Bringup:
             self._board.confirm(self._board.command(Command.HOME))
 
     def _counting(self) -> list[int]:
-        """Return the joints that are read by a quadrature encoder."""
         joints = self.found.joints[: self.found.joint_count]
         return [j for j, each in enumerate(joints) if each.kind == SensorKind.QUADRATURE]
 
@@ -502,7 +501,6 @@ class Bringup:
         raise _mistake(joint, f"meanwhile joint {other} moves by itself: leave it where it stays, or support it.")
 
     def _hold_still(self, seconds: float) -> SensorReadings:
-        """Leave the motors at duty 0."""
         return self._moved(seconds, lambda t: (np.zeros(JOINTS), np.zeros(JOINTS), np.zeros(JOINTS)))
 
     def _ramp(self, joint: int, sign: float, start: Array, enough: Array) -> tuple[Array, float, SensorReadings]:
@@ -573,7 +571,6 @@ class Bringup:
         return float(np.clip(high if high > -low else low, -_TRAVEL_RAD, _TRAVEL_RAD))
 
     def _swung(self, joint: int, seconds: float) -> SensorReadings:
-        """Swing a joint about where it is."""
 
         def way(t_s: float) -> tuple[Array, Array, Array]:
             angle, speed = _swing_at(t_s, seconds)

@@ -43,7 +43,6 @@ STEPS = {
 
 
 def _path(*names: str, metavar: str = "FILE", default: str | None = None, **given: Any) -> Callable[..., Any]:  # noqa: ANN401
-    """Return an option that names a file or folder."""
     start = None if default is None else Path(default)
     kind, shown = PATH, default is not None
     return click.option(*names, metavar=metavar, type=kind, default=start, show_default=shown, **given)
@@ -71,7 +70,6 @@ _yes = click.option("--yes", is_flag=True, help="Do not ask.")
 
 
 def _show(as_json: bool, value: object, text: str) -> None:
-    """Print a result: an object for programs, or text."""
     click.echo(json.dumps(value) if as_json else text)
 
 

@@ -307,7 +307,6 @@ def _put_sensor(joint: Configuration, found: JointFound) -> None:
 def _put_motor(
     joint: Configuration, found: JointFound, motor: MotorFigures, supply_v: float, most_current_a: float
 ) -> None:
-    """Put gains, limits and the motor's numbers."""
     gravity_n_m, elastic = found.gravity_n_m or 0.0, found.elastic
     gains = quiet_gains(motor, supply_v, found.noise_rad, gravity_n_m)
     if elastic is not None:
@@ -408,7 +407,6 @@ def report(found: Found, gains: Array) -> Report:
 
 
 def _figure(found: Found) -> Figure | None:
-    """Plot for every joint: table, motor voltage of the swing, error of the small swing."""
     shown = [(j, each) for j, each in enumerate(found.joints) if each.range_counts is not None]
     if not shown:
         return None

@@ -238,7 +238,6 @@ def _neighbours(layout: Composite) -> list[Finding]:
 
 
 def _in_view(layout: Composite, rig: StereoRig, predictions: tuple[Prediction, ...]) -> list[Finding]:
-    """Say where too few points are seen together."""
     points, normals = layout.body.points, layout.normals
     cosine = normals @ look_direction(points, normals)
     facing, well = ~(cosine <= FACING), ~(cosine <= _WELL_FACING)
@@ -257,7 +256,6 @@ def _in_view(layout: Composite, rig: StereoRig, predictions: tuple[Prediction, .
 
 
 def _sizes(layout: Composite, rig: StereoRig, predictions: tuple[Prediction, ...]) -> list[Finding]:
-    """Say which discs are too small or too large in the images."""
     findings = []
     low, high = DISC_PX
     for one in predictions if layout.discs is not None else ():

@@ -178,7 +178,6 @@ def _discs(path: str | Path, layout: Composite, notes: list[str]) -> list[Mark]:
 
 
 def _patterns(layout: Composite) -> list[Mark]:
-    """Return tags and boards."""
     markers = []
     for one in () if layout.tags is None else layout.tags.tags:
         whole = one.family in LAYOUTS
@@ -208,7 +207,6 @@ def _of_pattern(name: str, pattern: Pattern, T_body_pattern: Array, middle: Arra
 
 
 def _corners(x: Array, y: Array) -> Array:
-    """Return the corners (4, 2) of a rectangle, in order around it."""
     return np.array([(x[0], y[0]), (x[1], y[0]), (x[1], y[1]), (x[0], y[1])])
 
 
@@ -388,7 +386,6 @@ def _smaller(spec: str) -> Iterator[str]:
 
 
 def _fits(spec: str, paper: str) -> bool:
-    """Whether a board fits a paper."""
     return _rotated(PAPERS[paper], _needed(_board_page(spec))) is not None
 
 
@@ -398,7 +395,6 @@ def _rotated(size: tuple[float, float], needed: Array) -> tuple[float, float] | 
 
 
 def _figure(page: Page, size: tuple[float, float], head: str, foot: str, sheet: _Sheet | None = None) -> Figure:
-    """Draw one page, or one sheet of it."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -490,7 +486,6 @@ def _name(axes: Axes, mark: Mark, shift: Array, taken: list[Array]) -> None:
 
 
 def _free(box: Array, taken: list[Array]) -> bool:
-    """Whether a box (2, 2) touches none of others."""
     return not any((box[0] < other[1]).all() and (box[1] > other[0]).all() for other in taken)
 
 
@@ -507,7 +502,6 @@ def _write(axes: Axes, at: Array, text: str, height_mm: float, **more: str) -> N
 
 
 def _arrows(axes: Axes, page: Page, at: Array, title: str) -> None:
-    """Draw the body's axes as seen on the page."""
     line: Any = {"arrowstyle": "-|>", "color": "black", "lw": 0.8, "shrinkA": 0, "shrinkB": 0}
     away = [title] if title else []
     for letter, (right, down, into) in zip("xyz", page.axes, strict=True):

@@ -18,7 +18,6 @@ _DISTANCES = 15
 
 
 def _cameras(rig: StereoRig, path: str | None) -> str:
-    """Say which cameras the numbers are for."""
     (width, height), f = rig.left.image_size_px, rig.left.intrinsics[0]
     name = "two perfect cameras" if path is None else path
     uncertain = "" if path is None or rig.cov.any() else ", its calibration taken as perfect"
@@ -89,7 +88,6 @@ def body_report(path: str, layout: Composite, rig: StereoRig, rig_path: str | No
 
 
 def _unique(layout: Composite, assessment: Assessment) -> str:
-    """Say whether the body can be identified, in one line."""
     if layout.parts:
         return "yes, where a tag or a board is in view"
     if any(f.grade == "bad" and f.kind == "ambiguous" for f in assessment.findings):
@@ -103,14 +101,12 @@ def _unique(layout: Composite, assessment: Assessment) -> str:
 
 
 def _row(one: Prediction) -> tuple[str, ...]:
-    """Return the expected sigma at a distance."""
     (across, depth), (tilt, roll) = one.position_mm, one.rotation_deg
     known = (f"{across:.3f} mm", f"{depth:.3f} mm", f"{tilt:.4f} deg", f"{roll:.4f} deg")
     return f"{one.distance_m:g} m", *(("no pose", "", "", "") if np.isnan(one.cov).any() else known), _pixels(one)
 
 
 def _pixels(one: Prediction) -> str:
-    """Return the discs' diameters in the image."""
     low, high = one.disc_px
     if np.isnan(low):
         return ""
@@ -118,7 +114,6 @@ def _pixels(one: Prediction) -> str:
 
 
 def _ambiguities(layout: Composite, assessment: Assessment) -> list[dict[str, Any]]:
-    """Return what may be taken for what, for programs."""
     return [
         {
             "seen": [layout.body.point_names[i] for i in one.symmetry.seen],
@@ -135,7 +130,6 @@ def _ambiguities(layout: Composite, assessment: Assessment) -> list[dict[str, An
 
 
 def _expected(one: Prediction) -> dict[str, Any]:
-    """Return the expected sigma at a distance, for programs."""
     (across, depth), (tilt, roll) = one.position_mm, one.rotation_deg
     return {
         "distance_m": one.distance_m,

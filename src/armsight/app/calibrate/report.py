@@ -208,7 +208,6 @@ FIGURES = {
 
 
 def _words(calibration: Calibration) -> dict[str, object]:
-    """Return what captions say of a calibration."""
     pairs = len(calibration.errors.pair)
     return {
         "what": target(calibration),
@@ -244,7 +243,6 @@ def _result(calibration: Calibration) -> str:
 
 
 def _volume(calibration: Calibration) -> str:
-    """Return what stands beneath the map of the volume."""
     unknown = "<p><b>The uncertainty of this calibration is unknown; its share is missing here.</b></p>\n"
     return (
         f"{sigma_table(calibration)}<p>The calibration's share is common to all points and all shots: averaging does not "
@@ -256,7 +254,6 @@ def _volume(calibration: Calibration) -> str:
 
 
 def _parameters(calibration: Calibration) -> str:
-    """Return the parameters with their sigmas and the distortion models tried."""
     rig = calibration.rig
     tried = (
         f"<h3>Distortion models tried</h3>\n{models_table(calibration)}<p>Evaluated on held-out pairs alone; of models "
@@ -271,7 +268,6 @@ def _parameters(calibration: Calibration) -> str:
 
 
 def _provenance(rig: StereoRig) -> str:
-    """Return how a rig was made, as its file records it."""
     rows = [
         (text(key), text(value if isinstance(value, str) else json.dumps(value, ensure_ascii=False, default=str)))
         for key, value in rig.provenance.items()

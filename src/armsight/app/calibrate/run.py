@@ -110,7 +110,6 @@ class _SimulatedBoard(Source):
         return None if shot is None else replace(shot, t_s=None)
 
     def close(self) -> None:
-        """End the workcell."""
         self._workcell.close()
 
 

@@ -39,7 +39,6 @@ def command(as_json: bool) -> None:
 
 
 def _lines(camera: VideoDevice) -> Iterator[str]:
-    """Yield one camera as lines of text."""
     yield f"{camera.device}  {camera.name}" + (f"  ({camera.driver}, {camera.bus})" if camera.driver else "")
     for path in camera.stable:
         yield f"  {path}"

@@ -18,7 +18,6 @@ class _Context(click.Context):
 
     @property
     def command_path(self) -> str:
-        """The words by which it is called."""
         return super().command_path.rstrip()
 
 
@@ -28,7 +27,6 @@ class _Evaluate(click.Command):
     context_class = _Context
 
     def format_usage(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write both usages."""
         super().format_usage(ctx, formatter)
         formatter.write_usage(f"{ctx.command_path} plan", "[OPTIONS]", prefix="       ")
 

@@ -102,7 +102,6 @@ class _Stacked(NamedTuple):
 
 
 def _stacked(rows: Sequence[Row]) -> _Stacked:
-    """Return what rows have, as arrays."""
     p, p_ref = (np.array([T[:3, 3] for T in Ts]) for Ts in ([row.T for row in rows], [row.T_command for row in rows]))
     return _Stacked(p, p_ref, np.array([row.cov for row in rows]), np.mean([row.cov_common for row in rows], axis=0))
 
@@ -131,7 +130,6 @@ def _drift(often: dict[str, list[Row]]) -> DriftResult | None:
 
 
 def _outliers(rows: list[Row]) -> list[str]:
-    """Name the rows of a pose that lie far from the others."""
     p = _stacked(rows).p
     away = np.linalg.norm(p - np.median(p, axis=0), axis=1)
     usual = max(float(np.median(away)), _OUTLIER_LEAST_M)
@@ -144,7 +142,6 @@ def _outliers(rows: list[Row]) -> list[str]:
 
 
 def _pose(rows: list[Row]) -> iso9283.PoseMetrics:
-    """Return the metrics of a pose; None for what needs rotations that are not known."""
     ways, at = [row.approach for row in rows], _stacked(rows)
     if min(Counter(ways).values()) < iso9283.MIN_POSES:  # of a table whose approaches are too many for a scatter
         ways = [""] * len(rows)

@@ -128,8 +128,6 @@ def seen_by(run: Path) -> Allowed:
 
 
 class _Path(NamedTuple):
-    """A path in a cube."""
-
     way: Trajectory
     begin: tuple[str, Array]  #: name of the motion to where it begins, and joint angles (n,), rad
     motions: list[tuple[str, str, dict[str, Any]]]  #: kinds, names and keys of a cycle's motions
@@ -173,7 +171,6 @@ def _circle(arm: Arm, plan: CheckPlan, speed_m_s: float) -> _Path:
 
 
 def _motion(kind: str, name: str, keys: Mapping[str, Any]) -> str:
-    """Return a motion as a motion file has it."""
     text = f'\n[[motion]]\nkind = "{kind}"\nname = "{name}"\n'
     for key, value in keys.items():
         number = f"{value:.{1 if key == 'angle_deg' else 4}f}" if np.ndim(value) == 0 else ""

@@ -217,7 +217,6 @@ def value_m(metric: Metric) -> float:
 
 
 def _compared(line: MetricLine, limit_m: float) -> LimitResult:
-    """Compare one metric with its limit."""
     m, certain = line.metric, None
     if m.low is not None and m.high is not None:
         smallest = 0.0 if m.low <= 0 <= m.high else min(abs(m.low), abs(m.high))

@@ -133,7 +133,6 @@ def table_text(lines: list[SceneResult]) -> str:
 
 
 def _numbers(errors: DisparityErrors) -> list[float]:
-    """Return the numbers of a row of the table, by column."""
     return [*errors.bad_percent, errors.average_px, errors.rms_px, *errors.quantiles_px]
 
 

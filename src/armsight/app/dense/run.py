@@ -35,7 +35,6 @@ def read_pair(left: Path, right: Path) -> Shot:
 
 
 def _read_pixels(path: Path) -> Image:
-    """Read an image; floats become 8-bit grey."""
     floats: NDArray[np.generic] | None = None
     if path.suffix.lower() == ".pfm":
         floats = read_pfm(path)

@@ -132,7 +132,6 @@ def _some(run: RecordedRun, tables: dict[str, Table]) -> dict[str, Table]:
 
 
 def _file(folder: Path, name: str) -> Path:
-    """Return a file in a folder, which is made."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -185,7 +185,6 @@ def calibrate(options: Options, progress: Callable[[str], None]) -> HandEyeAnswe
 
 
 def _table(options: Options, side: str, arm: Arm | None = None) -> PoseTable:
-    """Read a table, of the side "robot" or "seen"."""
     from armsight.tables.poses import read_pose_table
 
     said = _said(options, side)
@@ -201,7 +200,6 @@ def _table(options: Options, side: str, arm: Arm | None = None) -> PoseTable:
 
 
 def _seen(options: Options, progress: Callable[[str], None]) -> Seen:
-    """Read or measure the poses of the target."""
     from armsight.app.handeye.images import see_with_camera, see_with_rig
     from armsight.loop.handeye.recording import seen_in_table
     from armsight.vision.sources import open_source

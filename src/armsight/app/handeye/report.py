@@ -131,7 +131,6 @@ def _with_sigma(value: float, sigma: float, decimals: int) -> str:
 
 
 def _transforms_table(run: HandEyeAnswer) -> TextTable:
-    """Return both transforms with their sigmas as a table."""
     found = run.found
     sigma = np.sqrt(np.diag(found.cov))
     rows = []
@@ -223,7 +222,6 @@ def _of_the_geometry(run: HandEyeAnswer) -> list[str]:
 
 
 def _scale(found: HandEye) -> list[Fact]:
-    """Say how long the target is."""
     scale, sigma = found.scale, found.sigma_scale
     of_given = f"{scale:.5f} ± {sigma:.5f} of those given"
     if "scale_walk" in found.sigmas:

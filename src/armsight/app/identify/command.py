@@ -191,7 +191,6 @@ def _plan_csv(plan: Plan) -> str:
 
 
 def _priors(texts: tuple[str, ...]) -> dict[str, float]:
-    """Read NAME=SIGMA."""
     out = {}
     for given in texts:
         name, _, sigma = given.partition("=")

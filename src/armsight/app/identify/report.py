@@ -374,7 +374,6 @@ def _printed(run: Identification, *, everything: bool) -> list[Block]:
 
 
 def _seen(run: Identification) -> list[tuple[float, float]]:
-    """Return the least and greatest reading of each joint in the poses fitted, rad."""
     assert run.found.model.q_seen is not None  # for the type checker: an identified arm has them
     return [(float(low), float(high)) for low, high in run.found.model.q_seen]
 

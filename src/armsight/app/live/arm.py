@@ -471,7 +471,6 @@ class ArmStep(PageStep[ArmState]):
             self.say("error", f"do not trust this run: {outcome.health[0].line()}")
 
     def _visit(self) -> None:
-        """Visit the poses of the guided hand-eye calibration."""
 
         def work(setup: Setup, rig: StereoRig, plan: MotionPlan, targets: Array) -> RunResult:
             self.handeye.clear()
@@ -526,7 +525,6 @@ class ArmStep(PageStep[ArmState]):
         return outcome
 
     def _setup(self, target: Composite) -> Setup:
-        """Return the devices as the loop takes them."""
         board, options, cameras = self._board, self.shared.options, self.shared.capture
         assert board is not None
         if self._simulated is not None:
@@ -665,7 +663,6 @@ class ArmStep(PageStep[ArmState]):
         )
 
     def _command(self) -> str:
-        """The command that runs the same."""
         options, measuring = self.shared.options, self._measuring
         motion = f" --motion {self.shared.motion}{' --follow-rig' * options.follow_rig}" if self._logged is None else ""
         return (
@@ -702,7 +699,6 @@ class ArmStep(PageStep[ArmState]):
 
 
 def _state_text(board: StoppableBoard) -> str:
-    """Return a board's state in words."""
     if board.stopped and not board.abilities.releases:
         return "stopped: the drives hold the joints at rest, this controller cannot switch them off"
     return STATE_TEXTS[board.status.state]

@@ -120,7 +120,6 @@ def _off(now: Detections, then: Detections) -> tuple[Array, Array]:
 
 
 def _sees(pair: Pair) -> tuple[bool, bool]:
-    """Return whether the left and the right camera see the board."""
     return pair.left.problem is None, pair.right.problem is None
 
 
@@ -264,7 +263,6 @@ class CalibrationStep(Guided[CalibrationState]):
         return float(min(count / STILL_DETECTIONS, 1.0) * min(1.0, STILL_PX / max(moved, 1e-6)))
 
     def _advice(self, pair: Pair, still: float) -> str:
-        """Return what the person should do now."""
         sees, edge_px = _sees(pair), self.shown.edge_px
         if not any(sees):
             return _SHOW

@@ -167,7 +167,6 @@ class HandEyeGuide(Guided[HandEyeState]):
             self._write(self.run)
 
     def _learn(self, run: HandEyeRun) -> None:
-        """Take in a fit."""
         self.run = run
         error_m = float(_errors_m(run, run.found.cov[None])[0])
         heldout_mm = 1e3 * run.found.held_out.rms()[0]
@@ -196,7 +195,6 @@ class HandEyeGuide(Guided[HandEyeState]):
             self.say("error", f"the hand-eye calibration cannot be written: {error}")
 
     def _choose(self) -> None:
-        """Choose the next pose."""
         self._next = None
         if self._around is None:
             return

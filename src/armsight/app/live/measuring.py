@@ -124,7 +124,6 @@ class _Followed:
     newest: tuple[LiveShot, PoseEstimate | Missed] | None = None
 
     def prepare(self, rig: StereoRig | None, sync_s: float) -> None:
-        """Get ready for a rig, and for exposures that are so far apart, s."""
         self.measure, self.newest = None if rig is None else measurer(rig, self.target, sync_s), None
 
     def points(self, pose: PoseEstimate) -> Array:
@@ -160,11 +159,9 @@ class _PoseFile:
 
     @property
     def rows(self) -> int:
-        """How many poses it holds."""
         return self._file.rows
 
     def close(self) -> None:
-        """Close both files."""
         self._mcap.close()
         with contextlib.suppress(InputError):  # a full disk: what it took is whole
             self._file.close()
@@ -239,7 +236,6 @@ class MeasureStep(PageStep[MeasureState]):
                 second.prepare(self.rig, self.shared.options.sync_s)
 
     def _prepare(self) -> None:
-        """Get ready for rig and target."""
         self._clear()
         self._streams.close()
         sync_s, rig, body = self.shared.options.sync_s, self.rig, self._body

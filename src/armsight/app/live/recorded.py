@@ -129,7 +129,6 @@ def _table(path: Path) -> list[list[str]]:
 
 
 def _number(row: list[str], column: int) -> float | None:
-    """Return a cell's number; None where it has none."""
     try:
         value = float(row[column])
     except (ValueError, IndexError):

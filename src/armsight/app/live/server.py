@@ -202,7 +202,6 @@ class LiveServer:
         return self.token is not None or host in ours
 
     def _knows(self, query: str) -> bool:
-        """Whether an address carries the token."""
         given = parse_qs(query).get("token", [""])[0]
         return self.token is None or hmac.compare_digest(given.encode(), self.token.encode())
 
@@ -368,7 +367,6 @@ class LiveServer:
                 self._hold("the page that commands does not answer")
 
     def _texts(self) -> dict[str, str]:
-        """Return every section as text."""
         self.session.between_shots()
         return {name: json_text({"section": name, "state": state}) for name, state in self.session.sections().items()}
 
@@ -386,7 +384,6 @@ class LiveServer:
 
 
 def _jpeg(live: LiveShot, side: int) -> bytes:
-    """Return one view as JPEG."""
     image = live.shot.left if side == 0 else live.shot.right
     assert image is not None
     image = image if image.ndim == 3 and image.dtype == "uint8" else grey(image)

@@ -226,7 +226,6 @@ class LiveSession:
         self.cameras.show(left_known=True)
 
     def _calibrated(self, rig: StereoRig, path: Path) -> None:
-        """Take a new rig."""
         self.measuring.use_rig(rig, path)
         if self.shared.simulated is not None:
             self.shared.simulated.person.holds = False

@@ -105,7 +105,6 @@ def _figure(run: ChartData) -> Figure:
 
 
 def _gaps(along: Array) -> NDArray[np.bool_]:
-    """Return (N - 1,) whether the interval between two shots is a gap."""
     steps = np.diff(along)
     return np.asarray(steps > _GAP_STEPS * np.median(steps)) if len(steps) else np.zeros(0, bool)
 

@@ -286,8 +286,6 @@ def _point(
 
 
 class _Panel:
-    """One camera's image in the picture."""
-
     def __init__(self, side: str, image: Image | None, size: tuple[int, int]) -> None:
         self.image = None if image is None else cv2.cvtColor(grey(image), cv2.COLOR_GRAY2BGR)
         self.title = side if image is not None else f"{side}: no image"

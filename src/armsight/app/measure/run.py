@@ -322,7 +322,6 @@ class MeasureRun:
 
 
 def _warn(line: str) -> None:
-    """Print what is weak."""
     click.echo(weak(line), err=True, color=colour())
 
 

@@ -101,7 +101,6 @@ class PictureFolder:
         return name
 
     def _put(self, name: str, data: bytes) -> None:
-        """Write a file, complete or not at all."""
         if not self._written:
             from armsight.app.show.page import writable_folder
 

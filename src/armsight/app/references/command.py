@@ -186,7 +186,6 @@ def _checked(entries: list[Entry]) -> Report:
 
 
 def _check(entry: Entry) -> tuple[dict[str, Any], list[str], list[str]]:
-    """Return values, lines and warnings of one recording."""
     import numpy as np
 
     from armsight.errors import InputError

@@ -60,7 +60,6 @@ def replay(request: Request, say: Callable[[str], None]) -> Replayed:
 
 
 def _of_run(request: Request, run: RecordedRun, say: Callable[[str], None]) -> Replayed:
-    """Run the estimators of a run again."""
     for note in run.notes:
         say(f"note: {note}")
     if request.rig is not None or request.target is not None:
@@ -137,7 +136,6 @@ def _of_source(request: Request, recorded: RecordedRun | None, say: Callable[[st
 
 
 def _of_images(request: Request, source: Source, bag: Bag | None, say: Callable[[str], None]) -> Replayed:
-    """Measure the images of a recording again."""
     assert request.target is not None
     for note in notes_of(source):
         say(f"note: {note}")
@@ -149,7 +147,6 @@ def _of_images(request: Request, source: Source, bag: Bag | None, say: Callable[
 
 
 def _rig(request: Request, bag: Bag | None, named: dict[str, str]) -> StereoRig:
-    """Return the rig that was given, or that of the recording."""
     if request.rig is not None:
         return StereoRig.load_trusted(request.rig)
     if bag is None:

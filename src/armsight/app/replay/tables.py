@@ -102,7 +102,6 @@ def compare(first: Path, second: Path) -> list[TableDifference]:
 
 
 def _pose_table(path: Path) -> Columns:
-    """Read a table of poses."""
     table = Columns.of_csv(path)
     if next(iter(table.at), None) not in ("shot", "t_s"):
         raise InputError(f"{path}: line 1: expected a table of poses whose first column is shot or t_s")
@@ -118,7 +117,6 @@ def _position_rms_m(deltas: Mapping[str, Array]) -> float | None:
 
 
 def _compared(*paths: Path) -> TableDifference:
-    """Return what differs between two tables."""
     tables = [_pose_table(path) for path in paths]
     a, b = ({row[0]: row for _, row in table.rows} for table in tables)
     columns = [name for name in list(tables[0].at)[1:] if name in tables[1].at]

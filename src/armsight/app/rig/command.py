@@ -158,7 +158,6 @@ def _sigmas(rig: StereoRig) -> dict[str, float]:
 
 
 def _json(path: str, rig: StereoRig) -> dict[str, Any]:
-    """Return the rig as one JSON object."""
     return {
         "rig": str(Path(path)),
         **{

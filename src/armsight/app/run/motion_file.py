@@ -91,7 +91,6 @@ def read_motions(arm: Arm, path: str | Path = DEFAULT_MOTION) -> MotionPlan:
 
 
 def _motion(where: str, arm: Arm, q: Array, entry: dict[str, Any], names: list[str], number: int) -> PlannedMotion:
-    """Plan one motion."""
     kind = entry.get("kind")
     if not isinstance(kind, str) or kind not in _KINDS:
         raise InputError(f"{where}: kind is {kind!r}; known are {', '.join(_KINDS)}")
@@ -160,7 +159,6 @@ def _line_goal(where: str, T_base_tool: Array, values: dict[str, Array]) -> Arra
 
 
 def _numbers(where: str, value: object, key: str, size: int) -> Array:
-    """Return the numbers of a key."""
     listed = value if isinstance(value, list) else [value]
     good = all(isinstance(n, int | float) and not isinstance(n, bool) and abs(n) < _MOST for n in listed)
     if not good or len(listed) != size or isinstance(value, list) != (size > 1):

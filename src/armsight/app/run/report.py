@@ -217,7 +217,6 @@ def show(report: Report, folder: Path, *, as_json: bool) -> None:
 
 
 def _known(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the values that are known."""
     return {key: value for key, value in values.items() if value is not None}
 
 
@@ -295,7 +294,6 @@ def _passes(result: RunResult, tracks: Tracks) -> tuple[PassErrors, PassErrors] 
 
 
 def _passes_json(before: PassErrors, after: PassErrors) -> dict[str, Any]:
-    """Return the JSON object of the two passes."""
     found: dict[str, Any] = {"singular_rests": {}}
     for when, each in (("before", before), ("after", after)):
         for name, value in each.singular.items():

@@ -203,7 +203,6 @@ class Service:
                 self._hear(data.decode(errors="replace").rstrip())
 
     def _hear(self, line: str) -> None:
-        """Take a line of the child."""
         self._last_line = line.removeprefix("armsight: error: ") or self._last_line
         if _PROGRESS.match(line):
             return
@@ -254,7 +253,6 @@ def _logger(config: ServeConfig) -> logging.Logger:
 
 
 def _close(logger: logging.Logger) -> None:
-    """Close the log."""
     for handler in logger.handlers[:]:
         logger.removeHandler(handler)
         with suppress(OSError):  # what a full disk did not take is lost

@@ -144,7 +144,6 @@ def words_of(cameras: str | None, board: str | None) -> dict[str, str]:
 
 
 def _asked(question: str) -> str:
-    """Ask a person for a line."""
     return str(click.prompt(question, default="", show_default=False, err=True)).strip()
 
 

@@ -49,7 +49,6 @@ class _Notes(logging.Handler):
         self._said = set[str]()
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Print one."""
         if (line := record.getMessage()) not in self._said:
             self._said.add(line)
             click.echo(f"note: {line}", err=True)

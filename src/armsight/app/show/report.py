@@ -276,7 +276,6 @@ def assessment(headlines: Sequence[str], meaning: str = "", grade: str = "") -> 
 
 
 def _html(block: Block, images: Mapping[str, bytes]) -> str:
-    """Return a block as HTML."""
     match block:
         case Html(html):
             return html

@@ -100,7 +100,6 @@ def _mean(values: Array, unit: float, *, root: bool = False) -> float | None:
 
 
 def _hottest(temperatures_c: Callable[[], Array | None] | None) -> float | None:
-    """Return the temperature of the hottest motor, degrees Celsius."""
     celsius = None if temperatures_c is None else temperatures_c()
     return None if celsius is None else round(float(celsius.max()), 1)
 

@@ -336,7 +336,6 @@ def finding(changes: Sequence[Change], names: Sequence[str]) -> HealthFinding:
 
 
 def _joint_finding(change: Change, names: Sequence[str], unsure: str) -> HealthFinding:
-    """Return the finding of a joint."""
     kind, joint = change.suspect.kind, change.suspect.joint
     size, sigma = float(np.degrees(change.size[0])), float(np.degrees(np.sqrt(change.cov[0, 0])))
     if kind == "backlash":
@@ -365,7 +364,6 @@ def _clock_finding(change: Change, unsure: str) -> HealthFinding:
 
 
 def _moved_finding(change: Change, unsure: str) -> HealthFinding:
-    """Return the finding of a rig or a body that moved."""
     shift, cov = change.newest
     size = float(np.linalg.norm(shift[:3]))
     along = shift[:3] / max(size, 1e-12)

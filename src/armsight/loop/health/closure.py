@@ -89,8 +89,6 @@ class _Tested(NamedTuple):
 
 
 class _Block:
-    """Sums of the shots of one block."""
-
     def __init__(self, begin_s: float, size: int) -> None:
         self.begin_s, self.count, self.kept = begin_s, 0, 1.0
         self.t, self.e, self.H, self.clock_s = 0.0, np.zeros(6), np.zeros((6, size)), 0.0
@@ -201,7 +199,6 @@ class ClosureWatch:
             self._block = None
 
     def _close(self, block: _Block) -> None:
-        """Add a block, and test."""
         self._t.append(block.t / block.count)
         self._e.append(block.e / block.count)
         self._H.append(block.H / block.count)
@@ -241,7 +238,6 @@ class ClosureWatch:
         return white @ model, white @ changes, (white @ e[..., None])[..., 0]
 
     def _sum(self, blocks: slice) -> None:
-        """Add blocks to the information."""
         H, changes, e = self._whitened(blocks)
         flat = H.reshape(-1, H.shape[2])
         self._N += flat.T @ flat
@@ -430,7 +426,6 @@ class ClosureWatch:
 
 
 def _matters(change: Change) -> bool:
-    """Return whether a change is so large that it is reported."""
     if change.suspect.cause == "time":
         return True
     if change.suspect.moves:

@@ -52,7 +52,6 @@ class HostWatch:
         return (*self._repetition(), *self._stalling())
 
     def _stalling(self) -> tuple[HealthFinding, ...]:
-        """Return the finding of stalls, if there were."""
         if self._stalls < max(_STALLS, _STALLED_SHARE * self._periods) and self._longest_s < _LONG_S:
             return ()
         times = "once" if self._stalls == 1 else f"{self._stalls} times"
@@ -69,7 +68,6 @@ class HostWatch:
         )
 
     def _repetition(self) -> tuple[HealthFinding, ...]:
-        """Return the finding of repeated shots, if there were."""
         if self._repeated < max(_LEAST, _SHARE * self._shots):
             return ()
         share = self._repeated / self._shots

@@ -64,7 +64,6 @@ class _Landmark:
 
     @property
     def moved(self) -> bool:
-        """Whether it moved in view."""
         if self.newest is None:
             return False
         xi, cov, _ = self.newest
@@ -194,7 +193,6 @@ def _agreed(last: tuple[Array, Array] | None, now: tuple[Array, Array] | None) -
 
 
 def _cameras(common: tuple[Array, Array], marks: Sequence[_Landmark]) -> HealthFinding:
-    """Return the finding of cameras that moved."""
     m, cov = common
     size = float(np.linalg.norm(m[:3]))
     along = m[:3] / max(size, 1e-12)
@@ -214,7 +212,6 @@ def _cameras(common: tuple[Array, Array], marks: Sequence[_Landmark]) -> HealthF
 
 
 def _not_fixed(mark: _Landmark) -> HealthFinding:
-    """Return the finding of a body that is not fixed."""
     what = f"the fixed body {mark.name} is not fixed: it moved by {1e3 * mark.shift_m:.2f} mm, others did not"
     return _finding(mark, what)
 

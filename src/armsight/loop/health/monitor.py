@@ -121,7 +121,6 @@ class HealthMonitor:
         return replace(pose, cov=pose.cov + self._suspected, cov_noise=pose.cov_noise + self._rig.noise)
 
     def _take(self, pose: PoseEstimate, t_s: float | None) -> None:
-        """Test a measured pose."""
         self._p_left = pose.T_left_body[:3, 3]
         if t_s is not None:
             self._host.take(pose, t_s)

@@ -455,7 +455,6 @@ class Passing:
         return (*before, _besides(replace(found, since_s=since_s if begins else None), causes))
 
     def _time_finding(self, *, timed: bool) -> HealthFinding:
-        """Return the finding of exposures that are apart."""
         since_s, tests = self.apart[0][0], [each for _, each in self.apart]
         information = np.sum([each.information for each in tests], axis=0)
         mean_s = np.linalg.solve(information, np.sum([each.information @ each.shared_s for each in tests], axis=0))
@@ -498,7 +497,6 @@ class Passing:
         )
 
     def _lens_finding(self, *, timed: bool) -> HealthFinding:
-        """Return the finding of a focal length that changes."""
         since_s, shares = self.focal[0][0], [share for _, share in self.focal]
         size = 100.0 * math.sqrt(float(np.mean(np.square(shares))))
         what = f"the focal length of one camera changes against that of the other by {size:.3f} % (RMS), within seconds"

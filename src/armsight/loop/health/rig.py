@@ -455,7 +455,6 @@ class RigWatch:
         return self._summed(stays, every=every, own=own, cov=cov).by(self._with_lens)
 
     def _decide(self, *, ends: bool = False) -> None:
-        """Test for a change with the newest shots."""
         stays, self._stays = self._stays, []
         if not stays:
             return
@@ -846,7 +845,6 @@ def _focal_changes(rig: StereoRig, size: int) -> Array:
 
 
 def _rig_finding(change: RigChange, since_s: float | None, alone: bool) -> HealthFinding:
-    """Return the finding of cameras that moved against each other."""
     rotation = change.f[_ROTATIONS]
     size = float(np.linalg.norm(rotation))
     along = rotation / size if size > 0.0 else np.zeros(3)
@@ -882,7 +880,6 @@ def _scale_finding(change: RigChange, since_s: float | None, alone: bool) -> Hea
 
 
 def _skew_finding(change: RigChange, since_s: float | None, alone: bool) -> HealthFinding:
-    """Return the finding of cameras that do not expose when they are said to."""
     size, sigma = 1e3 * float(change.f[_SKEWED]), 1e3 * float(np.sqrt(change.cov[_SKEWED, _SKEWED]))
     unsure = "; a rotation of one camera cannot be excluded" if alone else ""
     return HealthFinding(
@@ -931,7 +928,6 @@ def _breathing_finding(cov: Array, cost_m: float) -> HealthFinding:
 
 
 def _lens_finding(lens: LensError, cost_m: float) -> HealthFinding:
-    """Return the finding of camera models that lack something."""
     size, sigma = lens.size_px
     besides = "; a change of the cameras, the body or their times cannot be excluded" if lens.needed else ""
     return HealthFinding(

@@ -131,7 +131,6 @@ class _Spots:
 
     @property
     def followed(self) -> bool:
-        """Whether there are spots enough."""
         return len(self.uv) >= _LEAST
 
     def _choose(self) -> None:
@@ -192,7 +191,6 @@ class _Spots:
         return d, cov, seen
 
     def moved(self, image: Grey) -> CameraMotion | None:
-        """Return how the camera moved; None where too few spots are seen."""
         if not self.followed:
             return None
         d, cov, seen = self.displaced(image)
@@ -342,7 +340,6 @@ class SceneWatch:
     def _said(
         self, motions: Sequence[CameraMotion | None], certain: Sequence[bool], p_left: Array
     ) -> tuple[HealthFinding, ...]:
-        """Return the finding of cameras that moved."""
         moved = {side: motion for side, motion in enumerate(motions) if certain[side] and motion is not None}
         if not moved:
             return self._found

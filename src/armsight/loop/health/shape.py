@@ -519,7 +519,6 @@ class ShapeWatch:
         )
 
     def _points_finding(self, error: ShapeError, since_s: float | None) -> HealthFinding:
-        """Return the finding of points that are displaced."""
         points = [(each, _columns([each])) for each in error.chosen]
         largest = max((rows for _, rows in points), key=lambda rows: float(np.linalg.norm(error.value[rows])))
         size = float(np.linalg.norm(error.value[largest]))
@@ -595,7 +594,6 @@ def _explained(M: Array, hypotheses: _Hypotheses, excess: float) -> _Explained:
 
 
 def _columns(chosen: Sequence[int]) -> Ids:
-    """Return the columns of candidates."""
     return np.concatenate([[0] if each == FOCAL else np.arange(2 + 3 * each, 5 + 3 * each) for each in chosen])
 
 
@@ -613,7 +611,6 @@ def _differ(views: Array) -> bool:
 
 
 def _focal_finding(error: ShapeError, since_s: float | None) -> HealthFinding:
-    """Return the finding of a focal length that changed."""
     share, sigma = 100.0 * float(error.value[0]), 100.0 * float(np.sqrt(error.cov[0, 0]))
     goes_on = " so far, and it goes on" if error.onset.goes_on else ""
     longer, shorter = ("left", "right") if share > 0 else ("right", "left")

@@ -170,7 +170,6 @@ def _sizes(e: Array) -> Array:
 
 
 def _longer(Ts: Array, by: float) -> Array:
-    """Return poses (N, 4, 4) with their lengths multiplied."""
     out = Ts.copy()
     out[:, :3, 3] *= by
     return out
@@ -189,7 +188,6 @@ def _sized(p: Poses, by: float) -> Poses:
 
 
 def _angles(Ts: Array) -> Array:
-    """Return the angles between neighbouring poses, rad."""
     return np.asarray(np.linalg.norm(log_se3(inverse(Ts[:-1]) @ Ts[1:])[:, 3:], axis=1))
 
 

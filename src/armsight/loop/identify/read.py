@@ -197,7 +197,6 @@ def _rotated(table: Columns, measured: Measured, rotated: list[str], convention:
 
 
 def _joints(table: Columns, arm: ArmJoints | None) -> list[str]:
-    """Return the columns of the joints."""
     joints = table.joint_names() if arm is None else table.joint_names(len(arm.joint_names), arm.name)
     if not joints:
         most = 6 if arm is None else len(arm.joint_names)
