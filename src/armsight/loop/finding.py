@@ -105,6 +105,13 @@ class HealthFinding:
         return f"{self.cause}: {self.what}{since}{costs}{sigma}{right}; {self.advice}"
 
 
+def sized(x: Array, cov: Array) -> tuple[float, float]:
+    """Return the length of a vector (n,), and its standard deviation by its covariance (n, n)."""
+    size = float(np.linalg.norm(x))
+    along = x / max(size, 1e-12)
+    return size, float(np.sqrt(along @ cov @ along))
+
+
 def displacement_m(shift: Array) -> Array:
     """Return by how much tangents (..., 6), or roots of variances, displace the tool, m: rotations at ``LEVER_M``."""
     return np.asarray(np.linalg.norm(shift[..., :3], axis=-1) + LEVER_M * np.linalg.norm(shift[..., 3:], axis=-1))

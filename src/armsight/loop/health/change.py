@@ -14,7 +14,7 @@ import numpy as np
 from armsight.data import Array, Record
 from armsight.estimate.chance import chi_square_limit
 from armsight.geometry.pose import adjoint, inverse
-from armsight.loop.finding import LEVER_M, Cause, HealthFinding, displacement_m
+from armsight.loop.finding import LEVER_M, Cause, HealthFinding, displacement_m, sized
 
 if TYPE_CHECKING:
     from armsight.loop.estimators import PoseMeasurement
@@ -365,9 +365,7 @@ def _clock_finding(change: Change, unsure: str) -> HealthFinding:
 
 def _moved_finding(change: Change, unsure: str) -> HealthFinding:
     shift, cov = change.newest
-    size = float(np.linalg.norm(shift[:3]))
-    along = shift[:3] / max(size, 1e-12)
-    sigma = float(np.sqrt(along @ cov[:3, :3] @ along))
+    size, sigma = sized(shift[:3], cov[:3, :3])
     so_far = " so far" if change.suspect.slow else ""
     by = f"displaced by {1e3 * size:.2f} mm and {np.degrees(np.linalg.norm(shift[3:])):.3f} deg{so_far}{unsure}"
     if change.suspect.kind == "bend":
@@ -388,9 +386,7 @@ def _moved_finding(change: Change, unsure: str) -> HealthFinding:
 
 def _bend_finding(change: Change, unsure: str) -> HealthFinding:
     """Return the finding of a body that bends under gravity, by the angle of a beam that is level."""
-    size, shift_m = float(np.linalg.norm(change.size[:3])), abs(float(change.size[3]))
-    along = change.size[:3] / max(size, 1e-12)
-    sigma = float(np.sqrt(along @ change.cov[:3, :3] @ along))
+    (size, sigma), shift_m = sized(change.size[:3], change.cov[:3, :3]), abs(float(change.size[3]))
     return HealthFinding(
         "body",
         f"what holds the body bends under gravity: by up to {np.degrees(size):.3f} deg and "

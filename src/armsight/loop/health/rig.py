@@ -40,7 +40,7 @@ import numpy as np
 from armsight.data import Array, Body, Ids, PoseEstimate, Record
 from armsight.estimate.chance import chi_square_limit
 from armsight.geometry.pose import adjoint, inverse, log_se3
-from armsight.loop.finding import COSTS_M, SUSPECTED, HealthFinding, alarm_limit, displacement_m
+from armsight.loop.finding import COSTS_M, SUSPECTED, HealthFinding, alarm_limit, displacement_m, sized
 from armsight.loop.health.fixed import Unrest
 from armsight.loop.health.passing import TOGETHER, Apart, Leftover, Passes, Passing, Times, apart, eliminate, nodding
 from armsight.loop.health.residuals import (
@@ -845,19 +845,16 @@ def _focal_changes(rig: StereoRig, size: int) -> Array:
 
 
 def _rig_finding(change: RigChange, since_s: float | None, alone: bool) -> HealthFinding:
-    rotation = change.f[_ROTATIONS]
-    size = float(np.linalg.norm(rotation))
-    along = rotation / size if size > 0.0 else np.zeros(3)
-    sigma = float(np.sqrt(along @ change.cov[_ROTATIONS, _ROTATIONS] @ along))
+    size, sigma = np.degrees(sized(change.f[_ROTATIONS], change.cov[_ROTATIONS, _ROTATIONS])).tolist()
     unsure = "; a body of another size cannot be excluded" if alone else ""
     moved_mm = 1e3 * float(np.linalg.norm(change.f[:2]))
     return HealthFinding(
         "rig",
-        f"the right camera is rotated by {np.degrees(size):.3f} deg and shifted by {moved_mm:.2f} mm against the left one, "
+        f"the right camera is rotated by {size:.3f} deg and shifted by {moved_mm:.2f} mm against the left one, "
         f"compared with the calibration{', and goes on to' * change.slow}{unsure}",
         since_s,
-        float(np.degrees(size)),
-        float(np.degrees(sigma)),
+        size,
+        sigma,
         "deg",
         "fasten the cameras and calibrate the rig again",
     )

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from armsight.data import SIDES, Array, Image, Shot
 from armsight.geometry.pose import inverse, transform
 from armsight.geometry.rotation import skew
-from armsight.loop.finding import HealthFinding, alarm_limit
+from armsight.loop.finding import HealthFinding, alarm_limit, sized
 from armsight.vision.camera import Camera
 from armsight.vision.image import grey
 from armsight.vision.rig import StereoRig
@@ -84,10 +84,10 @@ class CameraMotion(NamedTuple):
 
     def sized(self) -> tuple[float, float, str, str]:
         """Return size, sigma, unit and words of what explains it: a shift where that does clearly, else a rotation."""
-        size, sigma = _size(*self.rotation, float(np.degrees(1.0)))
+        size, sigma = np.degrees(sized(*self.rotation)).tolist()
         how = f"rotated by {size:.3f} deg"
         if self.shift is not None and self.favours <= _DISTINCT:
-            shift_mm, sigma_mm = _size(*self.shift, 1e3)
+            shift_mm, sigma_mm = (1e3 * each for each in sized(*self.shift))
             if self.favours < -_DISTINCT:
                 return shift_mm, sigma_mm, "mm", f"moved by {shift_mm:.2f} mm"
             how += f", or moved by {shift_mm:.2f} mm: the two cannot be distinguished"
@@ -219,12 +219,6 @@ class _Spots:
         scale = max(min(moved[2].mean(), rotated[2].mean()) / 2, 1.0)
         favours = float(moved[2].sum() - rotated[2].sum()) / scale
         return CameraMotion(rotation, (moved[0][:3], moved[1][:3, :3] + floor), favours, int(good.sum()))
-
-
-def _size(x: Array, cov: Array, unit: float) -> tuple[float, float]:
-    """Return the length of a vector (3,) and its standard deviation, in a unit."""
-    size = float(np.linalg.norm(x))
-    return unit * size, unit * float(np.sqrt(x @ cov @ x)) / max(size, 1e-12)
 
 
 def _saliency(image: Grey) -> Array:

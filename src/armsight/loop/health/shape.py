@@ -36,7 +36,7 @@ import numpy as np
 from armsight.data import Array, Ids, Record
 from armsight.estimate.chance import chi_square_limit
 from armsight.geometry.rotation import skew
-from armsight.loop.finding import HealthFinding, alarm_limit
+from armsight.loop.finding import HealthFinding, alarm_limit, sized
 from armsight.loop.health.residuals import FURTHEST_M, STEPS, UNLIKE, History, Onset, ResidualSums, eliminated
 
 #: A focal length may change so much, as a share.
@@ -503,8 +503,7 @@ class ShapeWatch:
         shifts -= shifts.mean(axis=0)
         sizes = np.linalg.norm(shifts, axis=1)
         k = int(sizes.argmax())
-        along = np.zeros(len(error.value))
-        along[2 + 3 * k : 5 + 3 * k] = shifts[k] / sizes[k]
+        rows = slice(2 + 3 * k, 5 + 3 * k)
         strain = 50.0 * float(np.ptp(np.linalg.eigvalsh(rigid + rigid.T)))
         return HealthFinding(
             "body",
@@ -512,7 +511,7 @@ class ShapeWatch:
             f"direction to another, {self._names[k]} is displaced by {1e3 * sizes[k]:.2f} mm",
             since_s,
             1e3 * float(sizes[k]),
-            1e3 * float(np.sqrt(along @ error.cov @ along)),
+            1e3 * sized(shifts[k], error.cov[rows, rows])[1],
             "mm",
             "measure the body along two directions and both diagonals with calipers, or take its shape from images "
             "(armsight body); printers are off along one axis",
@@ -521,9 +520,7 @@ class ShapeWatch:
     def _points_finding(self, error: ShapeError, since_s: float | None) -> HealthFinding:
         points = [(each, _columns([each])) for each in error.chosen]
         largest = max((rows for _, rows in points), key=lambda rows: float(np.linalg.norm(error.value[rows])))
-        size = float(np.linalg.norm(error.value[largest]))
-        along = error.value[largest] / size
-        sigma = float(np.sqrt(along @ error.cov[np.ix_(largest, largest)] @ along))
+        size, sigma = sized(error.value[largest], error.cov[np.ix_(largest, largest)])
         names = ", ".join(
             f"{self._names[each]} by {1e3 * np.linalg.norm(error.value[rows]):.2f} mm" for each, rows in points
         )
@@ -556,7 +553,7 @@ def _reduced(sums: ResidualSums) -> _Reduced:
 def _smooth(points: Array) -> Array:
     """Return (3 N, 27) smooth deformations of points (N, 3), m: strains (9: by coordinate, direction) and bends (18).
 
-    The former are motions of rows of a matrix that multiplies the points, the latter products of two coordinates; each is
+    Strains multiply the points, bends are products of two coordinates; each is a share of the radius at the furthest point.
     """
     from_middle = points - points.mean(axis=0)
     radius = float(np.linalg.norm(from_middle, axis=1).max())
