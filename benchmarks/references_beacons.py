@@ -6,15 +6,19 @@ Each line gives the figure, the peer's on the same rows, and the goal.
 
 from __future__ import annotations
 
+import struct
 import sys
 from pathlib import Path
 
 import numpy as np
 import yaml
+from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from armsight.data import Array
+from armsight.errors import InputError
 from armsight.estimate.solve import covariances
+from armsight.geometry.pose import pose
 from armsight.geometry.rotation import exp_so3, log_so3
 from armsight.loop.identify.fit import linear_of, variances_of, with_joint_noise
 from armsight.loop.identify.identify import identify
@@ -22,7 +26,7 @@ from armsight.loop.identify.lengths import identify_wire
 from armsight.loop.identify.model import motion, nominal_table
 from armsight.loop.identify.selection import folds_of
 from armsight.loop.references.distance import Distance, follow_ranges
-from armsight.loop.references.lighthouse import EVENT, beginning, follow, lighthouse_of, read_events, sweeps_of
+from armsight.loop.references.lighthouse import Lighthouse, Sweeps, beginning, follow
 from armsight.robot.arm_file import open_arm
 
 FOLDS = 6
@@ -226,6 +230,110 @@ def crossing_error(t: Array, p: Array, mocap: Array, clock: float) -> Array:
 
 
 PARTS = {"draw-wire": draw_wire, "lighthouse2": lighthouse, "uwb": uwb}
+
+# Logs of a Crazyflie's lighthouse deck, as its SD card holds them: event types, then events. These give one diode's
+# time and, for one of four diodes a sweep, how long ago the beacon began its revolution; the beacon is known only there.
+CLOCK_HZ = 24e6  # of the deck
+#: Ticks of 48 MHz of a revolution, by channel.
+PERIODS = np.array([959, 957, 953, 949, 947, 943, 941, 939, 937, 929, 919, 911, 907, 901, 893, 887]) * 500.0
+APART = (
+    1200  # ticks between two diodes of one sweep at most; half: sweeps break near a beacon, double: two beacons merge
+)
+#: (4, 3) diodes of the deck, m.
+DIODES = np.array([[-0.015, 0.0075, 0.0], [-0.015, -0.0075, 0.0], [0.015, 0.0075, 0.0], [0.015, -0.0075, 0.0]])
+EVENT = "lhUartFrame"
+_KEYS = ("phase", "tilt", "curve", "gibmag", "gibphase", "ogeemag", "ogeephase")
+#: Sigmas of a beacon's pose as the open tool finds it (m, rad), and of the seven numbers that a beacon sends of a plane.
+SIGMA_POSE, SIGMA_SWEEP = (0.3, 0.1), (1e-3, 1e-3, 0.05, 5e-4, 0.5, 0.05, 0.5)
+
+
+def read_events(path: str | Path) -> dict[str, dict[str, Array]]:
+    """Return event name -> variable -> (N,) values; "t_s" is the time stamp.
+
+    Raises:
+        InputError: no such log, or it ends early.
+    """
+    try:
+        data = Path(path).read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror}: expected a Crazyflie log") from None
+    if len(data) < 9 or data[0] != 0xBC:
+        raise InputError(f"{path}: no Crazyflie log: its first byte is not 0xBC")
+    version, count = struct.unpack_from("<HH", data, 1)
+    if version not in (1, 2):
+        raise InputError(f"{path}: version {version} of the log; 1 and 2 are known")
+    at, types = 5, {}
+    try:
+        for _ in range(count):
+            (key,) = struct.unpack_from("<H", data, at)
+            name, at = _text(data, at + 2)
+            (variables,) = struct.unpack_from("<H", data, at)
+            at, names = at + 2, []
+            for _ in range(variables):
+                text, at = _text(data, at)
+                names.append(text)
+            types[key] = (name, [n[: n.index("(")] for n in names], "<" + "".join(n[n.index("(") + 1] for n in names))
+        found: dict[str, list[tuple[float, ...]]] = {name: [] for name, _, _ in types.values()}
+        stamp, unit = ("<HI", 1e-3) if version == 1 else ("<HQ", 1e-6)
+        while at < len(data) - 4:
+            key, t = struct.unpack_from(stamp, data, at)
+            name, _, layout = types[key]
+            values = struct.unpack_from(layout, data, at + struct.calcsize(stamp))
+            found[name].append((t * unit, *values))
+            at += struct.calcsize(stamp) + struct.calcsize(layout)
+    except (struct.error, KeyError, ValueError) as broken:
+        raise InputError(f"{path}: broken at byte {at}: copy the log from the card again") from broken
+    keys = {name: ["t_s", *variables] for name, variables, _ in types.values()}
+    return {n: dict(zip(keys[n], np.array(rows).reshape(-1, len(keys[n])).T, strict=True)) for n, rows in found.items()}
+
+
+def _text(data: bytes, at: int) -> tuple[str, int]:
+    end = data.index(0, at)
+    return data[at:end].decode("ascii"), end + 1
+
+
+def sweeps_of(events: dict[str, Array], beacons: int) -> Sweeps:
+    """Return sweeps by the deck's frames; times are the deck's clock, s.
+
+    Args:
+        events: variable -> values of EVENT.
+        beacons: how many beacons are known; sweeps of others are left out.
+    """
+    order = np.argsort(events["timestamp2FPGA"], kind="stable")
+    ticks, offset = events["timestamp2FPGA"][order], events["offset"][order]
+    diode, beacon = events["sensor"][order].astype(int), events["basestation"][order].astype(int)
+    out = []
+    for rows in np.split(np.arange(len(ticks)), np.flatnonzero(np.diff(ticks) > APART) + 1):
+        known = rows[offset[rows] > 0]
+        b = np.unique(beacon[known])
+        if len(rows) < 2 or len(b) != 1 or b[0] >= beacons or len(np.unique(diode[rows])) < len(rows):
+            continue
+        period = PERIODS[b[0]]
+        plane = int(offset[known[0]] > period / 2)
+        rotation = 2 * np.pi * (offset[known[0]] + ticks[rows] - ticks[known[0]]) / period
+        out.append((rows, plane, rotation - np.pi + (np.pi / 3 if plane == 0 else -np.pi / 3)))
+    if not out:
+        raise InputError(f"no sweep of the {beacons} known beacons: does the deck see them?")
+    rows = np.concatenate([r for r, _, _ in out])
+    first = np.concatenate([np.full(len(r), beacon[r[offset[r] > 0][0]]) for r, _, _ in out])
+    planes: NDArray[np.int64] = np.concatenate([np.full(len(r), k) for r, k, _ in out])
+    return Sweeps(ticks[rows] / CLOCK_HZ, diode[rows], first, planes, np.concatenate([a for _, _, a in out]))
+
+
+def lighthouse_of(
+    geos: dict[int, dict[str, object]], calibs: dict[int, dict[str, list[dict[str, float]]]]
+) -> Lighthouse:
+    """Return the beacons of a system configuration's tables ``geos`` and ``calibs``; their order is by number.
+
+    Their poses come from one look at a deck of 30 mm, so that distances are off by per cents: ``cov`` says so.
+    """
+    keys = sorted(geos)
+    Ts = np.stack([pose(np.array(geos[k]["rotation"], float), np.array(geos[k]["origin"], float)) for k in keys])
+    calibration = np.array([[[sweep[n] for n in _KEYS] for sweep in calibs[k]["sweeps"]] for k in keys])
+    one = np.concatenate([np.repeat(SIGMA_POSE, 3), np.tile(SIGMA_SWEEP, 2)])
+    cov = np.diag(np.tile(one**2, len(keys)))
+    return Lighthouse(name="lighthouse", cov=cov, Ts_base_beacon=Ts, calibration=calibration, receivers=DIODES)
+
 
 if __name__ == "__main__":
     for part in sys.argv[2:] or PARTS:

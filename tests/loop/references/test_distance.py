@@ -6,7 +6,7 @@ import numpy as np
 
 from armsight.geometry.pose import exp_se3
 from armsight.loop.references.calibrate import calibrate
-from armsight.loop.references.distance import Distance, fold_sigmas
+from armsight.loop.references.distance import Distance
 from armsight.loop.references.reference import Reading, ToolMotion
 
 STEP = 1e-6
@@ -48,11 +48,3 @@ def test_anchors_are_found_from_the_arms_motion() -> None:
     error = np.array(list(found.reference.parameters.values())) - np.array(list(true.parameters.values()))
     assert (np.abs(error) < 4 * np.sqrt(np.diag(found.reference.cov))).all()
     assert [k for k in range(240) if k % 40 == 7] == np.flatnonzero(~found.used).tolist()
-
-
-def test_a_flat_layout_does_not_distinguish_above_from_below() -> None:
-    flat = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.0]])
-    tall = flat + np.outer([0, 0.8, 0, 0.8], [0, 0, 1])
-    p = np.array([[0.5, 0.3, 0.7]])
-    assert fold_sigmas(flat, p, 0.01)[0] < 1e-9
-    assert fold_sigmas(tall, p, 0.01)[0] > 10

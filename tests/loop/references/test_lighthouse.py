@@ -1,34 +1,27 @@
-"""Lighthouse sweeps: derivatives, closed forms, the bundle with a body in motion, and the deck's log."""
+"""Lighthouse sweeps: derivatives, closed forms, the bundle with a body in motion."""
 
 from __future__ import annotations
-
-import struct
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from armsight.data import Array
-from armsight.errors import CalibrationError, InputError
+from armsight.errors import CalibrationError
 from armsight.geometry.pose import exp_se3
 from armsight.geometry.rotation import exp_so3
 from armsight.loop.references.lighthouse import (
-    DIODES,
-    EVENT,
-    PERIODS,
     SLANT,
     Lighthouse,
     Sweeps,
     beginning,
     follow,
-    read_events,
     sweep_angle,
-    sweeps_of,
     triangulated,
 )
 from armsight.loop.references.reference import ToolMotion
 
 NOISE_RAD, STEP = 40e-6, 1e-6
+DIODES = np.array([[-0.015, 0.0075, 0.0], [-0.015, -0.0075, 0.0], [0.015, 0.0075, 0.0], [0.015, -0.0075, 0.0]])  # m
 
 
 def _looking_at(eye: Array, at: Array) -> Array:
@@ -137,28 +130,6 @@ def test_a_point_triangulated_from_beacons_has_an_honest_covariance() -> None:
         assert 0.85 < nees < 1.15  # three sigma of 600 numbers
     with pytest.raises(CalibrationError, match="one line"):
         triangulated(np.tile([1.0, 0, 0], (2, 1)), np.stack([np.eye(4), exp_se3(np.eye(6)[0])]), np.ones(2))
-
-
-def _log(path: Path, frames: list[tuple[int, int, int, int]]) -> Path:
-    names = ("sensor(B)", "basestation(B)", "offset(I)", "timestampFPGA(I)", "timestamp2FPGA(I)")
-    head = struct.pack("<BHHH", 0xBC, 2, 1, 7) + EVENT.encode() + b"\0" + struct.pack("<H", len(names))
-    head += b"".join(n.encode() + b"\0" for n in names)
-    body = b"".join(struct.pack("<HQBBIII", 7, t, s, b, o, t, t) for s, b, o, t in frames)
-    path.write_bytes(head + body + bytes(4))
-    return path
-
-
-def test_a_deck_log_becomes_sweeps(tmp_path: Path) -> None:
-    frames = [(3, 0, 161392, 1000), (0, 2, 0, 1066), (1, 2, 0, 900), (2, 1, 323892, 90000), (0, 2, 0, 90258)]
-    s = sweeps_of(read_events(_log(tmp_path / "log", frames))[EVENT], 2)
-    assert s.beacon.tolist() == [0, 0, 0, 1, 1]
-    assert s.plane.tolist() == [0, 0, 0, 1, 1]
-    ticks = np.array([161392 - 100, 161392, 161392 + 66])
-    np.testing.assert_allclose(s.angle[:3], 2 * np.pi * ticks / PERIODS[0] - np.pi + np.pi / 3)
-    broken = tmp_path / "broken"
-    broken.write_bytes(_log(tmp_path / "log", frames).read_bytes()[:-15])
-    with pytest.raises(InputError, match="broken at byte"):
-        read_events(broken)
 
 
 def test_parameters_are_named_in_the_tangents_order() -> None:

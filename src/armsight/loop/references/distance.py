@@ -1,9 +1,7 @@
 """Distances between a point of the tool and fixed anchors: draw-wire, bar, laser, ultrasonic or ultra-wideband range.
 
 A channel is an anchor: z = scale |p - a| + offset, m. Parameters: the tool's point, then each anchor's position, offset and
-scale. Anchors nearly in one plane leave their mirror image open, :func:`fold_sigmas` gives by how much (Moore et al.,
-"Robust distributed network localization with noisy range measurements", SenSys 2004: no position from a layout whose flip
-noise can produce).
+scale. Anchors nearly in one plane leave their mirror image open.
 
 Path of a point by ranges to anchors, as ultra-wideband gives them: biased for seconds, now and then far too long.
 
@@ -81,24 +79,6 @@ class Distance(Reference):
             offset=self.offset + each[:, 3],
             scale=self.scale + each[:, 4],
         )
-
-
-def fold_sigmas(anchors: Array, p: Array, sigma_m: float) -> Array:
-    """Return by how many sigmas ranges distinguish positions from their mirror images about the anchors' best plane.
-
-    Args:
-        anchors: (A, 3) positions, m.
-        p: (N, 3) positions, m.
-        sigma_m: of a range, m.
-
-    Returns:
-        (N,) Mahalanobis distances; below 3 or so the position may be the mirror image, whatever the fit says.
-    """
-    centre = anchors.mean(axis=0)
-    normal = np.linalg.svd(anchors - centre)[2][2]
-    mirrored = p - 2 * ((p - centre) @ normal)[:, None] * normal
-    far, image = (np.linalg.norm(x[:, None] - anchors, axis=2) for x in (p, mirrored))
-    return np.asarray(np.linalg.norm(far - image, axis=1) / sigma_m)
 
 
 LONG, SHORT = (

@@ -11,19 +11,11 @@ In: sweeps of beacons, and a pose every now and then to begin with. Out: poses a
 reference with parameters and covariance. Between knots the body moves evenly; its acceleration is white noise. Readings are
 weighed by Cauchy's function, whose scale falls from round to round: reflections lose their weight and far starts arrive.
 The knots are a band, which is eliminated (Triggs et al., "Bundle adjustment: a modern synthesis", 2000).
-
-Logs of a Crazyflie's lighthouse deck (binary, as its SD card holds them) as sweeps, and its system configuration.
-
-A log is a list of event types, then events. The deck's events give one diode's time and, for one of four diodes a sweep,
-how long ago the beacon began its revolution, in ticks of 24 MHz; the others follow by their times. The beacon is known only
-where that is: the other events have an arbitrary number there.
 """
 
 from __future__ import annotations
 
-import struct
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -32,8 +24,8 @@ from scipy.linalg import cho_solve_banded, cholesky_banded
 from scipy.spatial.transform import Rotation, Slerp
 
 from armsight.data import Array, Record
-from armsight.errors import CalibrationError, InputError
-from armsight.geometry.pose import exp_se3, pose
+from armsight.errors import CalibrationError
+from armsight.geometry.pose import exp_se3
 from armsight.geometry.rotation import exp_so3, log_so3, nearest_rotation, skew
 from armsight.loop.references.reference import ExpectedReading, Reference, ToolMotion
 
@@ -432,105 +424,3 @@ class _Bundle:
         g = own.T @ (weight * e) + self._known * at[self.free] - border.T @ X[:, 0]
         x = -np.linalg.solve(H, g) if len(self.free) else g
         return -(X[:, 0] + X[:, 1:] @ x).reshape(-1, KNOTS), np.asarray(x)
-
-
-CLOCK_HZ = 24e6  # of the deck
-#: Ticks of 48 MHz of a revolution, by channel.
-PERIODS = np.array([959, 957, 953, 949, 947, 943, 941, 939, 937, 929, 919, 911, 907, 901, 893, 887]) * 500.0
-APART = (
-    1200  # ticks between two diodes of one sweep at most; half: sweeps break near a beacon, double: two beacons merge
-)
-#: (4, 3) diodes of the deck, m.
-DIODES = np.array([[-0.015, 0.0075, 0.0], [-0.015, -0.0075, 0.0], [0.015, 0.0075, 0.0], [0.015, -0.0075, 0.0]])
-EVENT = "lhUartFrame"
-_KEYS = ("phase", "tilt", "curve", "gibmag", "gibphase", "ogeemag", "ogeephase")
-#: Sigmas of a beacon's pose as the open tool finds it (m, rad), and of the seven numbers that a beacon sends of a plane.
-SIGMA_POSE, SIGMA_SWEEP = (0.3, 0.1), (1e-3, 1e-3, 0.05, 5e-4, 0.5, 0.05, 0.5)
-
-
-def read_events(path: str | Path) -> dict[str, dict[str, Array]]:
-    """Return event name -> variable -> (N,) values; "t_s" is the time stamp.
-
-    Raises:
-        InputError: no such log, or it ends early.
-    """
-    try:
-        data = Path(path).read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: {error.strerror}: expected a Crazyflie log") from None
-    if len(data) < 9 or data[0] != 0xBC:
-        raise InputError(f"{path}: no Crazyflie log: its first byte is not 0xBC")
-    version, count = struct.unpack_from("<HH", data, 1)
-    if version not in (1, 2):
-        raise InputError(f"{path}: version {version} of the log; 1 and 2 are known")
-    at, types = 5, {}
-    try:
-        for _ in range(count):
-            (key,) = struct.unpack_from("<H", data, at)
-            name, at = _text(data, at + 2)
-            (variables,) = struct.unpack_from("<H", data, at)
-            at, names = at + 2, []
-            for _ in range(variables):
-                text, at = _text(data, at)
-                names.append(text)
-            types[key] = (name, [n[: n.index("(")] for n in names], "<" + "".join(n[n.index("(") + 1] for n in names))
-        found: dict[str, list[tuple[float, ...]]] = {name: [] for name, _, _ in types.values()}
-        stamp, unit = ("<HI", 1e-3) if version == 1 else ("<HQ", 1e-6)
-        while at < len(data) - 4:
-            key, t = struct.unpack_from(stamp, data, at)
-            name, _, layout = types[key]
-            values = struct.unpack_from(layout, data, at + struct.calcsize(stamp))
-            found[name].append((t * unit, *values))
-            at += struct.calcsize(stamp) + struct.calcsize(layout)
-    except (struct.error, KeyError, ValueError) as broken:
-        raise InputError(f"{path}: broken at byte {at}: copy the log from the card again") from broken
-    keys = {name: ["t_s", *variables] for name, variables, _ in types.values()}
-    return {n: dict(zip(keys[n], np.array(rows).reshape(-1, len(keys[n])).T, strict=True)) for n, rows in found.items()}
-
-
-def _text(data: bytes, at: int) -> tuple[str, int]:
-    end = data.index(0, at)
-    return data[at:end].decode("ascii"), end + 1
-
-
-def sweeps_of(events: dict[str, Array], beacons: int) -> Sweeps:
-    """Return sweeps by the deck's frames; times are the deck's clock, s.
-
-    Args:
-        events: variable -> values of EVENT.
-        beacons: how many beacons are known; sweeps of others are left out.
-    """
-    order = np.argsort(events["timestamp2FPGA"], kind="stable")
-    ticks, offset = events["timestamp2FPGA"][order], events["offset"][order]
-    diode, beacon = events["sensor"][order].astype(int), events["basestation"][order].astype(int)
-    out = []
-    for rows in np.split(np.arange(len(ticks)), np.flatnonzero(np.diff(ticks) > APART) + 1):
-        known = rows[offset[rows] > 0]
-        b = np.unique(beacon[known])
-        if len(rows) < 2 or len(b) != 1 or b[0] >= beacons or len(np.unique(diode[rows])) < len(rows):
-            continue
-        period = PERIODS[b[0]]
-        plane = int(offset[known[0]] > period / 2)
-        rotation = 2 * np.pi * (offset[known[0]] + ticks[rows] - ticks[known[0]]) / period
-        out.append((rows, plane, rotation - np.pi + (np.pi / 3 if plane == 0 else -np.pi / 3)))
-    if not out:
-        raise InputError(f"no sweep of the {beacons} known beacons: does the deck see them?")
-    rows = np.concatenate([r for r, _, _ in out])
-    first = np.concatenate([np.full(len(r), beacon[r[offset[r] > 0][0]]) for r, _, _ in out])
-    planes: NDArray[np.int64] = np.concatenate([np.full(len(r), k) for r, k, _ in out])
-    return Sweeps(ticks[rows] / CLOCK_HZ, diode[rows], first, planes, np.concatenate([a for _, _, a in out]))
-
-
-def lighthouse_of(
-    geos: dict[int, dict[str, object]], calibs: dict[int, dict[str, list[dict[str, float]]]]
-) -> Lighthouse:
-    """Return the beacons of a system configuration's tables ``geos`` and ``calibs``; their order is by number.
-
-    Their poses come from one look at a deck of 30 mm, so that distances are off by per cents: ``cov`` says so.
-    """
-    keys = sorted(geos)
-    Ts = np.stack([pose(np.array(geos[k]["rotation"], float), np.array(geos[k]["origin"], float)) for k in keys])
-    calibration = np.array([[[sweep[n] for n in _KEYS] for sweep in calibs[k]["sweeps"]] for k in keys])
-    one = np.concatenate([np.repeat(SIGMA_POSE, 3), np.tile(SIGMA_SWEEP, 2)])
-    cov = np.diag(np.tile(one**2, len(keys)))
-    return Lighthouse(name="lighthouse", cov=cov, Ts_base_beacon=Ts, calibration=calibration, receivers=DIODES)
