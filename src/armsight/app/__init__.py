@@ -4,6 +4,6 @@ A ``command.py`` has the options and the help; its functions import what does th
 mistakes in the options and the completion of a shell import neither numpy nor OpenCV. Constants that options show stand in
 light modules, most of them in the ``__init__.py`` of their package.
 
-``main.py`` is the group. ``report/`` holds what all reports share, ``shot_pose.py`` a shot's pose as JSON and CSV,
-``progress.py`` the progress bars; ``interrupts.py`` delays Ctrl-C until something is complete.
+``main.py`` is the group, ``show/`` how every result is shown; ``interrupts.py`` delays Ctrl-C until something is
+complete.
 """

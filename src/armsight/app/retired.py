@@ -1,8 +1,4 @@
-"""Options that are retired: command lines that have them go on working, and say what is written today.
-
-In: the arguments of a command line. Out: the same in today's options. A rule puts the value of a retired option where it
-belongs now.
-"""
+"""Options that are retired: command lines that have them go on working, and say what is written today."""
 
 from __future__ import annotations
 

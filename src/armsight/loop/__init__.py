@@ -1,7 +1,5 @@
 """The closed loop: what needs both vision and robot.
 
-In: poses that vision measured, joints that the robot read. Out: joint commands, and what is known of the arm.
-
 - ``running``: the control loop, what it finds by moving the arm, and its log.
 - ``servo``: the outer loop, from a motion and an estimate to the next joint command.
 - ``estimators``: the tool's pose at 1 kHz, from potentiometers and vision.

@@ -1,8 +1,4 @@
-"""Text files as rows of cells: tables with any separator, lists, programs of robots, YAML and JSON.
-
-In: a file. Out: :class:`Cells`, names of columns and rows of text, whichever form the file has. What the columns mean is
-``columns.py``'s.
-"""
+"""Text files as rows of cells: tables with any separator, lists, programs of robots, YAML and JSON."""
 
 from __future__ import annotations
 

@@ -1,9 +1,6 @@
 """Numbers as any program writes them, and whether a length can be one.
 
 The unit of a file is its author's, and a wrong one is a factor of 1000 in every result.
-
-In: a length, the unit it was read in, and what it is of. Out: nothing, or an error that names the unit in which it would
-be an ordinary one.
 """
 
 from __future__ import annotations

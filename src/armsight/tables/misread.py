@@ -1,8 +1,4 @@
-"""Other readings of the numbers of a table: what they would be if something about it were other than was said.
-
-In: a table of poses. Out: its poses read in other ways, and what each would mean. Which of them is true is for the
-subject's own closed form to say: the one that makes its data fit.
-"""
+"""Other readings of the numbers of a table: what they would be if something about it were other than was said."""
 
 from __future__ import annotations
 

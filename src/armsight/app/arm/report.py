@@ -1,7 +1,4 @@
-"""The report of an arm for its owner: one page, the same as a PDF, and one JSON that others can compare.
-
-In: an :class:`~armsight.app.arm.evaluate.ArmReport`, and reports of other arms. Out: report.html, report.pdf, report.json.
-"""
+"""The report of an arm for its owner: one page, the same as a PDF, and one JSON that others can compare."""
 
 from __future__ import annotations
 

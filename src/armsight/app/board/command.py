@@ -1,7 +1,4 @@
-"""``armsight board``: build and flash the firmware, watch a board, tune its gains, test it, bring it up.
-
-In: the name of a board, emulated or at a port. Out: JSON objects in SI units, text in degrees.
-"""
+"""``armsight board``: build and flash the firmware, watch a board, tune its gains, test it, bring it up."""
 
 from __future__ import annotations
 

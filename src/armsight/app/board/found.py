@@ -1,7 +1,4 @@
-"""What a bring-up found: the records of joints and board, their file, the configuration that follows, the page of figures.
-
-In: what :mod:`armsight.app.board.bringup` measured. Out: ``bringup.json``, a board's configuration, ``report.html``.
-"""
+"""What a bring-up found: the records of joints and board, their file, the configuration, the page."""
 
 from __future__ import annotations
 

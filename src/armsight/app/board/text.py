@@ -1,7 +1,4 @@
-"""What ``armsight board`` prints: JSON objects in SI units, and text in degrees.
-
-In: records of a board and of a build. Out: for each a function NAME_json and a function NAME_text; gains with changes.
-"""
+"""What ``armsight board`` prints: JSON objects in SI units, and text in degrees."""
 
 from __future__ import annotations
 

@@ -1,9 +1,4 @@
-"""``armsight body``: assess a body before it is built, and draw its markers to scale.
-
-In: a body file (docs/howto/targets.md) and, for the assessment, a stereo rig and distances. Out: findings with the
-predicted covariance of the pose; drawings as PDF, SVG or PNG. ``check`` assesses, ``text`` says it, ``draw``
-draws one page for each plane of the body.
-"""
+"""``armsight body``: assess a body before it is built, and draw its markers to scale."""
 
 import math
 

@@ -1,7 +1,4 @@
-"""Assess a body before it is built: its markers, its predicted pose, and which discs may be taken for which.
-
-In: a body's layout, a stereo rig and distances. Out: an ``Assessment``; ``armsight body check`` prints it.
-"""
+"""Assess a body before it is built: its markers, its predicted pose, and which discs may be taken for which."""
 
 from __future__ import annotations
 

@@ -1,9 +1,6 @@
 """A body's markers, or a calibration board, on paper, to scale: ``armsight body draw``.
 
-In: a body's layout, or a board's spec. Out: a page for each plane of the body, seen from outside, as PDF, SVG or PNG; one
-that is larger than the paper is split over several sheets where that is requested.
-
-First the markers are sorted by plane. The coordinates of a ``Page`` are millimetres, x to the right and y down, the body's
+Markers are sorted by plane. The coordinates of a ``Page`` are millimetres, x to the right and y down, the body's
 origin projected to (0, 0). Then each page is put on paper: a figure of the paper's size whose only axes cover it and count
 millimetres from its upper left corner.
 """

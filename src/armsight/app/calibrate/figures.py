@@ -1,7 +1,4 @@
-"""The figures of a calibration's report: predicted sigma, shape of the target, coverage, residuals, errors by pair.
-
-In: a Calibration. Out: a matplotlib Figure each, or None where there is nothing to plot.
-"""
+"""The figures of a calibration's report: predicted sigma, shape of the target, coverage, residuals, errors by pair."""
 
 from __future__ import annotations
 

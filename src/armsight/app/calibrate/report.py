@@ -1,7 +1,4 @@
-"""The result of a calibration as a Report: its table, its JSON, and a page with its assessment and its figures.
-
-In order: the tables; the figures with their captions, which explain what one should see, and what would be bad; the report.
-"""
+"""The result of a calibration as a Report: its table, its JSON, and a page with its assessment and its figures."""
 
 from __future__ import annotations
 

@@ -1,8 +1,4 @@
-"""``armsight check``: evaluate an arm by ISO 9283 and ISO 230-4, or plan the motions of such a test.
-
-In: a run's folder (``run_folder``) or a CSV of attained poses (``rows``). Out: metrics of poses, distance, paths, drift and
-a circle (``evaluate``, ``result``), as text, JSON and a page (``report``); ``plan``: the motions of a test.
-"""
+"""``armsight check``: evaluate an arm by ISO 9283 and ISO 230-4, or plan the motions of such a test."""
 
 #: Test -> how many cycles it has unless asked otherwise, and how many ISO 9283 requires.
 CYCLES, REQUIRED_CYCLES = {"poses": 30, "wide": 1, "line": 10, "circle": 3}, {"poses": 30, "line": 10}

@@ -1,8 +1,4 @@
-"""The metrics of a test as text, as figures and as one HTML page that holds everything it shows.
-
-In: the metrics (``result``) and the rows that they are made of. Out: text in mm for the terminal; a folder of report.html,
-its figures as PNG, SVG and CSV, check.json and check.csv.
-"""
+"""The metrics of a test as text, as figures and as one HTML page that holds everything it shows."""
 
 from __future__ import annotations
 

@@ -1,8 +1,4 @@
-"""The files of a dense result, and pictures of disparity maps.
-
-In: a disparity map, with a rig its rectification. Out: the files that ``armsight dense`` leaves in its folder, and a
-:class:`DenseSummary`; a picture in colours with a scale, where what was not measured is marked; a map of errors.
-"""
+"""The files of a dense result, and pictures of disparity maps."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""One pair of ``armsight dense``, from images to files.
-
-In: the images of a pair, how to rectify them, a method and its search. Out: the files and a :class:`PairResult`.
-"""
+"""One pair of ``armsight dense``, from images to files."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""A run as another recording: MCAP compressed with zstd, or a ROS 2 bag.
-
-Which of Foxglove's messages become which of ROS's: ``app/stream/ros.py``; the others are left out.
-"""
+"""A run as another recording: MCAP compressed with zstd, or a ROS 2 bag."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""One identification: identify, and validate on poses that were not fitted to.
-
-In: the nominal arm and measured poses. Out: an :class:`Identification`, whose Report is ``report``'s.
-"""
+"""One identification: identify, and validate on poses that were not fitted to."""
 
 from __future__ import annotations
 

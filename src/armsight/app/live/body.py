@@ -1,8 +1,4 @@
-"""What is printed: the calibration board, and the body that is measured; drawn to scale, the body checked before.
-
-In: a board's spec, a body file. Out: a :class:`BoardChoice` and a :class:`BodyState`, and PDFs in the folder of the
-session. What is checked is what ``armsight body check`` checks, with the session's own rig once there is one.
-"""
+"""What is printed: the calibration board, and the body that is measured; drawn to scale, the body checked before."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""The cameras: which ones are open, which of them is left, and what is wrong with their images.
-
-In: the newest shots. Out: a :class:`CamerasState`. With ``sim:`` the workcell stands for them, and a simulated person.
-"""
+"""The cameras: which ones are open, which of them is left, and what is wrong with their images."""
 
 from __future__ import annotations
 

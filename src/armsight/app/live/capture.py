@@ -1,7 +1,6 @@
 """Reads the cameras in a thread and keeps the newest shot; nobody waits for a camera, and no camera waits for anybody.
 
-In: what opens a source. Out: the newest :class:`LiveShot`, the rate, and what is wrong in words. A camera that is gone is
-opened again every few seconds: a cable that is put back continues the work.
+A camera that is gone is opened again every few seconds: a cable that is put back continues the work.
 """
 
 from __future__ import annotations

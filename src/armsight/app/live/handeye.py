@@ -1,10 +1,8 @@
 """The guided hand-eye calibration: which pose of the arm to take next, and how good the calibration is, in mm.
 
-In: poses of the arm at rest, taken by a person or by the arm itself. Out: a :class:`HandEyeState` at any time, and a
-:class:`~armsight.loop.running.calibrate.HandEyeRun`, which the loop uses and ``handeye/`` of the session holds. The next
-pose is the one of the candidates after which the predicted error is least: the RMS distance by which the covariance of the
+The next pose is the one of the candidates after which the predicted error is least: the RMS distance by which the
+covariance of the
 calibration moves a measured position in the arm's base (as :mod:`~armsight.vision.calibrate.guide` does for the cameras).
-From the same poses :class:`IdentifyStep` makes a corrected arm, and the files of ``armsight identify``.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """Measuring, shot by shot, and whether the calibrations still hold.
 
-In: live shots, a rig, a target. Out: a :class:`MeasureState` at any time; poses as CSV, in the form of ``armsight
-measure``. The sigma is split into precision (the noise of this shot) and what the calibration leaves in all shots alike.
+The sigma is split into precision (the noise of this shot) and what the calibration leaves in all shots alike.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""What was recorded: every table in the session's folder, any column of it over time, and all of it at one moment.
-
-In: the CSV files of recordings and runs. Out: a :class:`RecordedState`; the page draws its points and moves along its rows.
-"""
+"""What was recorded: every table in the session's folder, any column of it over time, and all of it at one moment."""
 
 from __future__ import annotations
 

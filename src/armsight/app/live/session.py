@@ -1,8 +1,7 @@
 """A session of ``armsight live``: the cameras, the steps, and what a person wants of them; it knows nothing of a page.
 
-In: :class:`SessionOptions`, and commands (:mod:`~armsight.app.live.records`). Out: sections of state, events, the newest
-shot, and the folder of the session. CameraCapture, what looks at the images, and the arm have a thread each; none waits
-for another, and none of them for whoever shows the state.
+CameraCapture, what looks at the images, and the arm have a thread each; none waits for another, nor for who shows the
+state.
 """
 
 from __future__ import annotations

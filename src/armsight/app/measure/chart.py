@@ -1,7 +1,4 @@
-"""The strip chart of many shots: how each was found, the pose, its sigmas and the residuals, one above the other.
-
-In: the shots' :class:`~armsight.vision.pose.shot_pose.ShotPose`. Out: a PNG.
-"""
+"""The strip chart of many shots: how each was found, the pose, its sigmas and the residuals, one above the other."""
 
 from __future__ import annotations
 

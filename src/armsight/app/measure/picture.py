@@ -1,9 +1,5 @@
 """One shot as a picture: what was measured, both images side by side, and below them the points enlarged.
 
-In: the rig, the body, a shot and its measured pose. Out: a BGR image. In order: :class:`Marks`, the positions of the body's
-points in both images (by the pose, as detected, dropped and why); lines and text on an image, with OpenCV; the header; the
-picture.
-
 A disc is shown by its image ellipse. A measurement corrects the detected centre for the perspective bias; here the bias is
 added again, so that the detection lies in its ellipse. The residual is the same either way. OpenCV's letters are ASCII on
 some versions: other characters are spelt out, or become a question mark.

@@ -1,8 +1,4 @@
-"""What ``armsight measure`` measures: images of a target, or detections of a body; each gives shots with their results.
-
-In: the options of the command, a rig. Out: :class:`ImageShots` or :class:`DetectedShots`, whose ``results`` are read one
-after the other, and which say afterwards what the images showed besides.
-"""
+"""What ``armsight measure`` measures: images of a target, or detections of a body; each gives shots with their results."""
 
 from __future__ import annotations
 

@@ -1,8 +1,4 @@
-"""``armsight rig update``: the relative pose of the cameras estimated again from what a run saw, and its page.
-
-In: a run's folder, with its rig, its body and its detections. Out: a new rig file, lines for people or JSON, and a page
-with the old rig beside the new one.
-"""
+"""``armsight rig update``: the relative pose of the cameras estimated again from what a run saw, and its page."""
 
 from __future__ import annotations
 

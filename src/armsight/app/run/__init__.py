@@ -1,7 +1,5 @@
 """``armsight run``: the experiment with an arm, a board and two cameras.
 
-In: devices (``devices.py``), a calibrated rig, a motion file (``motion_file.py``). Out: a folder of tracks with a report.
-
 ``experiment.py`` has the sequence; the control loop is in ``loop/running``. ``tracks.py`` makes the tracks of its log,
 ``metrics.py`` evaluates them, ``report.py`` says the result once for terminal, JSON and page (``figures.py``),
 ``folder.py`` writes all of it. ``logged.py``, ``angles.py``: an arm that another program moves.

@@ -1,7 +1,4 @@
-"""The figures of a run: joint angles, the tool's path, errors against the truth, the loop, latency, an overview, studies.
-
-In: parts of the tracks with few enough rows to be seen, and metrics. Out: figures; None where there is nothing to plot.
-"""
+"""The figures of a run: joint angles, path, errors against the truth, the loop, latency, an overview, studies."""
 
 from __future__ import annotations
 

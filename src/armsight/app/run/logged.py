@@ -1,9 +1,4 @@
-"""A run without motion: shots of an arm that another program moved, and the joint angles that it logged.
-
-In: a source of shots, a rig, a body and :class:`~armsight.app.run.angles.LoggedAngles`. Out: a folder with the hand-eye
-calibration, the poses it was made from (as ``armsight identify`` reads them), the error of every pose when it is left out,
-a summary and a page.
-"""
+"""A run without motion: shots of an arm that another program moved, and the joint angles that it logged."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""The report of a run: what summary.json holds, what the terminal says, and the page with its figures; made once.
-
-In: what a run measured, its tracks, studies. Out: a :class:`~armsight.app.show.report.Report`.
-"""
+"""The report of a run: what summary.json holds, what the terminal says, and the page with its figures; made once."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """A few pages over HTTP, read only, in threads of their own: for health checks, metrics, and people on this computer.
 
-Another computer needs the address with the token that :attr:`Pages.address` has. A name that is not this server's is
-answered
-nothing: a foreign page in the same browser could bring one (DNS rebinding).
+Another computer needs the token of :attr:`Pages.address`. A name that is not this server's gets no answer: a foreign
+page in
+the same browser could bring one (DNS rebinding).
 """
 
 from __future__ import annotations

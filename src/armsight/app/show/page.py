@@ -1,8 +1,4 @@
-"""Pages of reports: one HTML file that holds everything it shows and needs no network, and the folder it is written to.
-
-In: sections of HTML and the bytes of pictures. Out: the text of a page; files that are complete or not there at all.
-Whatever comes from outside passes :func:`text`, which escapes it.
-"""
+"""Pages of reports: one HTML file that holds everything it shows and needs no network, and the folder it is written to."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Plots of reports: style, canvas, arrows; matplotlib without a display, imported only when something is plotted.
-
-Plot within :func:`drawing`, on a :func:`new_figure`; :func:`png`, :func:`svg`, :func:`data_csv` return a file's bytes.
-"""
+"""Plots of reports: style, canvas, arrows; matplotlib without a display, imported only when something is plotted."""
 
 from __future__ import annotations
 

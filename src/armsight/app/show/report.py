@@ -1,8 +1,4 @@
-"""One result: a Report is made once by the command that found something, and shown as text, JSON, page and exit code.
-
-In: facts, tables, figures and notes, in sections. Out, of the same Report: :meth:`Report.text` for the terminal,
-:meth:`Report.json` for programs, :meth:`Report.write` for the folder of ``-o``, :meth:`Report.echo` to end a command.
-"""
+"""One result: a Report is made once by the command that found something, and shown as text, JSON, page and exit code."""
 
 from __future__ import annotations
 

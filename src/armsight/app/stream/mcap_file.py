@@ -3,9 +3,6 @@
 Beside the messages of ``foxglove.py`` it holds every datum as JSON with all digits, on ``/armsight/shot``,
 ``/armsight/joints`` and ``/armsight/event``, from which ``armsight replay`` reads; and, as metadata, the rig file and the
 versions. What waits is written out at least every half a second: if the process is killed, no more than that is missing.
-
-foxglove-schemas-protobuf with mcap-protobuf-support is used, not foxglove-sdk: together 4 MB of Python against a binary of
-54 MB, for the same schemas.
 """
 
 from __future__ import annotations

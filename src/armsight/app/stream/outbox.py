@@ -1,8 +1,4 @@
-"""Events that wait on disk until a hub has stored them: numbered, and sent by one process alone.
-
-In: events, one at a time. Out: those that were not confirmed, oldest first. A storm is thinned, and what was left out
-is counted.
-"""
+"""Events that wait on disk until a hub has stored them: numbered, and sent by one process alone."""
 
 from __future__ import annotations
 

@@ -1,8 +1,5 @@
 """Estimators: the pose of the tool at 1 kHz, from potentiometers and vision.
 
-In: :class:`~armsight.data.JointStates` and :class:`PoseMeasurement` (``mounting`` makes them from what a rig measured).
-Out: :class:`ArmEstimate` and :class:`Track`, poses with covariances.
-
 ``estimator`` is the contract of the family; its members are ``kalman`` (fuses both) and ``latest`` (vision alone). The
 Kalman filter's model is in ``armerror`` (what makes potentiometers wrong, as one vector) and ``errormodel`` (how motion
 changes it); ``readings`` and ``parabola`` smooth the potentiometers, ``backlash_dynamics`` follows links inside their

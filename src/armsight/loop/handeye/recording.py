@@ -1,8 +1,4 @@
-"""Both sides of a hand-eye calibration brought together: row by row, by time, or as two streams.
-
-In: a table of robot poses, or a recording of them, and what was seen. Out: :class:`PairedPoses`, rows that belong together,
-with their names.
-"""
+"""Both sides of a hand-eye calibration brought together: row by row, by time, or as two streams."""
 
 from __future__ import annotations
 

@@ -1,8 +1,4 @@
-"""Metrics of paths (ISO 9283, clause 8) and circles (ISO 230-4): accuracy, repeatability, reversals.
-
-In: positions attained along a path that is followed several times, or a circle both ways, and the instrument's covariance.
-Out: :class:`PathMetrics`, :class:`CircleMetrics`.
-"""
+"""Metrics of paths (ISO 9283, clause 8) and circles (ISO 230-4): accuracy, repeatability, reversals."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""What a loop finds by moving the arm: the poses of cameras and body on it, the delay of the images, and the shutters.
-
-In: a :class:`~armsight.loop.running.loop.Loop`. Out: a :class:`HandEyeRun`, a Delay.
-"""
+"""What a loop finds by moving the arm: the poses of cameras and body on it, the delay of the images, and the shutters."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""What a running loop publishes: a record of a shot, of a batch of joint readings, of an event; and to whom.
-
-docs/reference/data.md lists the names of their JSON. Numbers are SI.
-"""
+"""What a running loop publishes: a record of a shot, of a batch of joint readings, of an event; and to whom."""
 
 from __future__ import annotations
 
