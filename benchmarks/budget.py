@@ -16,6 +16,7 @@ and a velocity. The images come from the camera's model with its readout, exposu
 from __future__ import annotations
 
 import argparse
+import tempfile
 import textwrap
 import time
 from dataclasses import replace
@@ -34,18 +35,19 @@ from armsight.sim.budget.chart import marker_noise
 from armsight.sim.budget.plan import MOST_SQUARE_PX, PRICES, RigPlan, catalogue, length_m, planned
 from armsight.sim.budget.result import BOUNDS, CHANGES, RigBudget, best, kept, loss
 from armsight.sim.camera.pipeline import SimulatedCamera
+from armsight.sim.camera.stages import Defocus
 from armsight.sim.example_rig import board_poses
 from armsight.sim.render.render import Shutter, radiance
-from armsight.sim.render.scene import PosedBody, chessboard, plate
+from armsight.sim.render.scene import Pattern, PosedBody, chessboard, marker_bits, plate, tag
 from armsight.sim.workcell.body import BRIGHT, DARK
 from armsight.vision.calibrate.boards import printed_board
 from armsight.vision.calibrate.budget import Budget, Conditions, pose_budget, scaled_rig
 from armsight.vision.markers.board import open_board
-from armsight.vision.markers.targets import Composite
 from armsight.vision.pose.bundle import BundleState, Observations, minimise
 from armsight.vision.pose.measure import measure
 from armsight.vision.pose.posefit import PixelObservations, fit_pose
 from armsight.vision.pose.predict import face_axes, view
+from armsight.vision.pose.shutter import LOOSE_PX
 from armsight.vision.rig import StereoRig
 from armsight.vision.triangulate import optimal_points
 
@@ -63,6 +65,46 @@ RIGS = {
     "2 MP": {"camera": "machine-vision-2mp", "baseline": "500mm", "distance": "1.2m", "speed": "0.3m/s"},
     "2 MP, skew 15 ms": {"camera": "machine-vision-2mp", "baseline": "300mm", "skew_ms": 15.0, "speed": "0.1m/s"},
 }
+CHESS = "chessboard:9x6:10mm"
+#: A second set: 640 to 2592 px, 60 to 500 mm, verging 0 to 40 degrees, focal lengths of 0.6 to 4 widths, 0.3 to 2 m, all
+#: presets and kinds of markers.
+WIDE = {
+    "640 cheap, parallel": {"camera": "webcam-720p-cheap", "image": "640x480", "baseline": "60mm", "verging_deg": 0.0,
+                            "distance": "0.4m", "speed": "0.05m/s"},
+    "640 tags at rest": {"camera": "webcam-720p", "image": "640x480", "baseline": "120mm", "distance": "0.5m",
+                         "speed": "0m/s", "body": "TAGS"},
+    "640 board, f 2, 2 m": {"camera": "global-shutter-1mp", "image": "640x480", "baseline": "500mm", "distance": "2m",
+                            "focal_widths": 2.0, "speed": "0.3m/s", "body": "chessboard:9x6:20mm"},
+    "2592 f 4, 2 m": {"camera": "machine-vision-5mp", "baseline": "400mm", "distance": "2m", "focal_widths": 4.0,
+                      "speed": "0.2m/s"},
+    "2592 f 0.6, 0.3 m, 40 deg": {"camera": "machine-vision-5mp", "baseline": "218mm", "distance": "0.3m",
+                                  "verging_deg": 40.0, "focal_widths": 0.6, "speed": "0.05m/s", "body_scale": 0.5},
+    "2592 tags, 0.3 m/s": {"camera": "machine-vision-5mp", "baseline": "300mm", "distance": "1m", "speed": "0.3m/s",
+                           "body": "TAGS"},
+    "clean, skew 5 ms": {"camera": "clean-1mp", "baseline": "150mm", "distance": "0.7m", "skew_ms": 5.0,
+                         "speed": "0.1m/s"},
+    "evening, board": {"camera": "webcam-720p-evening", "baseline": "200mm", "distance": "0.6m", "speed": "0.01m/s",
+                       "body": CHESS},
+    "webcam tags, 0.1 m/s": {"camera": "webcam-720p", "baseline": "180mm", "distance": "0.6m", "speed": "0.1m/s",
+                             "body": "TAGS"},
+    "2 MP, skew 15 ms, 0.5 m/s": {"camera": "machine-vision-2mp", "baseline": "350mm", "distance": "1m", "skew_ms": 15.0,
+                                  "speed": "0.5m/s"},
+    "cheap, 30 deg, skew 10 ms": {"camera": "webcam-720p-cheap", "baseline": "350mm", "distance": "0.65m",
+                                  "verging_deg": 30.0, "skew_ms": 10.0, "speed": "0.1m/s"},
+    "1 MP board, f 3, 1.5 m": {"camera": "global-shutter-1mp", "baseline": "300mm", "distance": "1.5m",
+                               "focal_widths": 3.0, "speed": "0.1m/s", "body": CHESS},
+}  # fmt: skip
+#: Four tags on two levels.
+TAGS = 'version = 2\nname = "tags"\n' + "".join(
+    f'[[markers]]\nname = "t{k}"\nposition_mm = [{x}, {y}, {z}]\neuler_zyx_deg = [0, 0, 0]\n'
+    f'tag = {{ family = "tag36h11", id = {k}, size_mm = 36 }}\n'
+    for k, (x, y, z) in enumerate([(-45, -35, 0), (45, -35, 25), (-45, 35, 25), (45, 35, 0)])
+)
+#: White noise alone, and the exposures of a global shutter.
+CLEAN = (
+    "[white_noise]\nsigma_grey = 2.0\n[timing]\nrate_hz = 60.0\nexposure_ms = 2.0\nreadout_ms = 0.0\n"
+    "delay_ms = 10.0\njitter_ms = 0.1\nsync_ms = 0.1\nskew_ms = 0.0\n"
+)
 #: Kit -> its plan, and what it does not do.
 KITS = {
     "Two webcams": (
@@ -138,30 +180,26 @@ def warmed(rig: StereoRig, given: Conditions, z: Array) -> StereoRig:
 
 def measured(
     plan: RigPlan, groups: int, shots: int, seed: int, given: Conditions | None = None
-) -> tuple[Array, list[Budget], int]:
-    """Return errors (N, 6) along the left camera's axes, the budget of each shot, and how many were missed."""
+) -> tuple[Array, list[Budget], int, float]:
+    """Return errors (N, 6) along the left camera's axes, the budget of each, how many were missed, the share predicted."""
     rng, given = np.random.default_rng(seed), given or plan.conditions()
-    discs = plan.layout.discs
-    points, normals, missed = discs.body.points, discs.normals, 0
-    errors, predicted, height = [], [], plan.stereo_rig.left.image_size_px[1]
-    blurred = "exposure blur" in given.noise_px
+    body, marker, normals = plan.layout, plan.marker_of, plan.layout.normals
+    points, first = body.body.points, np.unique(marker, return_index=True)[1]
+    errors, predicted, kept, height = [], [], [], plan.stereo_rig.left.image_size_px[1]
+    blurred, missed = "exposure blur" in given.noise_px, 0
     shutter = Shutter(plan.timing["exposure"] if blurred else 0.0, given.readout_s / height)
-    M, modes = len(points), len(printed_board(open_board(plan.board).body.points).modes)
+    M, modes = len(first), len(printed_board(open_board(plan.board).body.points).modes)
     of_groups = np.split(spread(groups, 4 * M + 7 + modes, rng), np.cumsum([3 * M, M, 1, 1 + modes]), axis=1)
     of_shots = spread(groups * shots, 8, rng).reshape(groups, shots, 8)
     for group, (flat, away, size, of_board, warm) in enumerate(zip(*of_groups, strict=True)):
         rig = calibrated(plan, given, of_board, rng)
+        # As `run` and `live` search where the exposures are apart.
+        rig = replace(rig, sigma_px=LOOSE_PX) if plan.apart else rig
         seen_by = warmed(plan.stereo_rig, given, warm)
         off = flat.reshape(-1, 3) * given.body_sigma_m[0]
-        off += normals * (away[:, None] * given.body_sigma_m[1] - (off * normals).sum(1)[:, None])
-        printed = points * (1 + given.body_scale * size) + off
-        patterns = tuple(
-            plate(0.046 * plan.body_scale, 0.046 * plan.body_scale, DARK, [(0.0, 0.0, r, BRIGHT)]).on_body(
-                pose(face_axes(n), p)
-            )
-            for p, n, r in zip(printed, normals, discs.radii_m, strict=True)
-        )
-        imagers = [SimulatedCamera(plan.pipeline, seen_by.left.image_size_px, seed=2 * group + side) for side in (0, 1)]
+        off += normals[first] * (away[:, None] * given.body_sigma_m[1] - (off * normals[first]).sum(1)[:, None])
+        patterns = printed(plan, off, 1 + given.body_scale * float(size[0]))
+        imagers: dict[tuple[int, int], SimulatedCamera] = {}
         for drawn_now in of_shots[group]:
             x, y, z = rng.uniform(-0.5, 0.5, 3) * plan.size_m
             tilt = tuple(rng.uniform(-TILT_RAD, TILT_RAD, 2))
@@ -169,10 +207,14 @@ def measured(
             T = seen.T_left_body
             v = np.repeat([given.speed_m_s, given.rotation_rad_s], 3) / np.sqrt(3) * drawn_now[:6]
             late = given.skew_s + given.start_s * drawn_now[6]
+            radius = round(plan.defocus_px(plan.distance_m + z)) if given.noise_px.get("defocus") else 0
             images = []
-            for side, (camera, imager) in enumerate(zip(seen_by.cameras, imagers, strict=True)):
+            for side, camera in enumerate(seen_by.cameras):
+                if (side, radius) not in imagers:
+                    soft = replace(plan.pipeline, defocus=Defocus(radius)) if radius else plan.pipeline
+                    imagers[side, radius] = SimulatedCamera(soft, camera.image_size_px, seed=2 * group + side)
                 T_side = T if side == 0 else inverse(seen_by.T_left_right) @ T @ exp_se3(late * v)
-                imager.forget()
+                (imager := imagers[side, radius]).forget()
                 light = radiance(
                     camera,
                     [PosedBody(patterns, T_side, v)],
@@ -182,14 +224,34 @@ def measured(
                 for _ in range(1 if v.any() else 3):
                     image = imager.expose(light)
                 images.append(image)
-            found = measure(rig, Composite("body", (), discs), Shot("", images[0], images[1]))
+            found = measure(rig, body, Shot("", images[0], images[1]))
+            predicted.append(pose_budget(plan.stereo_rig, points, normals, [seen], given))
             if not isinstance(found, PoseEstimate):
                 missed += 1
                 continue
             stamped = T @ exp_se3(given.stamp_s * drawn_now[7] * v)
             errors.append(np.kron(np.eye(2), T[:3, :3]) @ log_se3(inverse(stamped) @ found.T_left_body))
-            predicted.append(pose_budget(plan.stereo_rig, points, normals, [seen], given))
-    return np.array(errors), predicted, missed
+            kept.append(predicted[-1])
+    return np.array(errors), kept, missed, float(np.mean([each.lost[0] for each in predicted]))
+
+
+def printed(plan: RigPlan, off: Array, size: float) -> tuple[Pattern, ...]:
+    """Return the body's patterns, each marker off by (G, 3), m, and all of it larger by a factor."""
+    body, found = plan.layout, list[Pattern]()
+    for tag_ in body.tags.tags if body.tags else ():
+        T = tag_.T_body_tag.copy()
+        T[:3, 3] = size * T[:3, 3] + off[len(found)]
+        found.append(tag(marker_bits(tag_.family, tag_.identity), size * tag_.size_m).on_body(T))
+    if body.boards:
+        board = body.boards.boards[0].board
+        T = pose(np.eye(3), off[0])
+        return (chessboard(board.columns, board.rows, size * board.square_m).on_body(T),)
+    if body.discs is not None:
+        side = 0.046 * plan.body_scale
+        for p, n, r in zip(body.discs.body.points, body.discs.normals, body.discs.radii_m, strict=True):
+            T = pose(face_axes(n), p * size + off[len(found)])
+            found.append(plate(side, side, DARK, [(0.0, 0.0, r, BRIGHT)]).on_body(T))
+    return tuple(found)
 
 
 #: Cause -> the conditions that it alone needs; the pixels' noise is always there.
@@ -201,7 +263,7 @@ NEEDS = {
     "readout": ("speed_m_s", "rotation_rad_s", "readout_s"),
     "calibration": ("cov_calibration",),
     "print of the board": ("board_scale",),
-    "print of the body": ("body_sigma_m", "body_scale"),
+    "print of the body": ("body_sigma_m", "body_scale", "marker"),
     "warming of the mount": ("mount_m",),
     "warming of the lenses": ("lens_share",),
 }
@@ -226,16 +288,13 @@ def ratios(errors: Array, predicted: list[Budget]) -> tuple[list[float], list[fl
 
 def causes(options: argparse.Namespace) -> None:
     """Print predicted over measured RMS of each cause alone."""
-    for number, (name, given) in enumerate(RIGS.items()):
-        if options.only not in name:
-            continue
-        plan = RigPlan(volume=VOLUME, **given)
+    for number, name, plan in rigs(options):
         every = plan.conditions()
         for cause in NEEDS if not options.cause else [options.cause]:
             one = alone(every, cause)
             if not all(np.any(getattr(one, key)) for key in NEEDS[cause] if key != "rotation_rad_s"):
                 continue
-            errors, predicted, missed = measured(plan, options.groups, options.shots, options.seed + number, one)
+            errors, predicted, missed, _ = measured(plan, options.groups, options.shots, options.seed + number, one)
             rms, out = ratios(errors, predicted) if len(errors) else ([np.nan] * 2, [np.nan] * 2)
             print(
                 f"{name:20}{cause:24}{len(errors):4}{missed:4}  {1e3 * rms[0]:8.4f} mm {np.degrees(rms[1]):8.4f} deg  "
@@ -276,7 +335,7 @@ def gained(before: RigPlan, after: RigPlan, options: argparse.Namespace, seed: i
     """Return the RMS position error of a plan over that of another, predicted and measured with the same draws."""
     rms = []
     for plan in (before, after):
-        errors, predicted, _ = measured(plan, options.groups, options.shots, seed)
+        errors, predicted, _, _ = measured(plan, options.groups, options.shots, seed)
         cov = np.array([each.cov()[0] for each in predicted])
         rms.append(
             (np.trace(cov[:, :3, :3], axis1=1, axis2=2).mean() ** 0.5, (errors[:, :3] ** 2).sum(axis=1).mean() ** 0.5)
@@ -286,10 +345,8 @@ def gained(before: RigPlan, after: RigPlan, options: argparse.Namespace, seed: i
 
 def changes_done(options: argparse.Namespace) -> None:
     """Print what the two best changes of each rig gain."""
-    for number, (name, given) in enumerate(RIGS.items()):
-        if options.only not in name:
-            continue
-        found = RigBudget(plan := RigPlan(volume=VOLUME, **given), planned(plan))
+    for number, name, plan in rigs(options):
+        found = RigBudget(plan, planned(plan))
         ways = {text: change for text, (_, change) in CHANGES.items()}
         lens = {"focal_widths": plan.focal_px / plan.image_size_px[0]}
         for each in sorted((c for c in found.changes if c.change in ways), key=lambda c: c.level_m)[:2]:
@@ -394,49 +451,51 @@ def drawn(plan: RigPlan, count: int, rng: np.random.Generator) -> Array:
     return np.array(errors)
 
 
-#: Real set -> class of its cameras, image, board, pairs that are fitted, held-out rigid RMS of `calibration.py 1`, mm.
+#: Real set -> class of its cameras, image, board, baseline (the default where it was not known before), pairs that are
+#: fitted, held-out rigid RMS, mm: of `calibration.py 1`; of ur3a odd pairs, as there; of caliscope `calibration.py 8`,
+#: cameras 0 and 1, at one time (0.53 as simultaneous). Both were predicted before they were measured.
 SETS = {
-    "webcams-360p": ("webcam-720p", (640, 360), "chessboard:9x6:24.23mm", 15, 0.465),
-    "opencv-480p": ("global-shutter-1mp", (640, 480), "chessboard:9x6:25mm", 7, 0.215),
-    "stereopi-240p": ("webcam-720p", (320, 240), "chessboard:9x6:25mm", 15, 0.622),
+    "webcams-360p": ("webcam-720p", "640x360", "chessboard:9x6:24.23mm", "94mm", 15, 0.465),
+    "opencv-480p": ("global-shutter-1mp", "640x480", "chessboard:9x6:25mm", "94mm", 7, 0.215),
+    "stereopi-240p": ("webcam-720p", "320x240", "chessboard:9x6:25mm", "94mm", 15, 0.622),
+    "ur3a": ("webcam-720p", "1280x720", "chessboard:9x7:20mm", "200mm", 10, 0.588),
+    "caliscope": ("webcam-720p", "1280x720", "charuco:4x5:54mm:40.5mm:DICT_4X4_1000", "200mm", 13, 0.104),
 }
 
 
 def real(options: argparse.Namespace) -> None:
     """Print the rigid RMS of a held-out board, predicted from class, board and number of pairs, over the measured."""
-    rng = np.random.default_rng(options.seed)
-    for name, (kind, size, spec, pairs, measured_mm) in SETS.items():
-        catalogue()[name] = replace(catalogue()[kind], image_size_px=size)
-        plan = RigPlan(volume="0.01x0.01x0.01m", distance="0.5m", camera=name, baseline="94mm", board=spec, pairs=pairs,
-                       body_scale=4.0, focal_widths=catalogue()[kind].focal_widths)  # fmt: skip
-        rig, board = plan.stereo_rig, open_board(spec)
-        drawing, cov = board.body.points, plan.conditions().cov_calibration
-        Ts = board_poses(rng, rig, chessboard(board.columns, board.rows, board.square_m), 20)
-        px = board.square_m * plan.focal_px / float(np.median(Ts[:, 2, 3]))
-        noise = marker_noise(plan.pipeline, "chessboard", min(px, MOST_SQUARE_PX))
+    for name, (kind, image, spec, baseline, pairs, measured_mm) in SETS.items():
+        if options.only not in name:
+            continue
+        rng = np.random.default_rng(options.seed)
+        plan = RigPlan(volume="0.01x0.01x0.01m", distance="0.5m", camera=kind, image=image, baseline=baseline, board=spec,
+                       pairs=pairs, body=spec, focal_widths=catalogue()[kind].focal_widths)  # fmt: skip
+        rig, drawing = plan.stereo_rig, open_board(spec).body.points
+        marker, size_px = plan.marker(plan.distance_m)
+        cov, square_m = plan.conditions().cov_calibration, size_px * plan.distance_m / plan.focal_px
+        counts = (int(n) for n in np.rint(np.ptp(drawing, axis=0)[:2] / square_m) + 1)
+        Ts = board_poses(rng, rig, chessboard(*counts, square_m), 200)
+        px = square_m * plan.focal_px / float(np.median(Ts[:, 2, 3]))
+        noise = marker_noise(plan.pipeline, marker, min(px, MOST_SQUARE_PX))
         model, square = printed_board(drawing), []
         for T in Ts:
             wrong = rig.perturbed(rng.multivariate_normal(np.zeros(len(cov)), cov))
-            bent = model.body(
-                length_m(plan.board_bent, "bent")
-                * np.sqrt(3 / len(model.modes))
-                * rng.standard_normal(len(model.modes))
-            )
+            sigma_m = length_m(plan.board_bent, "bent") * np.sqrt(3 / len(model.modes))
+            bent = model.body(sigma_m * rng.standard_normal(len(model.modes)))
             uv = np.stack(rig.project(bent @ T[:3, :3].T + T[:3, 3]), axis=1)
             uv += noise * rng.standard_normal(uv.shape)
             p, _, _ = optimal_points(wrong, uv, np.tile(noise**2 * np.eye(2), (len(uv), 2, 1, 1)))
             square.append(((p - transform(fit_rigid(drawing, p), drawing)) ** 2).sum(axis=1).mean())
         rms = 1e3 * float(np.sqrt(np.mean(square)))
-        print(f"{name:16} corners {noise:.3f} px: {rms:.3f} mm, measured {measured_mm} mm: {rms / measured_mm:.2f}")
+        print(f"{name:16} corners {noise:.3f} px, squares {px:.0f} px: {rms:.3f} mm, measured {measured_mm} mm: "
+              f"{rms / measured_mm:.2f}", flush=True)  # fmt: skip
 
 
 def peers(options: argparse.Namespace) -> None:
     """Print the makers' formula, half a pixel times D^2 / (b f), and a plain Monte Carlo over the budget's RMS."""
     far, near = 0, []
-    for number, (name, given) in enumerate(RIGS.items()):
-        if options.only not in name:
-            continue
-        plan = RigPlan(volume=VOLUME, **given)
+    for number, name, plan in rigs(options):
         plan.check()
         began = time.process_time()
         rms = (found := planned(plan)).rms(found.cov())[0]
@@ -450,6 +509,21 @@ def peers(options: argparse.Namespace) -> None:
     print(f"the formula is off by more than 2 in {far} of {len(near)}; Monte Carlo {min(near):.2f} to {max(near):.2f}")
 
 
+def rigs(options: argparse.Namespace) -> list[tuple[int, str, RigPlan]]:
+    """Return number, name and plan of the rigs of a set."""
+    folder = Path(tempfile.mkdtemp())
+    write_text(tags := folder / "tags.toml", TAGS)
+    write_text(clean := folder / "clean.toml", CLEAN)
+    catalogue()["clean-1mp"] = replace(catalogue()["global-shutter-1mp"], preset=str(clean))
+    sets = {"first": RIGS, "wide": WIDE}[options.set]
+    plans = {name: given | ({"body": str(tags)} if given.get("body") == "TAGS" else {}) for name, given in sets.items()}
+    return [
+        (number, name, RigPlan(volume=VOLUME, **given))
+        for number, (name, given) in enumerate(plans.items())
+        if options.only in name
+    ]
+
+
 def main() -> None:
     """Print predicted over measured for each rig."""
     parser = argparse.ArgumentParser()
@@ -461,6 +535,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=9100)
     parser.add_argument("--only", default="")
     parser.add_argument("--cause", default="")
+    parser.add_argument("--set", default="first", choices=["first", "wide"])
     options = parser.parse_args()
     if options.what == "page":
         write_text(PAGE, buying_page())
@@ -469,13 +544,12 @@ def main() -> None:
         ways[options.what](options)
         return
     good, inside = 0, []
-    print("rig                     shots missed  measured mm   deg  predicted/measured mm  deg  in 95 % ellipsoids")
-    for number, (name, given) in enumerate(RIGS.items()):
-        if options.only not in name:
-            continue
+    print(
+        "rig                     shots missed (predicted)  measured mm   deg  predicted/measured mm  deg  in ellipsoids"
+    )
+    for number, name, plan in rigs(options):
         began = time.process_time()
-        plan = RigPlan(volume=VOLUME, **given)
-        errors, predicted, missed = measured(plan, options.groups, options.shots, options.seed + number)
+        errors, predicted, missed, lost = measured(plan, options.groups, options.shots, options.seed + number)
         rms, found = ratios(errors, predicted)
         covs = [each.cov()[0] for each in predicted]
         d2 = [e[:3] @ np.linalg.solve(C[:3, :3], e[:3]) for e, C in zip(errors, covs, strict=True)]
@@ -483,8 +557,9 @@ def main() -> None:
         good += all(0.8 <= r <= 1.25 for r in found)
         share = np.mean(np.array(d2) < 7.815)
         print(
-            f"{name:24}{len(errors):5}{missed:7}{1e3 * rms[0]:13.4f}{np.degrees(rms[1]):8.4f}{found[0]:14.2f}"
-            f"{found[1]:14.2f}{100 * share:12.0f} %   {time.process_time() - began:.0f} s",
+            f"{name:26}{len(errors):4}{missed:6} ({lost * (len(errors) + missed):4.1f}){1e3 * rms[0]:13.4f}"
+            f"{np.degrees(rms[1]):8.4f}{found[0]:14.2f}{found[1]:14.2f}{100 * share:12.0f} %   "
+            f"{time.process_time() - began:.0f} s",
             flush=True,
         )
     print(

@@ -162,3 +162,29 @@ def test_other_cameras_keep_what_is_named(monkeypatch):
     monkeypatch.setattr(result, "catalogue", lambda: {name: catalogue()[name] for name in two})
     monkeypatch.setattr(result, "CHANGES", {})
     assert not result.RigBudget(plan, planned(plan)).changes  # the skew that is named costs most, and stays
+
+
+def test_a_body_of_tags_or_a_board_has_a_budget(tmp_path):
+    given = {"volume": "0.05x0.05x0.05m", "distance": "0.6m", "camera": "global-shutter-1mp", "speed": "0m/s"}
+    board = RigPlan(**given, body="chessboard:9x6:10mm")
+    assert board.marker(0.6) == ("chessboard", pytest.approx(0.01 * board.focal_px / 0.6))
+    tags = "".join(
+        f'[[markers]]\nname = "t{k}"\nposition_mm = [{x}, 0, 0]\neuler_zyx_deg = [0, 0, 0]\n'
+        f'tag = {{ family = "tag36h11", id = {k}, size_mm = 30 }}\n'
+        for k, x in enumerate((-40, 40))
+    )
+    (tmp_path / "tags.toml").write_text(f'version = 2\nname = "tags"\n{tags}')
+    two = RigPlan(**given, body=str(tmp_path / "tags.toml"))
+    assert two.marker(0.6)[0] == "tag"
+    assert two.marker_of.tolist() == [0] * 4 + [1] * 4
+    for plan in (board, two):
+        assert 0 < planned(plan).rms(planned(plan).cov())[0] < 1e-3
+    with pytest.raises(InputError, match="boards of discs none"):
+        planned(RigPlan(**given, body="circles:7x6:10mm:radius=3mm"))
+
+
+def test_the_image_has_the_size_that_is_given():
+    small = RigPlan(volume="0.05x0.05x0.05m", image="640x480", distance="0.5m")
+    assert small.stereo_rig.left.image_size_px == (640, 480)
+    with pytest.raises(InputError, match="expected width x height in pixels"):
+        RigPlan(volume="0.05x0.05x0.05m", image="640").check()

@@ -19,6 +19,7 @@ from armsight.vision.calibrate.budget import (
     radius,
     volume_views,
 )
+from armsight.vision.match import epipolar_distances
 from armsight.vision.pose.posefit import PixelObservations, fit_pose
 from armsight.vision.pose.predict import plain_rig
 
@@ -58,6 +59,10 @@ def measured(given: Conditions, rng: np.random.Generator, cameras: int = 2) -> A
                 uv[side == k] = at
                 rows = at[:, 1] / (RIG.left.image_size_px[1] - 1) - 0.5
                 late = k * (given.skew_s + start) + given.readout_s * rows
+        both = np.intersect1d(row[side == 0], row[side == 1])
+        pairs = [uv[side == k][np.isin(row[side == k], both)] for k in (0, 1)]
+        if cameras == 2 and epipolar_distances(RIG, *pairs).mean() > given.gate_px:
+            continue  # lost
         sigma = float(np.sqrt(sum(s**2 for s in given.noise_px.values())))
         uv += sigma * rng.standard_normal(uv.shape)
         found = fit_pose(
@@ -81,6 +86,7 @@ CASES = {
     "readout": Conditions(readout_s=0.02, speed_m_s=0.2, rotation_rad_s=0.2),
     "print of the body": Conditions(body_sigma_m=(1e-4, 3e-4), body_scale=1e-3),
     "warming of the lenses": Conditions(lens_share=2e-4),
+    "a gate": Conditions(skew_s=0.004, speed_m_s=0.3, gate_px=0.8),
     "skew and readout": Conditions(skew_s=0.004, readout_s=-0.006, speed_m_s=0.3),
 }
 
@@ -132,6 +138,25 @@ def test_shared_velocity_adds_before_it_is_squared() -> None:
     both = pose_budget(RIG, POINTS, NORMALS, VIEWS, CASES["skew and readout"])
     apart = both.cov(of="skew") + both.cov(of="readout")
     assert abs(np.trace(both.cov()[0]) / np.trace(apart[0]) - 1) > 0.02
+
+
+def test_shots_beyond_the_gate_are_lost() -> None:
+    # A share of 600 shots near 0.35 is known to 0.019: three sigmas.
+    found = pose_budget(RIG, POINTS, NORMALS, VIEWS, CASES["a gate"])
+    shots = measured(CASES["a gate"], np.random.default_rng(9))
+    assert 0.2 < found.lost.mean() < 0.5
+    assert 1 - len(shots) / SHOTS == pytest.approx(found.lost.mean(), abs=0.06)
+    assert not pose_budget(RIG, POINTS, NORMALS, VIEWS, CASES["skew"]).lost.any()
+    # Without what is lost the others are better.
+    skew = pose_budget(RIG, POINTS, NORMALS, VIEWS, CASES["skew"])
+    assert found.rms(found.cov())[0] < skew.rms(skew.cov())[0]
+
+
+def test_points_of_one_marker_move_together() -> None:
+    # Of a body that is one marker, what it is off by shifts the pose by as much.
+    given = Conditions(body_sigma_m=(2e-4, 2e-4), marker=np.zeros(len(POINTS), np.int64))
+    found = pose_budget(RIG, POINTS, NORMALS, VIEWS, given)
+    assert found.rms(found.cov()) == pytest.approx((2e-4 * np.sqrt(3), 0.0), rel=1e-6, abs=1e-9)
 
 
 def test_a_lost_cause_is_none_at_rest() -> None:

@@ -34,9 +34,7 @@ def command(path: str, optimise: bool, output: str | None, as_json: bool, **give
     What is left out is chosen, and said. PLAN.toml has the same keys and more: docs/howto/budget.md. Exit code 1: what
     --want asks for is not reached.
     """
-    from armsight.app.body.draw import draw_body
     from armsight.app.budget.report import REPORT_FILES, budget_report, to_build
-    from armsight.app.budget.run import motion_volume, run_plan
     from armsight.app.progress import steps
     from armsight.files import check_folder
     from armsight.sim.budget.plan import RigPlan, planned
@@ -52,9 +50,16 @@ def command(path: str, optimise: bool, output: str | None, as_json: bool, **give
     if (motion := given["volume"] or "").endswith(".toml"):
         if not given["arm"]:
             raise InputError(f"volume {motion}: the arm that moves so is needed, too: --arm ar4")
+        from armsight.app.budget.run import motion_volume  # here and below: what a plan alone does not need
+
         given |= motion_volume(Path(motion), given["arm"]) | ({"speed": given["speed"]} if given["speed"] else {})
     with steps() as progress:
-        plan = RigPlan.read(path, **given) if run is None else run_plan(Path(run), path, **given)
+        if run is None:
+            plan = RigPlan.read(path, **given)
+        else:
+            from armsight.app.budget.run import run_plan
+
+            plan = run_plan(Path(run), path, **given)
         alternatives = best(plan, progress) if optimise else ()
         found = chosen(alternatives) if alternatives else RigBudget(plan, planned(plan))
         progress("what would change it")
@@ -64,5 +69,7 @@ def command(path: str, optimise: bool, output: str | None, as_json: bool, **give
         files = to_build(found)
         written = str(report.write(Path(output), {"budget.json": report.json_text(), **files}))
         if "body.toml" in files:
+            from armsight.app.body.draw import draw_body
+
             draw_body([Path(output) / "body.toml"], Path(output) / "body.pdf", split=True)
     return report.echo(as_json=as_json, written=written) or int(not found.reached(found.moving))

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from armsight.app.budget.run import against_run
 from armsight.app.show.messages import Note
 from armsight.app.show.page import PAGE
 from armsight.app.show.plotting import new_figure
@@ -25,6 +24,7 @@ from armsight.vision.calibrate.budget import Budget
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+_SHOWN = 0.01  # share of lost shots that is shown; half: one in 200 is, double: one in 50 is not
 #: Names of all files that a report has.
 REPORT_FILES = (PAGE, "budget.json", "rig.json", "body.toml", "body.pdf", *figure_files("budget", ("volume",)))
 
@@ -39,8 +39,15 @@ def budget_report(found: RigBudget, alternatives: Sequence[Alternative] = (), ru
         ]
     parts = [f"{name} {1e3 * values[f'{name}_rms_m']:.2g} mm" for name in ("precision", "trueness", "lateral", "depth")]
     said = f"{', '.join(parts)} (RMS over the volume, in motion; lateral: one axis)"
-    beside = []
+    beside, lost = [], values["lost_share_in_motion"]
+    gone = [
+        Fact(
+            f"{100 * lost:.0f} % of the shots in motion are lost: their two images differ by more than the search allows"
+        )
+    ]
     if run:
+        from armsight.app.budget.run import against_run  # not above: a plan needs nothing of what reads runs
+
         table, values["run"] = against_run(run, plan)
         beside.append(table)
     states = found.states
@@ -58,7 +65,18 @@ def budget_report(found: RigBudget, alternatives: Sequence[Alternative] = (), ru
     )
     caption, title = "95 % of the errors in motion are within, mm.", "Error at 95 % over the volume, seen from above"
     sections: dict[str, Section] = {
-        "result": ("Result", [Fact(said), Fact(others), table, more, *_compared(alternatives), *beside]),
+        "result": (
+            "Result",
+            [
+                Fact(said),
+                *(gone if lost > _SHOWN else []),
+                Fact(others),
+                table,
+                more,
+                *_compared(alternatives),
+                *beside,
+            ],
+        ),
         "map": ("Over the volume", [Plot("volume", partial(_map, found.found), caption, title)]),
     }
     notes = [

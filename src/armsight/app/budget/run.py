@@ -48,9 +48,8 @@ def against_run(folder: Path, plan: RigPlan) -> tuple[TextTable, list[dict[str, 
     speed, rotation = (np.linalg.norm(twists[:, part], axis=1) for part in (slice(3), slice(3, 6)))
     rig, points, normals = plan.stereo_rig, plan.layout.body.points, plan.layout.normals
     views = [view_at(rig, points, normals, each) for each in T]
-    given = replace(
-        plan.conditions(), speed_m_s=1.0, rotation_rad_s=float(np.median(rotation / np.maximum(speed, _SLOW)))
-    )
+    per_speed = float(np.median(rotation / np.maximum(speed, _SLOW)))
+    given = replace(plan.conditions(), gate_px=np.inf, speed_m_s=1.0, rotation_rad_s=per_speed)
     found = pose_budget(rig, points, normals, views, given)
     of_plan = plan.speeds[0]  # which its blur in px is of; all else that moves is of 1 m/s
     faster = {name: speed for name, kind in CAUSES.items() if kind.moving} | {"exposure blur": speed / (of_plan or 1.0)}

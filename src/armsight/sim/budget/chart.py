@@ -28,7 +28,7 @@ from armsight.sim.render.scene import BLACK, CLEAR, WHITE, Pattern, PosedBody, c
 from armsight.vision.camera import Camera
 from armsight.vision.markers.board import open_board
 from armsight.vision.markers.discs import DiscTarget
-from armsight.vision.markers.tag import CORNERS, Tag, TagTarget
+from armsight.vision.markers.tag import Tag, TagTarget
 
 #: Detections that a chart needs: its sigma is then known to 5 %; half: 7 %, double: 4 % in twice the time.
 LEAST_DETECTIONS = 100
@@ -51,11 +51,16 @@ _NEAR, _BLUNDER = 0.35, 6.0
 
 
 class Chart(NamedTuple):
-    """What is rendered, where its markers are (N, 2), m, and what finds them in an image, px."""
+    """What is rendered, where its markers are (N, 2), m, and what finds them in an image, px.
+
+    Of a marker of several points its middle is looked for, for edges that two points share make both err alike: the
+    points' sigma is then the one that independent points need for a middle as uncertain.
+    """
 
     patterns: tuple[Pattern, ...]
     spots: Array
     find: Callable[[Image], Array]
+    points: int = 1
 
 
 def marker_noise(pipeline: CameraPipeline, kind: str, size_px: float, moved_px: float = 0.0) -> float:
@@ -87,18 +92,15 @@ def marker_noise(pipeline: CameraPipeline, kind: str, size_px: float, moved_px: 
 @lru_cache(maxsize=512)
 def _noise(pipeline: CameraPipeline, kind: str, size_px: float, moved_px: float) -> tuple[float, int, int]:
     """Render and detect charts until there are enough; return sigma, 0 where most are not found, the found and all."""
-    camera, imager = _CAMERA, SimulatedCamera(pipeline, _SIZE_PX, seed=0)
+    imager = SimulatedCamera(pipeline, _SIZE_PX, seed=0)
     rng, off, asked = np.random.default_rng(42), list[Array](), 0
     for number in range(_MOST_IMAGES):
-        chart = _CHARTS[kind](size_px / _FOCAL_PX, rng)
-        T = pose(exp_so3(np.array([0.0, 0.0, rng.uniform(-0.3, 0.3)])), np.array([0.0, 0.0, 1.0]))
-        light = radiance(camera, [PosedBody(chart.patterns, T)], psf_sigma_px=pipeline.psf_sigma_px)
+        chart, light, true = _shown(kind, size_px, number, pipeline.psf_sigma_px)
         if moved_px > 0:
             light = _smeared(light, moved_px, rng.uniform(0, np.pi))
         imager.forget()
         for k in range(_SETTLED if pipeline.temporal_denoise and not moved_px else 1):
             image = imager.expose(light, number=_SETTLED * number + k)
-        true = camera.project(transform(T, np.column_stack([chart.spots, np.zeros(len(chart.spots))])))
         inside = ((true > 2 * size_px) & (true < np.array(_SIZE_PX) - 2 * size_px)).all(axis=1)
         asked += max(int(inside.sum()), 1)
         found = chart.find(np.asarray(image))
@@ -106,7 +108,7 @@ def _noise(pipeline: CameraPipeline, kind: str, size_px: float, moved_px: float)
             gaps = np.linalg.norm(found[:, None] - true[None], axis=2)
             near = gaps.min(axis=1) < _NEAR * size_px
             off.append((found - true[gaps.argmin(axis=1)])[near])
-        if sum(map(len, off)) >= LEAST_DETECTIONS or asked > LEAST_DETECTIONS / _LEAST_FOUND:
+        if chart.points * sum(map(len, off)) >= LEAST_DETECTIONS or asked > LEAST_DETECTIONS / _LEAST_FOUND:
             break
     every = np.concatenate([np.zeros((0, 2)), *off])
     if len(every) < max(_LEAST_FOUND * asked, 8):
@@ -114,7 +116,17 @@ def _noise(pipeline: CameraPipeline, kind: str, size_px: float, moved_px: float)
     every = every - np.median(every, axis=0)  # what all share, the calibration takes up
     scale = float(np.median(np.abs(every)) / 0.6745)
     near = every[(np.abs(every) < _BLUNDER * max(scale, 1e-4)).all(axis=1)]
-    return float(np.sqrt((near**2).mean())), len(every), asked
+    return float(np.sqrt(chart.points * (near**2).mean())), len(every), asked
+
+
+@lru_cache(maxsize=12)  # 2 MB each
+def _shown(kind: str, size_px: float, number: int, psf_sigma_px: float) -> tuple[Chart, Radiance, Array]:
+    """Return a chart, its light, and its markers in the image (N, 2), px."""
+    rng = np.random.default_rng((42, number))
+    chart = _CHARTS[kind](size_px / _FOCAL_PX, rng)
+    T = pose(exp_so3(np.array([0.0, 0.0, rng.uniform(-0.3, 0.3)])), np.array([0.0, 0.0, 1.0]))
+    light = radiance(_CAMERA, [PosedBody(chart.patterns, T)], psf_sigma_px=psf_sigma_px)
+    return chart, light, _CAMERA.project(transform(T, np.column_stack([chart.spots, np.zeros(len(chart.spots))])))
 
 
 def _smeared(light: Radiance, way_px: float, direction: float) -> Radiance:
@@ -150,15 +162,20 @@ def _discs(size_m: float, rng: np.random.Generator) -> Chart:
 
 
 def _tags(size_m: float, rng: np.random.Generator) -> Chart:
-    """Return tags on white faces; their corners are found."""
+    """Return tags on white faces; their middles are found."""
     faces, grid = _faces(2 * size_m, 1.4 * size_m, WHITE)
-    tags, patterns, spots = list[Tag](), [faces], list[Array]()
-    for k, (x, y) in enumerate(_spots(grid, rng)[: LEAST_DETECTIONS // 3]):
+    tags, patterns, spots = list[Tag](), [faces], _spots(grid, rng)[: LEAST_DETECTIONS // 2]
+    for k, (x, y) in enumerate(spots):
         tags.append(Tag(f"t{k}", FAMILY, k, size_m, pose(np.eye(3), np.array([x, y, 0.0]))))
         patterns.append(tag(marker_bits(FAMILY, k), size_m).on_body(tags[-1].T_body_tag))
-        spots.append(transform(tags[-1].T_body_tag, CORNERS * (size_m / 2))[:, :2])
     target = TagTarget("chart", tuple(tags))
-    return Chart(tuple(patterns), np.concatenate(spots), lambda image: target.detect(image).uv)
+
+    def middles(image: Image) -> Array:
+        found = target.detect(image)
+        whole = np.flatnonzero(np.bincount(found.ids // 4, minlength=1) == 4)
+        return np.array([found.uv[found.ids // 4 == k].mean(axis=0) for k in whole]).reshape(-1, 2)
+
+    return Chart(tuple(patterns), spots, middles, points=4)
 
 
 def _squares(size_m: float, rng: np.random.Generator) -> Chart:

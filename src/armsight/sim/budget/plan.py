@@ -17,12 +17,11 @@ from typing import Any
 
 import numpy as np
 
-from armsight.data import Array
+from armsight.data import Array, Ids
 from armsight.errors import InputError
 from armsight.files import read_toml
 from armsight.geometry.pose import inverse, pose
 from armsight.geometry.rotation import exp_so3
-from armsight.robot.arm_file import open_arm
 from armsight.sim.budget.chart import marker_noise
 from armsight.sim.camera.stages import CameraPipeline, Defocus
 from armsight.sim.example_rig import board_poses
@@ -37,16 +36,28 @@ from armsight.vision.calibrate.budget import (
     volume_views,
 )
 from armsight.vision.camera import Camera
-from armsight.vision.markers.board import open_board
+from armsight.vision.discs.pairing import GATE_SIGMAS as PLANE_SIGMAS
+from armsight.vision.discs.pairing import UNMODELLED_PX
+from armsight.vision.follow.follower import APART_S
+from armsight.vision.markers.aprilgrid import AprilGrid
+from armsight.vision.markers.board import BOARDS, open_board
+from armsight.vision.markers.board_marker import BoardTarget, MountedBoard
+from armsight.vision.markers.charuco import Charuco
 from armsight.vision.markers.chessboard import Chessboard
+from armsight.vision.markers.marker import CalibrationBoard
 from armsight.vision.markers.targets import Composite, read_layout
+from armsight.vision.match import GATE_PX, GATE_SIGMAS
 from armsight.vision.pose.predict import PredictedView
+from armsight.vision.pose.shutter import LOOSE_PX
 from armsight.vision.rig import StereoRig
 
 #: A disc's diameter, a tag's and a square's side in the image below which detection is left to luck, px; half: half of them
 #: are lost, double: bodies twice as large are asked for.
-LEAST_DISC_PX, LEAST_TAG_PX, LEAST_SQUARE_PX = 8.0, 24.0, 8.0
+_LEAST_PX = {"disc": 8.0, "tag": 24.0, "chessboard": 8.0}
 MOST_SQUARE_PX = 60.0  # px; larger squares' corners are no better; half: their noise is a tenth too large
+_SETS = (
+    3  # of poses of the board, whose mean is taken; half: sigma differs by 10 % by chance, double: half a second more
+)
 #: Lengths that a table-top cell has, m: what lies outside is mm given as m.
 _LEAST_M, _MOST_M = 0.001, 20.0
 _LEAST_APART_M = 0.01  # m; half: endoscopes pass, double: the smallest camera modules are rejected
@@ -57,7 +68,7 @@ _WIDEST = 0.6
 _UNITS = {"um": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0}
 _NUMBER = r"((?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:e-?[0-9]+)?)"
 #: What a rig that there is says itself; and, where it says when its rows are exposed.
-_OF_RIG = ("baseline", "verging_deg", "focal_widths", "board", "pairs", "board_bent")
+_OF_RIG = ("image", "baseline", "verging_deg", "focal_widths", "board", "pairs", "board_bent")
 _OF_SHUTTERS = ("skew_ms", "start_ms")
 #: Key -> least and most that a plan may say.
 _RANGES = {
@@ -125,11 +136,13 @@ class RigPlan:
         speed: of the body, and its rate of rotation: 0.3m/s or 0.3m/s,20deg/s.
         want: what 95 % of the errors are to be within: 0.1mm or 0.1mm,0.05deg; empty: nothing is asked.
         camera: a class of the catalogue.
+        image: width x height, px; by default the class's.
         rig: a rig file, for a rig that there is: its lenses, baseline, calibration and, where known, shutters.
         baseline: between the cameras.
         verging_deg: angle between their axes; by default both look at the middle of the volume.
         focal_widths: focal length over the image's width; by default the class's.
-        body: a body file; by default the plate with wings and nine discs that `armsight demo` has.
+        body: a body file, or a board such as chessboard:9x6:25mm; by default the body of `armsight demo` with nine
+            discs.
         body_scale: by how much the default body is larger; discs grow with it.
         body_depth: by how much further its wings stand behind its plate; beyond 2 the plate hides them.
         board: the calibration board.
@@ -156,6 +169,7 @@ class RigPlan:
     speed: str = "0.3m/s"
     want: str = ""
     camera: str = "webcam-720p"
+    image: str = ""
     rig: str = ""
     baseline: str = "200mm"
     verging_deg: float = -1.0
@@ -257,7 +271,14 @@ class RigPlan:
     @cached_property
     def image_size_px(self) -> tuple[int, int]:
         """Width and height."""
-        return self.existing.left.image_size_px if self.existing else self.cameras.image_size_px
+        if self.existing:
+            return self.existing.left.image_size_px
+        found = re.fullmatch(
+            r"([1-9]\d{2,4})x([1-9]\d{2,4})", self.image.strip() or "{}x{}".format(*self.cameras.image_size_px)
+        )
+        if found is None:
+            raise InputError(f"image {self.image!r}: expected width x height in pixels, such as 1280x720")
+        return int(found[1]), int(found[2])
 
     @cached_property
     def baseline_m(self) -> float:
@@ -359,6 +380,9 @@ class RigPlan:
     @cached_property
     def layout(self) -> Composite:
         """The body."""
+        if self.body.partition(":")[0] in BOARDS:
+            board = MountedBoard("board", open_board(self.body), np.eye(4), np.array([0.0, 0.0, -1.0]))
+            return Composite(self.body, (BoardTarget(self.body, (board,)),))
         if self.body:
             return read_layout(Path(self.folder) / self.body)
         return Composite("tool_body", (), body_target(self.body_scale, self.body_depth).discs)
@@ -386,12 +410,35 @@ class RigPlan:
 
     def marker(self, distance_m: float) -> tuple[str, float]:
         """Return the kind of the body's markers and their least size in the image at a distance, px."""
-        per_m = self.focal_px / distance_m
+        per_m, layout = self.focal_px / distance_m, self.layout
+        if layout.discs is not None:
+            return "disc", 2 * float(layout.discs.radii_m.mean()) * per_m
+        if layout.tags is not None:
+            return "tag", min(tag.size_m for tag in layout.tags.tags) * per_m
+        assert layout.boards is not None
+        kind, size_m = min((_smallest(each.board) for each in layout.boards.boards), key=lambda each: each[1])
+        return kind, size_m * per_m
+
+    @cached_property
+    def marker_of(self) -> Ids:
+        """(M,) the number of the marker that each point of the body is of."""
+        layout = self.layout
+        parts = [4] * len(layout.tags.tags) if layout.tags else []
+        parts += [len(each.board.body.points) for each in layout.boards.boards] if layout.boards else []
+        parts += [1] * layout.disc_count
+        return np.repeat(np.arange(len(parts)), parts)
+
+    @property
+    def apart(self) -> bool:
+        """Whether the exposures are so far apart that `run` and `live` search with a wider epipolar gate."""
+        return max(self.timing["skew"], self.timing["start"]) > APART_S
+
+    def _gate_px(self, noise_px: float) -> float:
+        """Return how far a marker may be off its epipolar line, px."""
+        noise_px = math.hypot(noise_px, LOOSE_PX if self.apart else noise_px)
         if self.layout.discs is not None:
-            return "disc", 2 * float(self.layout.discs.radii_m.mean()) * per_m
-        if self.layout.tags is not None:
-            return "tag", min(tag.size_m for tag in self.layout.tags.tags) * per_m
-        raise InputError(f"{self.body}: a body of discs or tags is expected; boards on a body have no budget yet")
+            return PLANE_SIGMAS * math.sqrt(2) * math.hypot(noise_px, UNMODELLED_PX)
+        return max(GATE_PX, GATE_SIGMAS * math.sqrt(2) * noise_px)
 
     def defocus_px(self, distance_m: float) -> float:
         """Return the radius of the blur away from the lens's focus, px: aperture times the difference of dioptres."""
@@ -454,7 +501,7 @@ class RigPlan:
                     f"a distance of {least:.2g} m, or focal_widths = {near / needed * pixels / width:.2g}"
                 )
         kind, px = self.marker(far)
-        least_px = LEAST_DISC_PX if kind == "disc" else LEAST_TAG_PX
+        least_px = _LEAST_PX[kind]
         if px < least_px:
             raise InputError(
                 f"a {kind} is {px:.1f} px at {far:.2g} m, at least {least_px:g} are needed: markers {least_px / px:.1f} "
@@ -485,14 +532,18 @@ class RigPlan:
         t, (speed, rotation) = self.timing, self.speeds
         arm = (0.0, 0.0)
         if self.arm:
+            from armsight.robot.arm_file import open_arm  # not above: only the loop needs it
+
             model, sigma = open_arm(self.arm), math.radians(self.backlash_deg)
             J = model.jacobian(model.home)
             arm = tuple(sigma * float(np.sqrt((part**2).sum() / 3)) for part in (J[:3], J[3:]))  # type: ignore[assignment]
         bent = length_m(self.body_print, "body_print"), length_m(self.body_bent, "body_bent")
         mount, lens = (1e-6 * each * self.warming_k for each in (self.mount_um_per_k, self.lens_ppm_per_k))
+        noise = self._noise_px()
         return Conditions(
-            self._noise_px(), self._cov_calibration(), self.board_print, bent, self.body_size, mount, lens,
+            noise, self._cov_calibration(), self.board_print, self.marker_of, bent, self.body_size, mount, lens,
             t["skew"], t["start"], t["readout"], t["stamp"], speed, rotation,
+            self._gate_px(math.sqrt(sum(each**2 for each in noise.values()))),
             self.handeye_errors if self.arm else (0.0, 0.0), arm,
         )  # fmt: skip
 
@@ -500,26 +551,36 @@ class RigPlan:
         """Return the covariance (P, P) of the rig's parameters."""
         if self.existing:
             return self.existing.cov
-        kept = {key: getattr(self, key) for key in ("camera", "baseline", "board", "pairs", "board_bent")}
+        kept = {key: getattr(self, key) for key in ("camera", "image", "baseline", "board", "pairs", "board_bent")}
         lens, angle = self.focal_px / self.image_size_px[0], self.stereo_rig.convergence_deg
         return _calibrated(RigPlan(focal_widths=lens, verging_deg=angle, **kept))
+
+
+def _smallest(board: CalibrationBoard) -> tuple[str, float]:
+    """Return the kind of a board's markers, and the side of one, m."""
+    if isinstance(board, AprilGrid):
+        return "tag", board.tag_m
+    if not isinstance(board, (Chessboard, Charuco)):
+        raise InputError(
+            f"{board.body.name}: chessboards, ChArUco boards and aprilgrids have a budget, boards of discs none"
+        )
+    return "chessboard", board.square_m
 
 
 @lru_cache(maxsize=64)
 def _calibrated(plan: RigPlan) -> Array:
     """Return the covariance (P, P) of what boards that are held still determine, at the camera's own exposure."""
     board = open_board(plan.board)
-    if not isinstance(board, Chessboard):
-        raise InputError(f"board {plan.board!r}: chessboards have a budget so far: {Chessboard.form}")
-    pattern = chessboard(board.columns, board.rows, board.square_m)
-    Ts = board_poses(np.random.default_rng(1), plan.stereo_rig, pattern, plan.pairs)
-    px = board.square_m * plan.focal_px / float(np.median(Ts[:, 2, 3]))
-    if px < LEAST_SQUARE_PX:
-        raise InputError(f"a square of {plan.board} is {px:.1f} px, at least {LEAST_SQUARE_PX:g} are needed")
-    sigma = marker_noise(plan.pipeline, "chessboard", min(px, MOST_SQUARE_PX))
-    return calibration_covariance(
-        plan.stereo_rig, board.body.points, Ts, sigma, length_m(plan.board_bent, "board_bent")
-    )
+    kind, size_m = _smallest(board)
+    columns, rows = (int(n) for n in np.rint(np.ptp(board.body.points, axis=0)[:2] / size_m) + 1)
+    rig, pattern = plan.stereo_rig, chessboard(columns, rows, size_m)
+    sets = [board_poses(np.random.default_rng(seed), rig, pattern, plan.pairs) for seed in range(_SETS)]
+    px, least_px = size_m * plan.focal_px / float(np.median(np.concatenate(sets)[:, 2, 3])), _LEAST_PX[kind]
+    if px < least_px:
+        raise InputError(f"a {kind} of {plan.board} is {px:.1f} px, at least {least_px:g} are needed")
+    sigma, bent_m = marker_noise(plan.pipeline, kind, min(px, MOST_SQUARE_PX)), length_m(plan.board_bent, "board_bent")
+    covs = [calibration_covariance(rig, board.body.points, Ts, sigma, bent_m) for Ts in sets]
+    return np.asarray(np.mean(covs, axis=0))
 
 
 def planned(plan: RigPlan, cameras: int = 2) -> Budget:

@@ -49,6 +49,7 @@ NOT_MODELLED = (
     "focus that breathes: an autofocus must be switched off",
     "poses of the board other than all over the images",
     "a mount that bends, not only grows, as it warms",
+    "a board on the body that is bent: it counts as one rigid marker",
 )
 
 
@@ -194,6 +195,7 @@ class RigBudget(Record):
             "plan": {each.name: getattr(self.plan, each.name) for each in self.plan.settings()},
             "focal_px": self.plan.focal_px,
             "results": {name: state._asdict() for name, state in self.states.items()},
+            "lost_share_in_motion": float(self.found.lost.mean()),
             "precision_rms_m": self.found.rms(self.found.cov(of="precision"))[0],
             "trueness_rms_m": self.found.rms(self.found.cov(of="trueness"))[0],
             "lateral_rms_m": lateral,

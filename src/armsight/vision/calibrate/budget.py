@@ -12,14 +12,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import erf, gammaincinv
 
-from armsight.data import Array, Record
+from armsight.data import Array, Ids, Record
 from armsight.errors import InputError
+from armsight.geometry.pose import transform
 from armsight.geometry.rotation import exp_so3
 from armsight.vision.calibrate.boards import printed_board, rigid_board
 from armsight.vision.pose.bundle import BundleState, Observations, minimise
-from armsight.vision.pose.predict import PredictedView, pose_derivatives, view
+from armsight.vision.pose.predict import PoseDerivatives, PredictedView, pose_derivatives, view
 from armsight.vision.rig import StereoRig
 
 #: Share of errors that a figure "at 95 %" covers.
@@ -29,16 +30,12 @@ _THIRD = 2 * np.pi / 3  # rad; between the pairs of three cameras
 
 @dataclass(frozen=True)
 class CauseKind:
-    """What kind of cause it is: ``moving`` costs nothing at rest; ``common`` is the same in all shots (trueness).
+    """What kind of cause it is."""
 
-    ``loop``: no error of what the cameras measure, but of where a closed loop brings the arm; ``camera``: each has its
-    own.
-    """
-
-    moving: bool = False
-    common: bool = False
-    loop: bool = False
-    camera: bool = False
+    moving: bool = False  #: it costs nothing at rest.
+    common: bool = False  #: it is the same in all shots (trueness); else it differs from shot to shot (precision).
+    loop: bool = False  #: it is no error of what the cameras measure, but of where a closed loop brings the arm.
+    camera: bool = False  #: each camera, or each pair of them, has one of its own.
 
 
 #: Cause -> its kind, in the order of tables.
@@ -62,54 +59,42 @@ CAUSES: dict[str, CauseKind] = {
 
 @dataclass(frozen=True, eq=False)
 class Conditions(Record):
-    """What is not known when a body is measured; zero where nothing is given.
+    """What is not known when a body is measured; zero where nothing is given."""
 
-    Attributes:
-        noise_px: cause -> standard deviation that it adds to a marker's position, px: pixel noise, defocus, exposure blur.
-        cov_calibration: (P, P) covariance of the rig's parameters by its calibration, or (0, 0).
-        board_scale: standard deviation of the board's size, as a share.
-        body_sigma_m: of each point of the body from its file, along its face and out of it, m.
-        body_scale: of the body's size, as a share.
-        mount_m: of the right camera's position along each axis since the calibration, m.
-        lens_share: of each focal length since the calibration, as a share.
-        skew_s: by how much the right exposures are later, uncorrected, s.
-        start_s: standard deviation of what differs from shot to shot, s.
-        readout_s: from the first row to the last, uncorrected, s.
-        stamp_s: standard deviation of a time stamp, s.
-        speed_m_s: of the body, in any direction.
-        rotation_rad_s: its rate of rotation, about any axis.
-        handeye: standard deviations of position along each axis, m, and of rotation about each, rad.
-        arm: the same of how near the arm comes to where it is sent.
-    """
-
+    #: cause -> standard deviation that it adds to a marker's position, px: pixel noise, defocus, exposure blur.
     noise_px: Mapping[str, float] = field(default_factory=dict)
+    #: (P, P) covariance of the rig's parameters by its calibration, or (0, 0).
     cov_calibration: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    board_scale: float = 0.0
+    board_scale: float = 0.0  #: standard deviation of the board's size, as a share.
+    #: (M,) the marker that each point of the body is of, whose points move together; empty: each its own.
+    marker: Ids = field(default_factory=lambda: np.zeros(0, np.int64))
+    #: of each marker of the body from its file, along its face and out of it, m.
     body_sigma_m: tuple[float, float] = (0.0, 0.0)
-    body_scale: float = 0.0
-    mount_m: float = 0.0
-    lens_share: float = 0.0
-    skew_s: float = 0.0
-    start_s: float = 0.0
-    readout_s: float = 0.0
-    stamp_s: float = 0.0
-    speed_m_s: float = 0.0
-    rotation_rad_s: float = 0.0
+    body_scale: float = 0.0  #: of the body's size, as a share.
+    mount_m: float = 0.0  #: of the right camera's position along each axis since the calibration, m.
+    lens_share: float = 0.0  #: of each focal length since the calibration, as a share.
+    skew_s: float = 0.0  #: by how much the right exposures are later, uncorrected, s.
+    start_s: float = 0.0  #: standard deviation of what differs from shot to shot, s.
+    readout_s: float = 0.0  #: from the first row to the last, uncorrected, s.
+    stamp_s: float = 0.0  #: standard deviation of a time stamp, s.
+    speed_m_s: float = 0.0  #: of the body, in any direction.
+    rotation_rad_s: float = 0.0  #: its rate of rotation, about any axis.
+    #: distance from the epipolar line beyond which a shot's points are not matched: the shot is lost.
+    gate_px: float = np.inf
+    #: standard deviations of position along each axis, m, and of rotation about each, rad.
     handeye: tuple[float, float] = (0.0, 0.0)
-    arm: tuple[float, float] = (0.0, 0.0)
+    arm: tuple[float, float] = (0.0, 0.0)  #: the same of how near the arm comes to where it is sent.
 
 
 @dataclass(frozen=True, eq=False)
 class Budget(Record):
-    """The error of a body's pose, [translation m; rotation rad] along the left camera's axes, at p_left (G, 3), m.
+    """The error of a body's pose, [translation m; rotation rad] along the left camera's axes, at G points of a volume."""
 
-    ``forward`` (3,) is the direction of depth; ``factors``: cause -> (G, 6, K) what its K sources of variance one do to
-    the pose; ``shared``: causes that multiply the same sources, which add before they are squared.
-    """
-
-    p_left: Array
-    forward: Array
-    factors: Mapping[str, Array]
+    p_left: Array  #: (G, 3) the points, m, left camera's frame.
+    forward: Array  #: (3,) direction of depth.
+    factors: Mapping[str, Array]  #: cause -> (G, 6, K) what its K sources of variance one do to the pose.
+    lost: Array  #: (G,) share of the shots in motion that the epipolar gate loses; the errors are those of the others.
+    #: causes that multiply the same sources, which add before they are squared.
     shared: tuple[str, ...] = ("skew", "readout")
 
     def cov(self, *, moving: bool = True, loop: bool = False, of: str = "", scaled: str = "", by: float = 1.0) -> Array:
@@ -154,7 +139,9 @@ def radius(cov: Array) -> Array:
     mean, square = np.trace(cov, axis1=1, axis2=2), np.einsum("gij,gji->g", cov, cov)
     safe = np.maximum(mean, 1e-300)
     scale = np.maximum(square, 1e-300) / safe
-    return np.asarray(np.where(mean > 0, np.sqrt(scale * chi2.ppf(LEVEL, np.clip(safe / scale, 1.0, 3.0))), 0.0))
+    return np.asarray(
+        np.where(mean > 0, np.sqrt(scale * 2 * gammaincinv(np.clip(safe / scale, 1.0, 3.0) / 2, LEVEL)), 0.0)
+    )
 
 
 def volume_views(
@@ -186,7 +173,7 @@ def pose_budget(rig: StereoRig, points: Array, normals: Array, views: list[Predi
     cameras see enough of the body.
     """
     found: list[dict[str, Array]] = []
-    at, forward = [], np.zeros(3)
+    at, lost, forward = [], list[float](), np.zeros(3)
     by_rig = {
         "calibration": covariance_root(given.cov_calibration),
         "print of the board": given.board_scale * scaled_rig(rig),
@@ -196,6 +183,7 @@ def pose_budget(rig: StereoRig, points: Array, normals: Array, views: list[Predi
     velocity = np.repeat(np.array([given.speed_m_s, given.rotation_rad_s]) / np.sqrt(3.0), 3)
     out = np.where(np.isfinite(normals).all(axis=1, keepdims=True), normals, 0.0)
     flat, away = given.body_sigma_m
+    together = (given.marker if len(given.marker) else np.arange(len(points))) == np.arange(len(points))[:, None]
     # Along a face and out of it; alike in all directions where the face is unknown.
     spread = flat * (np.eye(3) - out[:, :, None] * out[:, None]) + away * out[:, :, None] * out[:, None]
     for seen in views:
@@ -204,26 +192,61 @@ def pose_budget(rig: StereoRig, points: Array, normals: Array, views: list[Predi
             continue
         F = {name: d.by_uv.reshape(6, -1) * sigma for name, sigma in given.noise_px.items()}
         F |= {name: d.by_rig @ root for name, root in by_rig.items() if root.size}
-        each = np.einsum("kmi,mij->kmj", d.by_point, spread).reshape(6, -1)
+        each = np.einsum("gm,kmi,mij->kgj", together, d.by_point, spread).reshape(6, -1)
         larger = given.body_scale * np.einsum("kmi,mi->k", d.by_point, points)
         F["print of the body"] = np.column_stack([each, larger])
         heights = np.array([camera.image_size_px[1] for camera in rig.cameras])[d.side]
         late: Array = given.readout_s * (d.uv[:, 1] / (heights - 1) - 0.5)
-        F["readout"] = d.moved(late) * velocity
         right = d.side.astype(np.float64)
-        F["skew"], F["start of exposures"] = (d.moved(s * right) * velocity for s in (given.skew_s, given.start_s))
+        share, kept = _gated(rig, points, seen, d, given, late + given.skew_s * right, velocity)
+        F["readout"] = d.moved(late) @ kept
+        F["skew"], F["start of exposures"] = (d.moved(s * right) @ kept for s in (given.skew_s, given.start_s))
         F["time stamps"] = given.stamp_s * np.diag(velocity)
         for name, (m, rad) in {"hand-eye": given.handeye, "steps and backlash of the arm": given.arm}.items():
             F[name] = np.diag(np.repeat([m, rad], 3))
         R = np.kron(np.eye(2), seen.T_left_body[:3, :3])
         found.append({name: R @ each for name, each in F.items() if each.any()})
         at.append(seen.T_left_body[:3, 3])
+        lost.append(share)
         forward = forward + seen.forward
     if not found:
         raise InputError("both cameras together see three markers of the body nowhere in the volume")
     # What is not seen at one position has as many sources as at the others.
     factors = {name: _stacked([one.get(name) for one in found]) for name in CAUSES if any(name in one for one in found)}
-    return Budget(np.array(at), forward / np.linalg.norm(forward), factors)
+    return Budget(np.array(at), forward / np.linalg.norm(forward), factors, np.array(lost))
+
+
+def _gated(
+    rig: StereoRig,
+    points: Array,
+    seen: PredictedView,
+    d: PoseDerivatives,
+    given: Conditions,
+    late: Array,
+    velocity: Array,
+) -> tuple[float, Array]:
+    """Return the share of shots whose points the exposures move beyond the gate, and V (6, 6) of the others' velocities.
+
+    A velocity of independent parts (6,) moves the points off their epipolar lines; of the shots within the gate that part
+    of it has the variance of a truncated normal distribution, all else of it is as it was. ``late`` (N,), s.
+    """
+    pairs, V = seen.paired, np.diag(velocity)
+    if not np.isfinite(given.gate_px) or (not late.any() and not given.start_s) or seen.seen.shape[1] == 1:
+        return 0.0, V
+    p = transform(seen.T_left_body, points[pairs])
+    line = rig.project(1.001 * p)[1] - rig.project(p)[1]  # along it
+    across = np.column_stack([-line[:, 1], line[:, 0]]) / np.linalg.norm(line, axis=1, keepdims=True)
+    rows = [np.flatnonzero((d.side == side) & np.isin(d.point, pairs)) for side in (0, 1)]
+    by_velocity = np.einsum("nc,ncj->nj", across, d.uv_by_pose[rows[1]]) * velocity
+    a = ((late[rows[1]] - late[rows[0]])[:, None] * by_velocity).mean(axis=0)
+    off = float(np.hypot(np.linalg.norm(a), given.start_s * np.linalg.norm(by_velocity.mean(axis=0))))
+    t = given.gate_px / max(off, 1e-12)
+    inside = erf(t / np.sqrt(2))
+    left = (
+        1 - t * np.sqrt(2 / np.pi) * np.exp(-(t**2) / 2) / inside
+    )  # variance of what is within, Johnson and Kotz 1970
+    unit = by_velocity.mean(axis=0) / max(np.linalg.norm(by_velocity.mean(axis=0)), 1e-12)
+    return float(1 - inside), V @ (np.eye(6) - (1 - np.sqrt(max(left, 0.0))) * np.outer(unit, unit))
 
 
 def of_three(pairs: Sequence[Budget]) -> Budget:

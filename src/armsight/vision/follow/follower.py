@@ -89,7 +89,7 @@ Way = Literal["followed", "searched", "lost"]
 #: least and at the most; and in sizes of the last errors of prediction.
 _MARGIN_FIRST_PX, _MARGIN_LEAST_PX, _MARGIN_MOST_PX, _MARGIN_ERRORS = 60.0, 6.0, 120.0, 4.0
 #: Exposures so far apart, s, move a body by more than a gate allows: a search then lets larger gaps pass.
-_APART_S = 5e-4
+APART_S = 5e-4
 #: A pose from another source is taken back by so much, s, to be predicted from there.
 _BEFORE_S = 1e-3
 #: While it is searched where it is expected, the whole image is searched once in so many shots.
@@ -178,7 +178,7 @@ class Follower:
     def expose_apart(self, apart_s: float) -> None:
         """Replace the standard deviation of the time between the two exposures of a shot, s."""
         self._scene = self._scene._replace(apart_s=apart_s)
-        self._loose = replace(self.rig, sigma_px=max(self.rig.sigma_px, LOOSE_PX)) if apart_s > _APART_S else self.rig
+        self._loose = replace(self.rig, sigma_px=max(self.rig.sigma_px, LOOSE_PX)) if apart_s > APART_S else self.rig
 
     def measure(self, shot: Shot, expected: Array | None = None, twist: Array | None = None) -> PoseEstimate | Missed:
         """Measure one shot; shots must come in the order of their time.
