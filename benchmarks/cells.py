@@ -5,12 +5,14 @@
     python cells.py 200 --rate 1       latency and cost alone, with a shot a second of each cell
     python cells.py 50 --drift 5       three of them drift: where they stand in the list after 5 minutes
     python cells.py --alarms 7         false alarms of healthy cells in so many days, without any process
-    python cells.py 50 --beside 600    image to command of a workcell beside them, alternately without them: the workcell
-                                       has a core to itself, as a cell has its computer
+    python cells.py 50 --beside 600    image to command of a workcell beside hub and cells, alternately without them
     python cells.py 200 --page         how often Chromium draws the page, and its memory; the hub is fed in one process
 
 Cells are processes of their own with the sink that commands have; they are fed with measured poses of a simulated rig
 at 10 Hz, or --rate. The hub runs in a process of its own, and is looked at through its pages.
+
+With --beside workcell and hub share all cores. The others stand for computers of their own: the scheduler gives them
+what is left (nice 19, SCHED_IDLE), so that what changes is what the hub and the workcell's own stream cost.
 """
 
 import argparse
@@ -35,6 +37,8 @@ NOISE_PX, BREATH_RAD, BREATH_S = 0.05, 3e-6, 40.0
 DRIFT_DEG_H = 0.05
 #: From a block's middle to the hub's look at it, s: the next block is being filled.
 LATE_S = 12.0
+#: Poses that a cell measures before it replays them.
+RECORDED = 50
 #: s that the cells go on and are stopped alternately, less than a zenoh session lasts without a sign of life; s of each
 #: that do not count.
 BLOCK_S, BEGIN_S = 2.5, 0.3
@@ -55,8 +59,9 @@ def timed(self, *arguments, **named):
     self.latency_s = Timed()
 log.Log.__init__ = timed
 gc.set_threshold(100_000)
-for k in range(1000):
-    assert run([*sys.argv[2:], "-o", f"beside{k}"]) == 0
+for k in range(1000):  # every other run is a cell of the hub
+    print(time.monotonic(), -1.0 - k % 2, file=file, flush=True)
+    assert run([*sys.argv[3:], "-o", f"beside{k}", *(("--stream", sys.argv[2]) if k % 2 else ())]) == 0
 """
 
 
@@ -85,13 +90,15 @@ def cell(number, spec, seed, drifts):
     from armsight.loop.running.data import NoteDatum, ShotDatum
     from armsight.sim.example_rig import example_rig
 
+    if ARGUMENTS.beside:
+        idle()
     rng = np.random.default_rng([seed, number])
     rig, breath, began = example_rig(), np.zeros(3), time.monotonic()
     body, _ = measured(rig, rig, rng)
     axis = rng.integers(0, 2)
     sink = open_cell(spec, Published(rig, body, properties={"command": "measure"}))
     sink.start()
-    ended = []
+    known, ended = [], []
     signal.signal(signal.SIGTERM, lambda *_: ended.append(True))
     image, count, keep = np.zeros((480, 640), np.uint8), 0, np.exp(-1.0 / (ARGUMENTS.rate * BREATH_S))
     while not ended:
@@ -101,7 +108,9 @@ def cell(number, spec, seed, drifts):
         tangent[-3:] = breath
         if drifts:
             tangent[-3 + axis] += np.radians(DRIFT_DEG_H) * now / 3600.0
-        _, pose = measured(rig, rig.perturbed(tangent), rng)
+        if ARGUMENTS.drift or len(known) < RECORDED:  # where nothing drifts they are replayed
+            known.append(measured(rig, rig.perturbed(tangent), rng)[1])
+        pose = known[-1] if ARGUMENTS.drift else known[rng.integers(len(known))]
         sink.put(ShotDatum(Shot(f"{now:.1f}", image, image, now), pose))
         if not drifts and now > 5.0 * (count + 1) and not ARGUMENTS.drift:
             count += 1
@@ -112,19 +121,16 @@ def cell(number, spec, seed, drifts):
     print(json.dumps({"cell": number, "sink_cpu_s": sink.cpu_s, "process_cpu_s": used, "seconds": now}), flush=True)
 
 
+def idle():
+    """Have this process, and those it starts, take only what others leave of the processor."""
+    os.nice(19)
+    os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+
+
 def hub(folder, port, http):
     """Start a hub, and return its process."""
-    command = [
-        sys.executable,
-        "-m",
-        "armsight",
-        "hub",
-        "--listen",
-        f"tcp/127.0.0.1:{port}",
-        "--http",
-        f"127.0.0.1:{http}",
-    ]
-    process = subprocess.Popen([*command, "-o", str(folder), "--json"], stdout=subprocess.PIPE, text=True)
+    ends = ["--listen", f"tcp/127.0.0.1:{port}", "--http", f"127.0.0.1:{http}", "-o", str(folder), "--json"]
+    process = subprocess.Popen([sys.executable, "-m", "armsight", "hub", *ends], stdout=subprocess.PIPE, text=True)
     process.stdout.readline()
     return process
 
@@ -260,51 +266,55 @@ def workcell(folder):
     return ["run", "--source", "sim:", "--board", "emulated:", *files]
 
 
-def beside(seconds, run, core, others, folder, port):
-    """Print how long a workcell takes from image to command, alternately with and without the others."""
+def beside(seconds, run, hub_pid, cells, folder, port, http):
+    """Print how long a workcell takes from image to command, alternately with and without hub, cells and its stream."""
     taken = folder / "taken"
-    alone = subprocess.Popen(
-        [sys.executable, "-c", BESIDE, taken, *run],
-        cwd=folder,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        preexec_fn=lambda: os.sched_setaffinity(0, {core}),
-    )
-    until(lambda: alone.poll() is not None or (taken.exists() and taken.stat().st_size), 600)
+    quiet = {"cwd": folder, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "start_new_session": True}
+    alone = subprocess.Popen([sys.executable, "-c", BESIDE, taken, f"cell:beside@127.0.0.1:{port}", *run], **quiet)
+    until(lambda: alone.poll() is not None or (taken.exists() and taken.read_text().count("\n") > 1), 600)
     if alone.poll() is not None:
         raise SystemExit("the workcell beside has ended")
-    other, number, ends, end = None, 0, [], time.monotonic() + seconds
+    other, number, ends, used = None, 0, [], [cpu_s(hub_pid)[0]]
+    before, end = sum(each["state"].get("shots") or 0 for each in page(http)["cells"]), time.monotonic() + seconds
     while time.monotonic() < end:
         if other is None or other.poll() is not None:
-            cell, number = f"w{number % 4}", number + 1
-            command = [sys.executable, "-m", "armsight", *run, "-o", cell, "--stream", f"cell:{cell}@127.0.0.1:{port}"]
-            quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "start_new_session": True}
-            other = subprocess.Popen(command, cwd=folder, **quiet)
+            name, number = f"w{number % 4}", number + 1
+            command = [sys.executable, "-m", "armsight", *run, "-o", name, "--stream", f"cell:{name}@127.0.0.1:{port}"]
+            other = subprocess.Popen(command, preexec_fn=idle, **quiet)
         time.sleep(BLOCK_S)
+        page(http)
         ends.append(time.monotonic())
         for what in (signal.SIGSTOP, signal.SIGCONT):
-            for pid in others:
+            for pid in (hub_pid, *cells):
                 os.kill(pid, what)
             os.killpg(other.pid, what)
             if what == signal.SIGSTOP:
                 time.sleep(BLOCK_S)
                 ends.append(time.monotonic())
-    alone.kill()
-    os.killpg(other.pid, signal.SIGKILL)
+    used.append(cpu_s(hub_pid)[0])
+    time.sleep(2.0)
+    shots = sum(each["state"].get("shots") or 0 for each in page(http)["cells"] if each["name"][0] == "c") - before
+    for each in (alone, other):
+        os.killpg(each.pid, signal.SIGKILL)
     at, took = np.loadtxt(taken).T
+    first = np.maximum.accumulate(np.where(took < 0, np.arange(len(took)), 0))  # the line with which the run began
+    streams = took[first] == -2.0
     block = np.searchsorted(ends, at)
-    inside = (block > 0) & (block < len(ends))
+    inside = (took >= 0) & (block > 0) & (block < len(ends))
     inside &= at - np.array(ends)[np.maximum(block, 1) - 1] > BEGIN_S
-    print(f"{number} workcells one after another on the core of cells and hub; blocks of {BLOCK_S} s")
-    found = {}
-    kinds = {"with": block % 2 == 0, "without": block % 2 == 1, "without, half of the blocks": block % 4 == 1}
+    heard, share = np.array([shots, 100 * (used[1] - used[0])]) / (BLOCK_S * len(ends) / 2)
+    print(f"{number} workcells in turn; {heard:.0f} shots a second of cells heard; the hub: {share:.1f} % of a core")
+    found, on = {}, block % 2 == 0
+    kinds = {"without": ~on & ~streams, "with hub and cells": on & ~streams, "with its stream, too": on & streams}
+    kinds |= {"with its stream alone": ~on & streams, "half of without": ~on & ~streams & (block % 4 == 1)}
     for label, kind in kinds.items():
-        mine = inside & kind
-        found[label] = np.percentile(1e3 * took[mine], [50, 99])
-        print(f"image to command {label}: {mine.sum()} shots, p50 {found[label][0]:.3f}, p99 {found[label][1]:.3f} ms")
-    for label in ("with", "without, half of the blocks"):
+        mine = took[inside & kind]
+        found[label] = np.percentile(1e3 * mine, [50, 99]) if len(mine) else np.full(2, np.nan)
         change = 100 * (found[label] / found["without"] - 1)
-        print(f"{label} over without: p50 {change[0]:+.1f} %, p99 {change[1]:+.1f} % (5 asked)")
+        print(
+            f"image to command {label}: {len(mine)} shots, p50 {found[label][0]:.3f}, p99 {found[label][1]:.3f} ms: "
+            f"{change[0]:+.1f} %, {change[1]:+.1f} % (5 asked)"
+        )
 
 
 def renderers():
@@ -323,11 +333,8 @@ def fed(count, folder, port):
     """Return the page's address of a hub in this process that hears so many cells once a second, with a day's errors."""
     from armsight.app.hub.service import Hub
 
-    rng, site, names = (
-        np.random.default_rng(ARGUMENTS.seed),
-        Hub(folder, f"tcp/127.0.0.1:{port}", "127.0.0.1:0", None, print),
-        [f"c{number:03d}" for number in range(count)],
-    )
+    site = Hub(folder, f"tcp/127.0.0.1:{port}", "127.0.0.1:0", None, print)
+    rng, names = np.random.default_rng(ARGUMENTS.seed), [f"c{number:03d}" for number in range(count)]
     for name in names:
         site._hear(("site", name, "alive", time.time(), (name, True)))
 
@@ -423,8 +430,6 @@ def main():
     port, http, count = free_port(), free_port(), ARGUMENTS.cells
     if ARGUMENTS.beside:
         run = workcell(folder)
-        core, *_, last = sorted(os.sched_getaffinity(0))
-        os.sched_setaffinity(0, {last})  # of hub and cells, too
     drifting = set(np.random.default_rng(ARGUMENTS.seed).choice(count, 3, replace=False)) if ARGUMENTS.drift else set()
     if ARGUMENTS.page:
         page_drawn(fed(count, folder, port))
@@ -445,7 +450,7 @@ def main():
                 flush=True,
             )
     elif ARGUMENTS.beside:
-        beside(ARGUMENTS.beside, run, core, [process.pid, *(each.pid for each in cells)], folder, port)
+        beside(ARGUMENTS.beside, run, process.pid, [each.pid for each in cells], folder, port, http)
     else:
         before = cpu_s(process.pid)
         began = time.monotonic()

@@ -2,6 +2,8 @@
 
 import json
 import pickle
+import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,6 +11,7 @@ import pytest
 pytest.importorskip("distributed")
 pytest.importorskip("mcap")
 
+from armsight.app.batch.report import _of_result
 from armsight.app.batch.run import Batch, _keys, _load, found_recordings, run_batch
 from armsight.app.batch.work import BatchOptions, Done, work
 from armsight.errors import InputError
@@ -158,8 +161,36 @@ def test_check_and_identify_take_the_data_of_their_commands(tmp_path, monkeypatc
     checked = work(str(tmp_path / "run"), BatchOptions("check"))
     assert checked.recording["status"] == "ok"
     assert set(json.loads(checked.recording["result"])["poses"]) == {f"P{k}" for k in range(1, 6)}
+    compared = _of_result(json.loads(checked.recording["result"]))
+    assert (
+        compared["circle.circularity_m"] == json.loads(checked.recording["result"])["circle"]["circularity_m"]["clean"]
+    )
+    assert not any(name.endswith((".raw", ".sigma")) for name in compared)
     failed = work(str(tmp_path / "run" / "check.csv"), BatchOptions("identify", arm="six_r"))
     assert "no joint angles; columns q1_rad" in failed.recording["reason"]
+
+
+def test_a_run_s_arm_rig_and_summary_are_in_its_row(tmp_path, monkeypatch):
+    from armsight.app.batch import work as module
+    from armsight.app.stream.datum import Published
+    from armsight.app.stream.mcap_file import McapSink, properties
+    from armsight.robot.arm_file import open_arm
+    from armsight.sim.example_rig import example_rig
+
+    monkeypatch.setitem(module.OPERATIONS, "replay", lambda path, options: ({"shots": 0}, []))
+    rig = replace(example_rig(), provenance={"made_utc": "2026-10-03T07:00:00+00:00"})
+    sink = McapSink(tmp_path / "run.mcap", Published(properties=properties(rig, None, open_arm("six_r"))))
+    sink.start()
+    sink.close()
+    delay = {"value": 0.013, "sigma": 0.001}
+    (tmp_path / "summary.json").write_text(json.dumps({"wall_s": 7.0, "camera_delay_s": delay, "handeye": None}))
+    for path in (tmp_path, tmp_path / "run.mcap"):
+        row = work(str(path), BatchOptions("replay")).recording
+        assert row["arm"] == "six_r"
+        assert re.fullmatch("2026-10-03 [0-9a-f]{8}", row["rig"])
+        assert _of_result(json.loads(row["result"])) == {"camera_delay_s": 0.013}
+    (tmp_path / "summary.json").write_text("[")
+    assert work(str(tmp_path), BatchOptions("replay")).recording["result"] is None
 
 
 def test_another_rig_file_of_the_same_name_is_another_batch(tmp_path):

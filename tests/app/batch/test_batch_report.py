@@ -17,15 +17,21 @@ pytest.importorskip("distributed")
 CELLS, RUNS, SHOTS = 12, 10, 8
 
 
-def batch(folder, seed, change=lambda cell, run: 0.0, missed=lambda cell: 0.1, a_day=1, runs=RUNS):
-    """Write the tables of a batch: residuals in which cells differ by 5 %, days by 3 %, shots by 20 %."""
+def batch(folder, seed, change=lambda cell, run: 0.0, missed=lambda cell: 0.1, a_day=1, runs=RUNS, arms=0):
+    """Write the tables of a batch: residuals in which cells differ by 5 %, days by 3 %, shots by 20 %.
+
+    With arms, cells have one of so many, and another rig from the fifth run on; without, each cell has one rig.
+    """
     rng = np.random.default_rng(seed)
     recordings, shots = [], {"recording": [], "status": [], "residual_rms_m": []}
     own = 0.05 * rng.standard_normal(CELLS)
     for cell in range(CELLS):
         for run in range(runs):
             name = f"s3://bucket/lab/2026-11-{run // a_day + 1:02d}/c{cell:02d}/run{run}/run.mcap"
-            recordings.append({"recording": name, "status": "ok", "reason": None})
+            row = {"recording": name, "status": "ok", "reason": None, "rig": f"2026-10-{cell + 1:02d} 0"}
+            if arms:
+                row |= {"arm": f"arm{cell % arms}", "rig": f"2026-{10 + (run > 4)}-{cell + 1:02d} 0"}
+            recordings.append(row)
             if run % a_day == 0:
                 day = 0.03 * rng.standard_normal()
             for _ in range(SHOTS):
@@ -44,7 +50,7 @@ def batch(folder, seed, change=lambda cell, run: 0.0, missed=lambda cell: 0.1, a
 
 
 def named(rows):
-    return {(row.cell, row.metric) for row in rows if row.named}
+    return {(row.name, row.metric) for row in rows if row.named}
 
 
 def test_a_cell_that_differs_is_named_alone(tmp_path):
@@ -60,13 +66,26 @@ def test_a_cell_that_changes_from_day_to_day_is_named(tmp_path):
     assert rows[0].per_day == pytest.approx(0.01, rel=0.4)
 
 
+def test_an_arm_that_changes_and_a_rig_that_differs_are_named(tmp_path):
+    """Six arms, two cells each, of which one wears; the second rig of a cell is calibrated badly."""
+    wrong = lambda cell, run: 0.1 * run * (cell % 6 == 2) + 2.0 * (cell == 4 and run > 4)  # noqa: E731
+    rows = report(batch(tmp_path / "b", 4, wrong, arms=6))
+    (worn,) = [row for row in rows if row.named and row.by == "arm"]
+    assert (worn.name, worn.runs) == ("arm2", 2 * RUNS)
+    assert worn.per_day == pytest.approx(0.01, rel=0.4)
+    assert {row.name for row in rows if row.named and row.by == "rig" and row.median > 0.25} == {"2026-11-05 0"}
+    assert {row.by for row in report(batch(tmp_path / "c", 4))} == {"cell"}  # a rig a cell says the same as cells
+
+
 def test_a_cell_that_misses_more_is_named(tmp_path):
     rows = report(batch(tmp_path / "b", 3, missed=lambda cell: 0.7 if cell == 7 else 0.1))
     assert ("c07", "missed") in named(rows)
 
 
 @pytest.mark.parametrize(
-    "how", [{}, {"missed": lambda cell: 0.01}, {"a_day": 5, "runs": 30}], ids=["as it is", "few missed", "many a day"]
+    "how",
+    [{}, {"missed": lambda cell: 0.01}, {"a_day": 5, "runs": 30}, {"arms": 6}],
+    ids=["as it is", "few missed", "many a day", "with arms and rigs"],
 )
 def test_where_no_cell_differs_few_reports_name_one(tmp_path, how):
     """5 % of reports may; of 40 more than 5 have a chance of 1.4 % (binomial)."""

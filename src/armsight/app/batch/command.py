@@ -45,8 +45,8 @@ def command(
     reason, is tried again when the batch is started again, and makes the exit code 1. identify takes tables of poses
     (armsight identify -h), check folders of runs (armsight check -h), measure and replay recordings (armsight replay -h).
 
-    ``report DIR`` reads the results of a batch whose recordings lie as SITE/DAY/CELL/RUN (armsight hub push): which cells
-    differ from their siblings, and which change from day to day.
+    ``report DIR`` reads the results of a batch whose recordings lie as SITE/DAY/CELL/RUN (armsight hub push): which cells,
+    arms and rigs differ from their siblings, and which change from day to day.
     """
     from armsight.app.batch.run import Batch, run_batch
     from armsight.app.batch.work import BatchOptions

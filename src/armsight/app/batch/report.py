@@ -1,7 +1,8 @@
-"""``armsight batch report``: which cells of a batch differ from their siblings, and which change from day to day.
+"""``armsight batch report``: which cells, arms or rigs differ from their siblings, and which change from day to day.
 
-In: the tables of a batch. Out: a row a number and cell: its median over the runs, how far it is off the siblings', and
-how it changes a day; each with a chance that counts how many comparisons were made (Holm, Scand. J. Statist. 6, 1979).
+In: the tables of a batch. Out: a row a number and cell, arm or rig of a site: its median over the runs, how far it is off
+the siblings', and how it changes a day; each with a chance that counts how many comparisons were made (Holm, Scand. J.
+Statist. 6, 1979).
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import json
 import math
 import re
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import date
 from pathlib import Path
@@ -40,33 +41,27 @@ _OF_SHOTS = {
     "misfit": ("misfit", 1.0),
 }
 MISSED = "missed"
+#: By what runs are compared.
+BY = ("cell", "arm", "rig")
+#: Site, what of BY it is, and its name; and the numbers of their runs.
+_Group = tuple[str, str, str]
+_Groups = Mapping[_Group, Sequence[int]]
 
 
 @dataclass(frozen=True)
-class CellRow:
-    """One number of one cell.
-
-    Attributes:
-        site: of the cell.
-        cell: its name.
-        metric: the number's name, with its unit.
-        runs: how many runs have it.
-        median: over its runs.
-        siblings: median of the other cells' medians.
-        chance: how probable a difference as large is where no cell differs, comparisons counted; None without siblings.
-        per_day: its change a day; None where there are too few days.
-        chance_trend: how probable a change as steep is where none is, comparisons counted.
-    """
+class Compared:
+    """One number of one cell, arm or rig; chances count the comparisons."""
 
     site: str
-    cell: str
-    metric: str
-    runs: int
-    median: float
-    siblings: float | None
-    chance: float | None
-    per_day: float | None
-    chance_trend: float | None
+    by: str  #: one of BY
+    name: str  #: of the cell or arm, or day and checksum of the rig
+    metric: str  #: the number's name, with its unit
+    runs: int  #: how many runs have it
+    median: float  #: over its runs
+    siblings: float | None  #: median of the others' medians
+    chance: float | None  #: how probable a difference as large is where none differs; None without siblings
+    per_day: float | None  #: its change a day; None where there are too few days
+    chance_trend: float | None  #: how probable a change as steep is where none is
 
     @property
     def least(self) -> float:
@@ -84,15 +79,17 @@ class _PushedRun:
     """One run: where it was made, its numbers, and how many of its shots missed."""
 
     site: str
-    cell: str
+    names: dict[str, str]  # of BY -> its name; an arm or a rig that is not known is left out
     day: int
     values: dict[str, float]
     missed: int
     shots: int
 
 
-def report(folder: Path) -> list[CellRow]:
-    """Compare the cells of a batch; the rows that name one are first.
+def report(folder: Path) -> list[Compared]:
+    """Compare the cells, arms and rigs of a batch; the rows that name one are first.
+
+    Arms or rigs are left out where they part the runs as cells do: the rows would be the same.
 
     Raises:
         InputError: it is no batch, or its recordings have no cells.
@@ -102,10 +99,23 @@ def report(folder: Path) -> list[CellRow]:
         raise InputError(
             f"{folder}: no recording lies as SITE/DAY/CELL/RUN, as armsight hub push has it: nothing to compare"
         )
-    rows = [row for metric in sorted({name for run in runs for name in run.values}) for row in _compared(runs, metric)]
+    metrics, kinds = sorted({name for run in runs for name in run.values}), _grouped(runs)
+    rows = [row for metric in metrics for groups in kinds for row in _compared(runs, metric, groups)]
     chances = _holm([*(row.chance for row in rows), *(row.chance_trend for row in rows)])
     rows = [replace(row, chance=chances[n], chance_trend=chances[n + len(rows)]) for n, row in enumerate(rows)]
-    return sorted(rows, key=lambda row: (not row.named, row.least, row.metric, row.cell))
+    return sorted(rows, key=lambda row: (not row.named, row.least, row.metric, BY.index(row.by), row.name))
+
+
+def _grouped(runs: Sequence[_PushedRun]) -> Collection[_Groups]:
+    """Return the runs of each cell, of each arm and of each rig; none that parts them as one before."""
+    found = dict[frozenset[tuple[int, ...]], _Groups]()
+    for by in BY:
+        groups = defaultdict[_Group, list[int]](list)
+        for n, run in enumerate(runs):
+            if by in run.names:
+                groups[run.site, by, run.names[by]].append(n)
+        found.setdefault(frozenset(map(tuple, groups.values())), groups)
+    return found.values()
 
 
 def _runs(folder: Path) -> Iterator[_PushedRun]:
@@ -132,45 +142,44 @@ def _runs(folder: Path) -> Iterator[_PushedRun]:
             for key, (name, factor) in _OF_SHOTS.items()
             if key in columns and own and np.isfinite(columns[key][own]).any()
         }
-        values |= _of_result(recording.get("result"))
+        values |= _of_result(json.loads(recording.get("result") or "{}"))
         missed = int((status[own] != "ok").sum())
         if own:
             values[MISSED] = missed / len(own)
-        yield _PushedRun(where[1], where[3], date.fromisoformat(where[2]).toordinal(), values, missed, len(own))
+        names = {"cell": where[3], **{by: recording[by] for by in BY[1:] if recording.get(by)}}
+        yield _PushedRun(where[1], names, date.fromisoformat(where[2]).toordinal(), values, missed, len(own))
 
 
-def _of_result(text: str | None) -> dict[str, float]:
-    """Return the numbers at the top of a result of check or identify, and of its tables by name."""
-    found: dict[str, float] = {}
-    for key, value in json.loads(text or "{}").items():
-        if isinstance(value, int | float) and not isinstance(value, bool):
-            found[key] = float(value)
-        elif isinstance(value, dict):
-            inner = {f"{key}.{name}": each for name, each in value.items()}
-            found |= {
-                name: float(x) for name, x in inner.items() if isinstance(x, int | float) and not isinstance(x, bool)
-            }
-    return found
+def _of_result(found: Any, name: str = "") -> dict[str, float]:  # noqa: ANN401 - whatever JSON holds
+    """Return the numbers of a result by their names, joined by dots; of one with its uncertainty itself alone."""
+    if isinstance(found, dict):
+        found = found.get("clean", found.get("value", found))
+    if isinstance(found, dict):
+        return {k: x for key, each in found.items() for k, x in _of_result(each, f"{name}.{key}".strip(".")).items()}
+    known = isinstance(found, int | float) and not isinstance(found, bool) and math.isfinite(found)
+    return {name: float(found)} if known else {}
 
 
-def _compared(runs: Sequence[_PushedRun], metric: str) -> Iterator[CellRow]:
-    """Compare one number of the cells of each site."""
-    cells: dict[tuple[str, str], list[_PushedRun]] = defaultdict(list)
-    for run in runs:
-        if metric in run.values:
-            cells[run.site, run.cell].append(run)
-    medians = {key: float(np.median([run.values[metric] for run in own])) for key, own in cells.items()}
-    if metric == MISSED:  # of all shots together
-        medians = {key: sum(r.missed for r in own) / sum(r.shots for r in own) for key, own in cells.items()}
-    for (site, cell), own in sorted(cells.items()):
-        others = [key for key in medians if key[0] == site and key[1] != cell]
-        values, least = np.array([medians[site, cell], *(medians[key] for key in others)]), 0.0
+def _compared(runs: Sequence[_PushedRun], metric: str, groups: _Groups) -> Iterator[Compared]:
+    """Compare one number of the cells, arms or rigs of each site."""
+    having = {key: [runs[n] for n in own if metric in runs[n].values] for key, own in groups.items()}
+    cells = {key: own for key, own in having.items() if own}
+    medians = {key: _median(own, metric) for key, own in cells.items()}
+    for key, own in sorted(cells.items()):
+        others = [each for each in medians if each[0] == key[0] and each != key]
+        values, least = np.array([medians[key], *(medians[each] for each in others)]), 0.0
         if metric == MISSED:  # an angle whose scatter by chance alone does not depend on the share (Anscombe)
             values, least = np.arcsin(np.sqrt(values)), 0.5 / math.sqrt(sum(run.shots for run in own))
         chance = _chance(float(values[0]), values[1:], least) if len(others) >= _CELLS - 1 else None
-        siblings = float(np.median([medians[key] for key in others])) if others else None
-        slope, chance_trend = _trend(own, metric)
-        yield CellRow(site, cell, metric, len(own), medians[site, cell], siblings, chance, slope, chance_trend)
+        siblings = float(np.median([medians[each] for each in others])) if others else None
+        yield Compared(*key, metric, len(own), medians[key], siblings, chance, *_trend(own, metric))
+
+
+def _median(own: Sequence[_PushedRun], metric: str) -> float:
+    """Return the median of runs; of missed shots the share of all together."""
+    if metric == MISSED:
+        return sum(run.missed for run in own) / sum(run.shots for run in own)
+    return float(np.median([run.values[metric] for run in own]))
 
 
 def _chance(value: float, others: Array, least: float) -> float | None:
@@ -203,10 +212,10 @@ def _holm(chances: Sequence[float | None]) -> list[float | None]:
     return found
 
 
-def lines(rows: Sequence[CellRow], most: int = 30) -> list[str]:
+def lines(rows: Sequence[Compared], most: int = 30) -> list[str]:
     """Return the report for a terminal."""
-    cells, named = {(row.site, row.cell) for row in rows}, [row for row in rows if row.named]
-    runs = max(row.runs for row in rows)
+    cells, named = {(row.site, row.name) for row in rows if row.by == "cell"}, [row for row in rows if row.named]
+    runs = max(row.runs for row in rows if row.by == "cell")
     said = [f"{len(cells)} cells, up to {runs} runs each, {len(rows)} comparisons: {len(named)} rows differ or change"]
     for row in named[:most]:
         off = (
@@ -215,10 +224,12 @@ def lines(rows: Sequence[CellRow], most: int = 30) -> list[str]:
             else ""
         )
         trend = f"{row.per_day:+.3g} a day (chance {row.chance_trend:.1g})" if row.chance_trend is not None else ""
-        said.append(f"{row.site}/{row.cell} {row.metric}: {'; '.join(filter(None, (off, trend)))}")
-    return said if named else [*said, "no cell differs from its siblings by more than chance"]
+        name = row.name if row.by == "cell" else f"{row.by} {row.name}"
+        said.append(f"{row.site}/{name} {row.metric}: {'; '.join(filter(None, (off, trend)))}")
+    others = " or ".join(by for by in BY if any(row.by == by for row in rows))
+    return said if named else [*said, f"no {others} differs from its siblings by more than chance"]
 
 
-def to_json(rows: Sequence[CellRow]) -> dict[str, Any]:
+def to_json(rows: Sequence[Compared]) -> dict[str, Any]:
     """Return the report for programs."""
     return {"rows": [{**asdict(row), "named": row.named} for row in rows], "chance": CHANCE}

@@ -7,6 +7,7 @@ which worker computes it, or when.
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import io
 import json
 import tempfile
@@ -20,6 +21,8 @@ from armsight.errors import ArmsightError
 
 #: What is printed is redirected for the whole process: one command at a time, where a worker has several threads.
 _PRINTS = threading.Lock()
+#: What is compared of a run's summary.json.
+_SUMMARY = ("camera_delay_s", "closed_loop", "handeye", "latency_s")
 #: Rows of a table: column -> value.
 Row = dict[str, Any]
 
@@ -65,6 +68,8 @@ def work(path: str, options: BatchOptions) -> Done:
     try:
         with _local(path) as local:
             row, shots = OPERATIONS[options.operation](local, options)
+            row |= _made_with(local)
+            row.setdefault("result", _summary(path))
     except (ArmsightError, OSError) as error:
         return Done({"recording": path, "status": "failed", "reason": " ".join(str(error).split())}, [])
     except Exception as error:  # noqa: BLE001 - one recording must not end the batch
@@ -85,6 +90,35 @@ def _local(path: str) -> Iterator[str]:
         local = Path(folder) / Path(name).name
         fs.get(name, str(local), recursive=fs.isdir(name))
         yield str(local)
+
+
+def _made_with(path: str) -> Row:
+    """Return arm and rig of a run, by which a report compares, too; nothing where a recording does not name them."""
+    from armsight.app.replay.recorded import run_file
+    from armsight.app.stream.mcap_file import ARM
+    from armsight.vision.sources.bag import Bag
+    from armsight.vision.sources.bag.camera_info import METADATA, RIG
+
+    file, found = run_file(path), Row()
+    with contextlib.suppress(ArmsightError, ValueError, KeyError, TypeError, AttributeError):  # metadata of others
+        texts = {} if file is None else Bag(file).metadata.get(METADATA, {})
+        if ARM in texts:
+            found["arm"] = str(json.loads(texts[ARM])["name"])
+        if RIG in texts:  # the day it was made, and which one of that day
+            made = str(json.loads(texts[RIG])["provenance"].get("made_utc", ""))[:10]
+            found["rig"] = f"{made} {hashlib.sha256(texts[RIG].encode()).hexdigest()[:8]}".strip()
+    return found
+
+
+def _summary(path: str) -> str | None:
+    """Return what a report compares of the summary.json beside a run, as JSON; None where there is none."""
+    import fsspec
+
+    fs, name = fsspec.core.url_to_fs(path)
+    with contextlib.suppress(OSError, ValueError, AttributeError):  # none is there, or it is of another program
+        found = json.loads(fs.cat_file(f"{name if fs.isdir(name) else name.rpartition('/')[0]}/summary.json"))
+        return json.dumps({key: found[key] for key in _SUMMARY if found.get(key)}, sort_keys=True)
+    return None
 
 
 def _replay(path: str, options: BatchOptions) -> tuple[Row, list[Row]]:
