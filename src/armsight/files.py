@@ -321,7 +321,6 @@ def _sync_folder(folder: Path) -> None:
 
 
 def _beside(target: Path) -> Path:
-    """Return the name of a temporary file beside another."""
     return target.with_name(f".{target.name}.{os.urandom(4).hex()}")
 
 

@@ -250,7 +250,6 @@ class PoseServo:
         return self._command(aim, change, mode, error)
 
     def _mode(self, estimate: ArmEstimate, trust: Trust) -> Mode:
-        """Return what may close the loop."""
         if trust is not Trust.FULL:
             return Mode.HELD if trust is Trust.DOUBTED else Mode.DISTRUSTED
         cov = estimate.cov_own[:3, :3]

@@ -224,7 +224,6 @@ def find_exposures(seen: Brightness, bit_s: float, *, near: tuple[float, float] 
 
 
 def _search(seen: Brightness, n: Array, stamp_s: float, period_s: float, bit_s: float) -> tuple[float, float] | Missed:
-    """Return the delay and the exposure, s, at which the code explains most of the brightness."""
     if len(n) < LEAST_FOUND:
         return Missed(f"the LED was seen in {len(n)} images, {LEAST_FOUND} at least are needed to find its code")
     known = np.column_stack([np.ones(len(n)), seen.around - seen.around.mean()])
@@ -433,7 +432,6 @@ class SyncLedWatch:
             self._busy = False
 
     def _search(self, batch: _Batch) -> str | None:
-        """Find the windows of what blinks."""
         corners = tuple(candidates(np.array([seen[side] for _, seen in batch])) for side in range(2))
         for side, found in zip(_SIDES, corners, strict=True):
             if not found:
@@ -442,7 +440,6 @@ class SyncLedWatch:
         return None
 
     def _identify(self, batch: _Batch) -> str | None:
-        """Choose the candidate that blinks the code, in both cameras."""
         stamp_s, chosen = np.array([t for t, _ in batch]), list[tuple[Spot, Brightness]]()
         corners, self._corners = self._corners, ()
         for side, name in enumerate(_SIDES):
@@ -474,7 +471,6 @@ class SyncLedWatch:
         return None
 
     def _follow(self, batch: _Batch) -> str | None:
-        """Estimate delay and skew of a window."""
         stamp_s = np.array([t for t, _ in batch])
         left, right = (Brightness(stamp_s, *np.array([seen[side] for _, seen in batch]).T) for side in range(2))
         found = estimate_sync(left, right, self._bit_s, near=self.estimates[-1])

@@ -323,7 +323,6 @@ class Columns:
         return names
 
     def _near(self, names: list[str], count: int) -> str:
-        """Return what may be wrong with the columns of joints."""
         if len(names) == count + 1:
             return "; is the last one a gripper? remove its column"
         unknown = next((name for name in self.at if name and name not in COLUMNS), None)
@@ -419,7 +418,6 @@ class Columns:
         return (np.degrees(found) if radians else found), convention, found
 
     def _checked(self, R: Array) -> Array:
-        """Return rotations, cleaned of rounding."""
         for (line, _), one in zip(self.rows, R, strict=True):
             off, determinant = float(np.abs(one @ one.T - np.eye(3)).max()), float(np.linalg.det(one))
             if off < LOOSE and determinant < 0:

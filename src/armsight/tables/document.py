@@ -155,7 +155,6 @@ def _refuse(data: bytes, path: str | Path) -> None:
 
 
 def _numpy(data: bytes, path: str | Path) -> dict[str, Foreign]:
-    """Return the arrays of an .npz, or the one of an .npy under the file's name."""
     try:
         if data[:2] == b"PK":
             sizes = [member.file_size for member in zipfile.ZipFile(io.BytesIO(data)).infolist()]
@@ -325,7 +324,6 @@ def dump_yaml(document: Mapping[str, Foreign]) -> str:
 
 
 def _literal(text: str, path: str | Path) -> Foreign:
-    """Return Python's literals, as mrcal writes them."""
     try:
         return ast.literal_eval(text.lstrip())
     except (ValueError, SyntaxError, MemoryError, RecursionError) as error:
@@ -361,7 +359,6 @@ def _xml(data: bytes, path: str | Path) -> Foreign:
 
 
 def _node(element: ElementTree.Element) -> Foreign:
-    """Return the value of an element of OpenCV's XML."""
     if children := list(element):
         listed = all(child.tag == "_" for child in children)
         return [*map(_node, children)] if listed else {child.tag: _node(child) for child in children}

@@ -179,7 +179,6 @@ def _items_of_mapping(node: Mapping[str, Any]) -> list[tuple[Any, str | None]]:
 
 
 def _numbers(node: Mapping[str, Any]) -> Record:
-    """Return the numbers of a mapping, as text."""
     return {key: repr(float(one)) for key, one in node.items() if type(one) in (int, float)}
 
 
@@ -329,7 +328,6 @@ def has_both(path: Path) -> bool:
 
 
 def _content(node: Any) -> str:  # noqa: ANN401
-    """Return what a document holds, as text."""
     if isinstance(node, Mapping):
         return f"a mapping of {', '.join(map(str, list(node)[:5]))}" + (", .." if len(node) > 5 else "")
     return f"a list of {len(node)}" if isinstance(node, list) else f"{str(node)[:40]!r}"

@@ -227,7 +227,6 @@ def _positions(table: Columns, unit: str | None, detect: bool, side: str) -> tup
 
 
 def _suffix(table: Columns) -> str:
-    """Return how the names of positions end."""
     suffix = next((s for s in ("_m", "_mm", "") if f"x{s}" in table.at), None)
     if suffix is not None:
         return suffix

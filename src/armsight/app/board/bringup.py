@@ -252,7 +252,6 @@ class Bringup:
                 self._board.confirm(self._board.command(Command.CLEAR_FAULTS))
 
     def _use(self, config: Configuration) -> None:
-        """Store a configuration and start the board with it; quadrature encoders are where they were."""
         self._off()
         counting = self._counting()
         for j in counting:
@@ -274,7 +273,6 @@ class Bringup:
         return [j for j, each in enumerate(joints) if each.kind == SensorKind.QUADRATURE]
 
     def _meet_encoders(self) -> None:
-        """Let the board read the encoders that were named, and learn where quadrature ones of an earlier run are."""
         config, count = self._configuration(Reaction.RELEASE, gains=False), self.found.joint_count
         requested, has = (each["joint"]["encoder"][:count] for each in (config, self._board.configuration()))
         elsewhere = (requested["input"] != has["input"]) & (requested["sensor"] == SensorKind.QUADRATURE)
@@ -327,7 +325,6 @@ class Bringup:
         return taken
 
     def _collect(self, seconds: float) -> SensorReadings:
-        """Return what the converters read in the next seconds."""
         self._motion.clear()
         for _ in range(max(1, round(seconds / _ASK_S))):
             self._take(self._sensed(_ASK_S))
@@ -374,7 +371,6 @@ class Bringup:
         self._each("readings", self._reading)
 
     def _reading(self, joint: int) -> None:
-        """Look at a sensor at rest."""
         found, self._flags[joint] = self.found.joints[joint], 0
         counts = self._collect(0.5).counts[:, joint]
         if found.kind == SensorKind.POTENTIOMETER:
@@ -410,7 +406,6 @@ class Bringup:
         self._say(joint, f"{ends} counts, direction {direction}")
 
     def _check_hand(self, joint: int, counts: Array, marks: list[list[float]]) -> None:
-        """Look at a movement by hand, and keep its table."""
         found = self.found.joints[joint]
         encoded = np.array([each.kind != SensorKind.POTENTIOMETER for each in self.found.joints])
         good = np.where(encoded | (counts > _SHORT_COUNTS) & (counts < _OPEN_COUNTS), counts, np.nan)
@@ -443,7 +438,6 @@ class Bringup:
             raise _mistake(joint, f"its potentiometer has a dead spot at {spans}. Clean or replace it.")
 
     def _fit_encoder(self, joint: int) -> None:
-        """Find an encoder's counts of a revolution, direction and zero."""
         found = self.found.joints[joint]
         try:
             if (off := found.fit_encoder()) > _UNEVEN_RAD:
@@ -586,7 +580,6 @@ class Bringup:
         return readings.t_s, volts, amperes, self.found.joints[joint].angles(readings.counts[:, joint])
 
     def _check_drum(self, joint: int, motor: MotorFigures, readings: SensorReadings) -> None:
-        """Say how uneven a joint's transmission is."""
         found = self.found.joints[joint]
         twist = 0.0 if found.stiffness_n_m is None else motor.constant_v_s / found.stiffness_n_m
         drum = fit_drum(*self._of_motor(joint, readings), motor, twist)
@@ -596,7 +589,6 @@ class Bringup:
             self._say(joint, f"its transmission is uneven: the joint leads and lags its motor by {by}")
 
     def _check_spring(self, joint: int, motor: MotorFigures) -> None:
-        """Say where a joint resonates, and whether it can be held."""
         found, hz = self.found.joints[joint], self.found.joints[joint].resonance_hz
         if found.elastic is None or hz is None:
             return
@@ -650,7 +642,6 @@ class Bringup:
             self._off()
 
     def _follow(self, joints: list[int]) -> None:
-        """Swing joints a little and look at how they follow."""
         self._board.enable(inward=True)
         refs, all_of_them = list[Array](), _way(joints, _VERIFY_RAD, _VERIFY_HZ)
 
@@ -798,7 +789,6 @@ def _dither_at(t_s: float) -> float:
 
 
 def _traces(**lines: Array) -> dict[str, list[float]]:
-    """Return lines with as many points as a figure needs."""
     return {name: [round(float(v), 5) for v in each[:: max(1, len(each) // _TRACE)]] for name, each in lines.items()}
 
 

@@ -176,7 +176,6 @@ def servo_zeros(
 
 
 def _kept_offsets(board: FeetechBoard, path: Path) -> dict[int, int]:
-    """Return the offsets of a file that this command kept, by id."""
     try:
         wished = {int(id): int(value) for id, value in read_json(path)["homing_offsets"].items()}
     except (KeyError, TypeError, ValueError, AttributeError):

@@ -342,7 +342,6 @@ _POT_FAULTS = {
 
 
 def _rejection(rig: BoardTestRig) -> Rejection:
-    """Send a command to stay where the joints are and return why it was rejected."""
     here = rig.readings(PERIOD_S)[-1]
     number = rig.board.send(JointCommand(here, np.zeros(JOINTS), np.zeros(JOINTS), PERIOD_S))
     rig.readings(0.05)

@@ -185,7 +185,6 @@ def sigma_px(rig: StereoRig) -> float:
 
 
 def _predicted(layout: Composite, rig: StereoRig, distance_m: float) -> Prediction:
-    """Predict the pose of a body that faces the cameras at a distance."""
     seen = view(rig, layout.body.points, layout.normals, distance_m)
     cov = pose_covariance(rig, layout.body.points, seen, sigma_px(rig))
     diameters = np.array([np.nan, np.nan])
@@ -197,7 +196,6 @@ def _predicted(layout: Composite, rig: StereoRig, distance_m: float) -> Predicti
 
 
 def _neighbours(layout: Composite) -> list[Finding]:
-    """Say which discs overlap, or leave each other, a tag or a board no plain surround."""
     if layout.discs is None:
         return []
     findings = []
@@ -395,7 +393,6 @@ class _Search:
         return findings
 
     def _finding(self, one: Ambiguity) -> Finding:
-        """Say what one way to take discs for others means."""
         text = what = ambiguity_text(one.symmetry, self.names)
         if one.symmetry.off_m < 1e-6:
             text += f"{', seen from behind,' if one.behind else ''} is the same body"
@@ -448,7 +445,6 @@ class _Search:
 
 
 def _single_camera(search: _Search) -> list[Finding]:
-    """Say what one camera alone cannot distinguish."""
     points = search.points
     if flat(points, _FLAT_M):
         text = "a flat body has two poses that one camera alone hardly distinguishes; two cameras do"

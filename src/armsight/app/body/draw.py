@@ -293,7 +293,6 @@ def draw_body(
 
 
 def _pages_of(path: str | Path, notes: list[str]) -> tuple[tuple[Page, ...], str, str]:
-    """Return the pages of a body or a board, their head and foot; what is odd about them is added to ``notes``."""
     if is_board_spec(path):
         return (_board_page(str(path)),), plain(str(path)), "drawn by armsight body draw"
     layout = read_layout(path)
@@ -304,7 +303,6 @@ def _pages_of(path: str | Path, notes: list[str]) -> tuple[tuple[Page, ...], str
 
 
 def _board_page(spec: str) -> Page:
-    """Return the page of a board by itself, its white margin left to the paper."""
     board = open_board(spec)
     if next(iter(board.codes[1]), 0):
         raise InputError(f"{spec}: boards are drawn with ids from 0 on only; leave out first={board.codes[1][0]}")
@@ -334,7 +332,6 @@ def _sheets(size: tuple[float, float], paper: tuple[float, float]) -> list[_Shee
 
 
 def _content(page: Page) -> Array:
-    """Return (2, 2) low and high corner of what is on a page, names included, mm."""
     boxes = np.array([mark.box for mark in page.marks])
     low, high = boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
     if not any(page.names):
@@ -346,7 +343,6 @@ def _content(page: Page) -> Array:
 
 
 def _paper(path: str | Path, page: Page, paper: str, split: bool) -> tuple[float, float]:
-    """Return the width and height of the paper, upright or rotated, mm; of the drawing where it is to be split."""
     needed = _needed(page)
     size = None if paper == "fit" else _rotated(PAPERS[paper], needed)
     if paper == "fit" or (size is None and split):
@@ -436,7 +432,6 @@ def _window(figure: Figure, paper: tuple[float, float], low: tuple[float, float]
 
 
 def _joints(axes: Axes, sheet: _Sheet) -> None:
-    """Draw in a sheet's margins where it is cut, and which one it is."""
     width, height = sheet.paper
     for i, size, across in ((0, width, height), (1, height, width)):
         cuts = _EDGE + sheet.cuts[i] - sheet.low[i]
@@ -470,7 +465,6 @@ def _print(axes: Axes, marks: tuple[Mark, ...], shift: Array) -> None:
 
 
 def _name(axes: Axes, mark: Mark, shift: Array, taken: list[Array]) -> None:
-    """Write a marker's name beside it, where nothing else is."""
     low, high = mark.box + shift
     if not (name := plain(mark.name, 24)):
         return
@@ -514,7 +508,6 @@ def _arrows(axes: Axes, page: Page, at: Array, title: str) -> None:
 
 
 def _save_pdf(figures: list[Figure], output: Path, dpi: int) -> list[Path]:
-    """Write one file of all pages."""
     from matplotlib.backends.backend_pdf import PdfPages
 
     nothing: dict[str, Any] = {"CreationDate": None, "Creator": "armsight", "Producer": None}

@@ -159,7 +159,6 @@ def distance_m(calibration: Calibration) -> float:
 
 
 def _grade(value: float, limits: tuple[float, float]) -> Grade:
-    """Return the grade of a metric of which less is better; NaN is poor."""
     return "good" if value <= limits[0] else "fair" if value <= limits[1] else "poor"
 
 

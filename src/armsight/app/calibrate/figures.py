@@ -135,7 +135,6 @@ def grid_counts(calibration: Calibration, side: int, cells: int = COVERAGE_CELLS
 
 
 def _image_axes(axes: Axes, calibration: Calibration, side: int, title: str) -> None:
-    """Set the limits and labels of axes to those of one camera's image."""
     width, height = calibration.rig.cameras[side].image_size_px
     axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal", title=title)
     axes.set(xlabel="u, px", ylabel="" if side else "v, px")

@@ -305,7 +305,6 @@ def _printed(calibration: Calibration, output: Path, board_file: Path | None, pa
 
 
 def _poor(calibration: Calibration) -> list[str]:
-    """Return the metrics for which the calibration must not be relied on yet, with their values."""
     return [f"{row.name} {row.heldout}" for row in graded_metrics(calibration) if row.grade == "poor"]
 
 

@@ -243,7 +243,6 @@ class _Unseen:
             ) from None
 
     def _why(self, images: list[Grey]) -> str:
-        """Return what is odd about images, or an empty string."""
         if images and all(darkness(image) for image in images):
             return darkness(images[0])
         for image in images:
@@ -252,7 +251,6 @@ class _Unseen:
         return self._codes(images[0]) if images else ""
 
     def _codes(self, image: Grey) -> str:
-        """Return whose codes an image shows in place of the target, or an empty string."""
         family, ids = self._target.codes
         if not family or len(detect_markers(image, family)[1]) >= _LEAST_CODES:
             return ""

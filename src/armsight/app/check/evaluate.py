@@ -154,7 +154,6 @@ def _pose(rows: list[Row]) -> iso9283.PoseMetrics:
 
 
 def _distance(often: dict[str, list[Row]]) -> DistanceResult | None:
-    """Return AD and RD from the second pose to the fourth, the standard's P2 and P4, in the cycles that have both."""
     if len(often) <= 2:
         return None
     (first, rows), *_, (last, last_rows) = list(often.items())[1:4]

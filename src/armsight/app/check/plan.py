@@ -145,7 +145,6 @@ def _goes(arm: Arm, path: Callable[[], _Path], allowed: Allowed) -> bool:
 
 
 def _line(arm: Arm, plan: CheckPlan, speed_m_s: float) -> _Path:
-    """Return the line across the cube, P2 to P4, and back."""
     Ts = plan.Ts_base_tool
     way = line(arm, plan.q[1], Ts[3], duration_s=float(np.linalg.norm((Ts[3] - Ts[1])[:3, 3])) / speed_m_s)
     goals = {"P2 to P4": 1e3 * Ts[3, :3, 3], "P4 to P2": 1e3 * Ts[1, :3, 3]}

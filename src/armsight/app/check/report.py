@@ -52,7 +52,6 @@ def metric_text(metric: Metric) -> str:
 
 
 def _at(rows: Sequence[Row]) -> tuple[Array, Array]:
-    """Return the attained and the commanded positions (N, 3) of rows, m."""
     return np.array([row.T[:3, 3] for row in rows]), np.array([row.T_command[:3, 3] for row in rows])
 
 
@@ -317,5 +316,4 @@ def _against_limits(outcomes: Sequence[LimitResult]) -> tuple[Grade, str] | None
 
 
 def _mm(value: float | None) -> str:
-    """Return a length, m, in mm; nothing where there is none."""
     return "" if value is None else f"{1e3 * value:.3f}"

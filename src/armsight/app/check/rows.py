@@ -120,7 +120,6 @@ def _require_sense(file: Path, rows: list[Row]) -> None:
 
 
 def _row(where: str, entries: dict[str, str], numbers: dict[str, float]) -> Row:
-    """Return a row; raise an InputError where it lacks a value, or one cannot be."""
     test = entries["test"] or "pose"
     if test not in TESTS:
         raise InputError(f"{where}: test is {test!r}; known are {', '.join(TESTS)}")

@@ -244,7 +244,6 @@ def _rests(
 
 
 def _rare(visits: dict[tuple[str, str], list[Row]]) -> dict[tuple[str, str], int]:
-    """Return the approaches that are too few for a scatter, of poses that were attained often enough."""
     attained = Counter(name for (name, _), group in visits.items() for _ in group)
     often = any(len(group) >= MIN_POSES for group in visits.values())
     return {at: len(rows) for at, rows in visits.items() if often and len(rows) < MIN_POSES <= attained[at[0]]}
@@ -298,7 +297,6 @@ def _paths(segments: list[PathSegment], noise: Noise) -> tuple[list[Row], set[st
 
 
 def _ends(segment: PathSegment) -> Array:
-    """Return the first, a middle and the last commanded position (3, 3)."""
     return segment.p_ref[[0, len(segment.p_ref) // 3, -1]]
 
 

@@ -222,7 +222,6 @@ def cameras_at(cameras: str, rate_hz: float) -> str:
 def _studies(
     demo: Demo, cameras: str, workcell: Workcell, result: RunResult, shots: int, progress: Progress
 ) -> list[Study]:
-    """Return the studies; none with --quick or after a run that ended early."""
     if not shots or result.closed_s is None or result.ended_text is not None:
         return []
 

@@ -113,7 +113,6 @@ def _default_rig(width: int) -> StereoRig:
 
 
 def _rig(width: int = _SIZE[0], baseline_m: float = _BASELINE) -> StereoRig:
-    """Return the true rig for an image width, px, and a baseline, m."""
     return replace(
         _default_rig(width), T_left_right=example_rig(baseline_m=baseline_m, convergence_deg=0.0).T_left_right
     )

@@ -32,13 +32,11 @@ _HIDDEN = (169, 169, 169)
 
 
 def _colours(values: NDArray[np.floating[Any]], low: float, high: float) -> Image:
-    """Return colours (..., 3) BGR for values between low and high."""
     share = np.nan_to_num((values.astype(np.float32) - np.float32(low)) * np.float32(255 / max(high - low, 1e-9)))
     return np.asarray(cv2.applyColorMap(np.clip(share, 0, 255).astype(np.uint8), cv2.COLORMAP_TURBO))
 
 
 def _write(canvas: Image, text: str, at: tuple[int, int]) -> None:
-    """Put a line of text on a canvas; it is plain ASCII, for OpenCV's font has nothing else."""
     cv2.putText(canvas, text, at, _FONT, _SIZE, _INK, 1, cv2.LINE_AA)
 
 
@@ -66,7 +64,6 @@ def paint_disparity(result: Disparity) -> Image:
 
 
 def _bar(canvas: Image, height: int, width: int, low: float, high: float) -> None:
-    """Paint the scale with round numbers beside the picture."""
     left = width + 10
     values = np.linspace(high, low, height)[:, None]
     canvas[:height, left : left + _BAR_PX] = np.repeat(_colours(values, low, high), _BAR_PX, axis=1)
@@ -257,6 +254,5 @@ def summary_of(result: Disparity) -> DenseSummary:
 
 
 def _median(values: NDArray[np.floating[Any]], scale: float = 1.0) -> float | None:
-    """Return the median of what is finite, times a scale; None where nothing is."""
     finite = values[np.isfinite(values)]
     return scale * float(np.median(finite, overwrite_input=True)) if finite.size else None

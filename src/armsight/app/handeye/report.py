@@ -143,7 +143,6 @@ def _transforms_table(run: HandEyeAnswer) -> TextTable:
 
 
 def _facts(run: HandEyeAnswer) -> list[Block]:
-    """Return what is said beside the transforms, a line each, with what programs read of it."""
     found = run.found
     facts: list[Block] = [_whose(found), _open_direction(run)]
     if run.offset_s is not None:
@@ -168,7 +167,6 @@ def _facts(run: HandEyeAnswer) -> list[Block]:
 
 
 def _whose(found: HandEye) -> Fact:
-    """Say how much of the error is the arm's and how much the camera's."""
     arm, camera = 1e3 * found.arm_m, 1e3 * found.camera_m
     said = f"at the target the arm is off by {arm:.2f} mm RMS, the camera by {camera:.2f} mm"
     best = max(found.likelihoods.values())
@@ -269,7 +267,6 @@ def _untrusted(run: HandEyeAnswer) -> list[str]:
 
 
 def _plan(plan: MountingPlan, names: tuple[str, ...], structure: str) -> list[Block]:
-    """Return the next poses; names are those of the poses that were taken."""
     near, rows = [names[k] for k in plan.nearest], []
     for k, T in enumerate(plan.Ts_base_flange):
         cells = [f"{v:.1f}" for v in (*1e3 * T[:3, 3], *_angles_deg(T))]

@@ -105,7 +105,6 @@ def selection_rows(run: Identification) -> list[tuple[str, float, bool]]:
 
 
 def _short(sources: str) -> str:
-    """Return the names of sources that were selected together, as one line."""
     first, *others = sources.split(", ")
     return f"{first} and {len(others)} more" if len(sources) > _MOST_LETTERS else sources
 
@@ -290,7 +289,6 @@ def parameter_rows(run: Identification) -> list[ParameterRow]:
 
 
 def _values(run: Identification) -> dict[str, Any]:
-    """Return what programs read, SI units."""
     found, noise, seen = run.found, run.found.solution.noise, _seen(run)
     return {
         "version": 2,
@@ -379,7 +377,6 @@ def _seen(run: Identification) -> list[tuple[float, float]]:
 
 
 def _ranges(run: Identification, *, everything: bool) -> list[Block]:
-    """Return the readings that the poses have shown of each joint."""
     fade, seen = np.degrees(run.found.model.fade_rad), [np.degrees(each) for each in _seen(run)]
     rows = [[escaped(n), f"{a:.1f}", f"{b:.1f}"] for n, (a, b) in zip(run.arm.joint_names, seen, strict=True)]
     curves = (
@@ -397,7 +394,6 @@ def _ranges(run: Identification, *, everything: bool) -> list[Block]:
 
 
 def _parameters(run: Identification) -> Html:
-    """Return the table of all parameters, HTML: those that were fitted beside base and tool; the others folded away."""
     found, sigma, nominal = run.found, np.sqrt(np.diag(run.found.cov)), run.found.model.nominal()
     fitted, rows = set(_fitted(run)), dict[bool, list[list[str]]]({True: [], False: []})
     for k, p in enumerate(found.model.parameters):
@@ -415,7 +411,6 @@ def _parameters(run: Identification) -> Html:
 
 
 def _backlash(backlashes: Sequence[JointBacklash], *, everything: bool) -> list[Block]:
-    """Return each joint's backlash and what showed it; what is not determined is folded away on the page."""
     lines: dict[bool, list[str]] = {True: [], False: []}
     for p in backlashes:
         value = f"{np.degrees(p.value_rad):.3f} +- {np.degrees(p.sigma_rad):.3f} deg, by "
@@ -437,7 +432,6 @@ def _backlash(backlashes: Sequence[JointBacklash], *, everything: bool) -> list[
 
 
 def _not_fitted(run: Identification) -> list[str]:
-    """Return the reasons of what was not fitted, equal ones together."""
     by_reason: dict[str, list[str]] = {}
     for p in run.found.model.parameters:
         reason = run.found.reasons.get(p.name)

@@ -63,7 +63,6 @@ def run_identify(
 
 
 def _notes(arm: Arm, found: Identified, measured: Measured, lines: Array) -> list[str]:
-    """Return what a person should know about the data."""
     notes = []
     still = [str(i + 1) for i in np.flatnonzero(np.ptp(measured.q, axis=0) < ALIKE)]
     lost = [p.name for p, k in zip(found.model.parameters, found.solution.free, strict=True) if p.joint < 0 and not k]

@@ -377,7 +377,6 @@ class ArmStep(PageStep[ArmState]):
             self._board.close()
 
     def _lacking(self) -> str:
-        """Return what is missing for a run; empty where nothing is."""
         if self._logged is not None:
             return f"{self.shared.options.board} commands no motion: another program moves the arm"
         if self._board is None:
@@ -484,7 +483,6 @@ class ArmStep(PageStep[ArmState]):
             self.say("good", f"hand-eye: {len(run.q)} poses, held out {1e3 * run.found.held_out.rms()[0]:.2f} mm RMS")
 
     def _to_start(self) -> None:
-        """Move slowly from where the arm is to the start."""
 
         def work(setup: Setup, rig: StereoRig, plan: MotionPlan, targets: Array) -> RunResult:
             q = setup.board.receive(_REST_S).q.mean(axis=0)
@@ -535,7 +533,6 @@ class ArmStep(PageStep[ArmState]):
         return Setup(self.model, board, cameras.poll, target, np.zeros_like, rate_hz, options.sync_s, HostClock())
 
     def _plan(self) -> tuple[MotionPlan, Array]:
-        """Return the motions, and the joint angles (N, 6) of the hand-eye poses, rad."""
         arm = self.model
         plan = read_motions(arm, self.shared.motion)
         ends = [plan.start, *(m.trajectory.at(m.trajectory.duration_s).q for m in plan.motions)]
@@ -594,7 +591,6 @@ class ArmStep(PageStep[ArmState]):
         self._chart.append((now.t_s, 1e3 * float(np.linalg.norm(away)), segment.closed))
 
     def _results(self, outcome: RunResult) -> tuple[str, ...]:
-        """Return what a run found, line by line."""
         lines = []
         if outcome.handeye is not None:
             self._mounting, (position_m, angle_rad) = outcome.handeye.mounting, outcome.handeye.found.held_out.rms()

@@ -295,7 +295,6 @@ class CalibrationStep(Guided[CalibrationState]):
         return now - then_m >= worth * (now - self._next.then_m)
 
     def _pose(self, pair: Pair) -> Array | None:
-        """Return the board's pose in the left camera's frame as the left view shows it; None where it does not."""
         if self._rig is None:
             return None
         found = body_poses(self.board.body.points[pair.left.ids], self._rig.left, pair.left.uv)
@@ -341,7 +340,6 @@ class CalibrationStep(Guided[CalibrationState]):
             self._next = self._guide.first(self._first, self._rig)
 
     def _fitted(self, *, quick: bool) -> tuple[Calibration, set[str]]:
-        """Calibrate from the shots so far, in the thread; return the calibration and their names."""
         with self.lock:
             pairs, sizes = list(self._shots.values()), self._sizes
         assert sizes is not None
@@ -353,7 +351,6 @@ class CalibrationStep(Guided[CalibrationState]):
         return result, {pair.name for pair in pairs}
 
     def _fit(self) -> None:
-        """Fit; a calibration that is good enough for the first time ends by itself."""
         super()._fit()
         with self.lock:
             shown = self.shown
@@ -378,7 +375,6 @@ class CalibrationStep(Guided[CalibrationState]):
             self.show(missing=(f"the shots cannot be fitted yet: {error}",), good=False)
 
     def _learned(self, result: Calibration) -> None:
-        """Take in a fit: what it determines, and how good it is."""
         self._result, self._rig = result, result.rig
         self._knowledge = Knowledge.of(result, self.board, self.aim)
         h, shots, error_m = result.held_out, result.pairs_found, self._knowledge.error_m

@@ -187,7 +187,6 @@ class CamerasStep(PageStep[CamerasState]):
                 self.swap()
 
     def _of_both(self, images: tuple[np.ndarray, np.ndarray]) -> list[Note]:
-        """Return what is wrong with both cameras together."""
         notes, newest, source = [], self.shared.capture.newest, self.shared.source
         if same_camera(*images):
             notes.append(Note("error", "both views look like one camera: choose two different ones"))
@@ -228,7 +227,6 @@ class CamerasStep(PageStep[CamerasState]):
         )
 
     def _open(self) -> Source:
-        """Open the cameras, in the thread that reads them."""
         shared = self.shared
         if shared.simulated is not None:
             return shared.simulated

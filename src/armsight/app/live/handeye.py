@@ -1,8 +1,7 @@
 """The guided hand-eye calibration: which pose of the arm to take next, and how good the calibration is, in mm.
 
 The next pose is the one of the candidates after which the predicted error is least: the RMS distance by which the
-covariance of the
-calibration moves a measured position in the arm's base (as :mod:`~armsight.vision.calibrate.guide` does for the cameras).
+calibration's covariance moves a measured position in the base (as :mod:`~armsight.vision.calibrate.guide` does).
 """
 
 from __future__ import annotations
@@ -171,7 +170,6 @@ class HandEyeGuide(Guided[HandEyeState]):
         self.learned(len(run.q), HandEyeProgress(len(run.q), heldout_mm, 1e3 * error_m))
 
     def _lacking(self, *, fitted: bool) -> list[str]:
-        """Return what is missing until the calibration is good."""
         count = len(self._visited)
         if count < LEAST_POSES:
             more = LEAST_POSES - count

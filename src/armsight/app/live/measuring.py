@@ -185,7 +185,6 @@ class MeasureStep(PageStep[MeasureState]):
         self._clear()
 
     def _clear(self) -> None:
-        """Forget what was measured with another rig or target."""
         self._trail: deque[Array] = deque(maxlen=_TRAIL)
         self._times: deque[float] = deque(maxlen=30)
         self._latency: deque[float] = deque(maxlen=_LATENCIES)
@@ -505,7 +504,6 @@ def shown_pose(pose: PoseEstimate, T_zero_left: Array | None) -> PoseShown:
 
 
 def _sigmas(cov: Array) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Return one sigma of the position, mm, and of the rotation, degrees, by a covariance (6, 6)."""
     sigma = np.sqrt(np.diag(cov))
     return _mm(sigma[:3]), tuple(np.degrees(sigma[3:]).tolist())
 

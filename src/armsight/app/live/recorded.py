@@ -83,7 +83,6 @@ class RecordedStep(PageStep[RecordedState]):
         return replace(shown, command=command if shown.field else "")
 
     def _files(self) -> tuple[str, ...]:
-        """Return the tables of the folder and of the folders in it."""
         found = [path for form in ("*.csv", "*/*.csv") for path in self.folder.glob(form) if path.is_file()]
         newest = sorted(found, key=lambda path: (-path.stat().st_mtime, str(path)))[:MOST_FILES]
         return tuple(str(path.relative_to(self.folder)) for path in newest)
@@ -118,7 +117,6 @@ class RecordedStep(PageStep[RecordedState]):
 
 
 def _table(path: Path) -> list[list[str]]:
-    """Return a table's header and rows; of a long one every so many rows."""
     if not is_long(path):
         return read_table(path)
     every = math.ceil(sum(1 for _ in long_rows(path)) / _MOST_ROWS)

@@ -256,7 +256,6 @@ class LiveServer:
         self._stops.submit(self.session.hold, why)
 
     def _introduce(self) -> None:
-        """Say to every page whether it commands."""
         for number, client in self._clients.items():
             you = {"number": number, "commands": number == self._commander, "pages": len(self._clients)}
             client.send(json.dumps({"you": you}))

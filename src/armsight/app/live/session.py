@@ -139,7 +139,6 @@ class LiveSession:
             self.body.use_body(target)
 
     def _kept(self) -> dict[str, dict[str, Any]]:
-        """Return the settings that were kept in the folder, by name."""
         file = self.folder / SETTINGS
         found = read_json(file) if file.exists() else {"settings": {}}
         settings = found.get("settings") if isinstance(found, dict) else None
@@ -219,7 +218,6 @@ class LiveSession:
         self.say("good", f"the rig is kept as {aside}")
 
     def _use_rig(self, path: Path) -> None:
-        """Begin with measuring by a calibrated rig."""
         self.measuring.use_rig(StereoRig.load_trusted(path), path)
         self._step = "measure"
         self.cameras.show(left_known=True)

@@ -71,7 +71,6 @@ def chart(poses: Sequence[ShotPose]) -> bytes:
 
 
 def _figure(run: ChartData) -> Figure:
-    """Plot the band, and nine strips below it that share its axis."""
     from matplotlib.ticker import MaxNLocator
 
     figure = new_figure(11.5)
@@ -132,7 +131,6 @@ def _intervals(run: ChartData) -> Iterator[tuple[float, float, str]]:
 
 
 def _band(axes: Axes, run: ChartData) -> None:
-    """Plot how each shot was found; rare ways last and never thinner than a line."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 

@@ -363,7 +363,6 @@ def _block(marks: Marks, i: int, panels: list[_Panel], zoom: float, factor: floa
 
 
 def _legend(marks: Marks, zoom: float, factor: float, in_images: float) -> Canvas:
-    """Return the legend, with a bar for the length of the enlarged vectors."""
     discs, centre = (
         bool(np.isfinite(marks.shape).any()),
         "centre of its ellipse (the position used plus the perspective bias)",
@@ -392,7 +391,6 @@ def _legend(marks: Marks, zoom: float, factor: float, in_images: float) -> Canva
 
 
 def _unshown(marks: Marks, shown: list[int]) -> list[Canvas]:
-    """Return a text on what is not shown enlarged."""
     dropped, lines = marks.dropped.any(axis=1), list[str]()
     if len(shown) < len(marks.names):
         lines.append(f"enlarged: the worst {len(shown)} of {len(marks.names)} points, dropped ones first")

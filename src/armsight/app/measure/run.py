@@ -188,7 +188,6 @@ class MeasureRun:
             silence_stdout()
 
     def _keep(self, record: ShotPose) -> None:
-        """Count a record, keep it for a while, and write its row."""
         self.records.append(record)
         self.first = self.first or record
         self.total += 1
@@ -207,7 +206,6 @@ class MeasureRun:
             self._write(record, self.options.output)
 
     def _write(self, record: ShotPose, output: Path) -> None:
-        """Write a record's row; where the disk is full go on, and try again with the next."""
         columns = CSV_COLUMNS + (SHUTTER_COLUMNS if self.shots.moves else ())
         try:
             self.file = self.file or RowFile(output, columns, replaces=True)
@@ -395,7 +393,6 @@ def _watched(
 
 
 def _streams(specs: Sequence[str], rig: StereoRig, body: Body) -> Publisher:
-    """Open the streams of the command line."""
     if not specs:
         return Fanout()
     from armsight.app.stream.streams import open_streams

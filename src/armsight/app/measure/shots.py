@@ -127,7 +127,6 @@ class ImageShots:
         self.total, self.results = source.count, self._results()
 
     def _results(self) -> Iterator[Result]:
-        """Measure shot after shot, by the shutters that are requested or stand in the rig's file."""
         first: list[tuple[float | None, PoseEstimate | Missed]] = []  # of cameras that are taken for simultaneous
         for result in self._measured(self._rig) if self._requested is None else self._moved(self._requested):
             shot, found = result[:2]
@@ -153,7 +152,6 @@ class ImageShots:
             yield shot, found, Followed(follower.way, follower.jump, 1e3 * (time.perf_counter() - begun)), None
 
     def _moved(self, requested: Requested | Shutters) -> Iterator[Result]:
-        """Measure all shots, then move their detections to one time and measure again."""
         wide = self._measured(replace(self._rig, sigma_px=max(self._rig.sigma_px, LOOSE_PX)))
         first = [(replace(shot, left=None, right=None), found, followed) for shot, found, followed, _ in wide]
         timed = [(shot.t_s, found) for shot, found, _ in first]

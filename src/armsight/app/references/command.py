@@ -90,7 +90,6 @@ def gravity(path: Path, model: str, joints: str, as_json: bool) -> None:
 
 
 def _gravity(entry: Entry, model: str, joints: Path) -> Report:
-    """Return what gravity shows of an arm that carries the first reference."""
     import numpy as np
 
     from armsight.app.show.report import Report
@@ -261,7 +260,6 @@ def _check(entry: Entry) -> tuple[dict[str, Any], list[str], list[str]]:
 
 
 def _calibrated(entries: list[Entry], poses: Path) -> tuple[Report, list[Entry]]:
-    """Return the report, and the references as calibrated."""
     import numpy as np
 
     from armsight.app.show.messages import Note
@@ -333,7 +331,6 @@ def _averaged(entry: Entry, path: Any) -> list[Any]:  # noqa: ANN401 - imported 
 
 
 def _said(result: ReferenceCalibration[Inertial]) -> tuple[dict[str, Any], list[Any]]:
-    """Return the values of a calibration, and what is shown of it."""
     import numpy as np
 
     from armsight.app.show.report import Fact

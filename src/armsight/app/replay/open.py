@@ -95,7 +95,6 @@ def _of_run(request: Request, run: RecordedRun, say: Callable[[str], None]) -> R
 
 
 def _body_of(recorded: RecordedRun) -> Body:
-    """Return the body of a run, from the text in its metadata."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / BODY
         path.write_text(recorded.properties[BODY], encoding="utf-8")
@@ -103,7 +102,6 @@ def _body_of(recorded: RecordedRun) -> Body:
 
 
 def _of_source(request: Request, recorded: RecordedRun | None, say: Callable[[str], None]) -> Replayed:
-    """Measure the images or the tags of a recording again."""
     path, named = parsed(request.recording.removeprefix("bag:"))
     folder = Path(path).expanduser()
     of_images = folder.is_dir() and (
@@ -155,7 +153,6 @@ def _rig(request: Request, bag: Bag | None, named: dict[str, str]) -> StereoRig:
 
 
 def _with_joints(replayed: Replayed, bag: Bag, say: Callable[[str], None]) -> Replayed:
-    """Add the joint readings of a recording, where it has some."""
     joints = read_joints(bag)
     if joints is None:
         return replayed

@@ -137,7 +137,6 @@ def update_(run: Path, output: str, since: float | None, report: Path | None, as
 
 
 def _image_size(text: str) -> tuple[int, int]:
-    """Return (width, height) of a text WxH, px."""
     match = re.fullmatch(r"([1-9]\d*)x([1-9]\d*)", text.strip())
     if match is None:
         raise InputError(f"--image-size {text!r}: expected WIDTHxHEIGHT in pixels, such as 1280x720")
@@ -184,7 +183,6 @@ def _json(path: str, rig: StereoRig) -> dict[str, Any]:
 
 
 def _lines(rig: StereoRig) -> list[str]:
-    """Return the rig as lines for people: mm, degrees, px."""
     sigmas, sigma_baseline = _sigmas(rig), _baseline_sigma_m(rig)
     lines = []
     for side, camera in zip(("left", "right"), rig.cameras, strict=True):

@@ -71,7 +71,6 @@ def _found_since(run: Path) -> float | None:
 
 
 def _page(old: StereoRig, new: StereoRig, found: RigUpdate, run: Path, since_s: float | None) -> Report:
-    """Return the page of an update: its figures, and the old rig beside the new one."""
     head = (
         ("right camera rotated by", f"{np.degrees(found.rotation_rad):.3f} ± {np.degrees(found.sigma_rad):.3f} deg"),
         ("shifted across the baseline by", f"{1e3 * found.shift_m:.3f} mm"),

@@ -260,7 +260,6 @@ def _run(
 
 
 def _close(loop: Loop, result: RunResult) -> None:
-    """Stop the arm, and take what the loop found into the result."""
     with uninterrupted() as again:  # a second Ctrl-C must not keep the arm from stopping
         with contextlib.suppress(ArmsightError):  # the board is gone: it reacts to the silence itself
             loop.stop()
@@ -317,7 +316,6 @@ def _passes(
     cover: Callable[[float, float], None] | None,
     close_loop: bool,
 ) -> None:
-    """Make the motions with potentiometers alone, and then with the loop closed."""
     setup, plan = loop.setup, result.plan
 
     def started(kind: str, duration_s: float) -> None:
@@ -382,7 +380,6 @@ def closed_on(servo: PoseServo, health: Callable[[], HealthMonitor], gravity: Ca
 
 
 def _to_start(loop: Loop, plan: MotionPlan) -> None:
-    """Move the arm from the end of the motions to their start, if these differ."""
     last = plan.motions[-1].trajectory
     end = last.at(last.duration_s).q
     if not np.allclose(end, plan.start, rtol=0.0, atol=1e-6):

@@ -145,7 +145,6 @@ def loop_figure(passes: tuple[PassErrors, PassErrors] | None) -> Figure | None:
 
 
 def _at_rest(plot: Axes, passes: tuple[PassErrors, PassErrors], closed: str) -> None:
-    """Plot the errors at rest, with potentiometers alone and with the loop closed, as bars."""
     for shift, each, (name, colour) in zip((-0.2, 0.2), passes, (_ALONE, (closed, GREEN)), strict=True):
         found = {**each.rests, **each.singular}
         plot.bar(np.arange(len(found)) + shift, _MM * np.array(list(found.values())), 0.38, color=colour, label=name)

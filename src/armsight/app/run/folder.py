@@ -180,7 +180,6 @@ def _write_measured(result: RunResult, tracks: Tracks | None, folder: Path, keep
 
 
 def _columns(name: str, part: Part) -> dict[str, Any]:
-    """Return the columns of a track in a part of a run."""
     return columns(part.named(name))
 
 
@@ -303,7 +302,6 @@ def make_room(folder: Path) -> None:
 
 
 def _picture(result: RunResult) -> Image | None:
-    """Return the left image of the first shot in motion with its pose overlaid."""
     if result.picture is None:
         return None
     shot, pose = result.picture

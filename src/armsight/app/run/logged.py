@@ -132,7 +132,6 @@ def _required(arm: Arm, q: Array, Ts: Array, covs: Array, centre: Array) -> Hand
 def _measured(
     source: Source, rig: StereoRig, target: Target, angles: LoggedAngles, progress: Callable[[str], None]
 ) -> tuple[list[str], list[PoseEstimate | Missed], list[Array | None]]:
-    """Return the name of every shot, what it shows, and the joint angles that belong to it."""
     names, times, seen = list[str](), list[float | None](), list[PoseEstimate | Missed]()
     while (shot := source.read()) is not None:
         progress(f"measuring shot {len(names) + 1}")
@@ -212,7 +211,6 @@ def _rounded(value: float) -> str:
 
 
 def _report(result: LoggedRun, summary: dict[str, Any]) -> Report:
-    """Return the page of a run without motion."""
 
     def errors() -> Figure:
         figure = new_figure(3.6)

@@ -121,7 +121,6 @@ def _motion(where: str, arm: Arm, q: Array, entry: dict[str, Any], names: list[s
 def _planned(
     where: str, kind: str, arm: Arm, q: Array, values: dict[str, Array], duration_s: float | None
 ) -> Trajectory:
-    """Plan a motion of a kind from joint angles q (n,), rad."""
     if kind in ("joints", "home"):
         goal = arm.home if kind == "home" else np.radians(values["q_deg"])
         return point_to_point(arm, q, goal, duration_s=duration_s)

@@ -186,7 +186,6 @@ def assess(result: RunResult, passes: tuple[PassErrors, PassErrors] | None) -> t
 
 
 def _said(result: RunResult) -> list[Note]:
-    """Return what is said of a run on stderr."""
     level: Level = "error" if any(each.forbids for each in result.health) else "warn"
     remarks = [*unseen_lines(result.fixed_unseen), *correction_lines(result.log.corrections, result.not_corrected)]
     return [
@@ -197,7 +196,6 @@ def _said(result: RunResult) -> list[Note]:
 
 
 def _lost(result: RunResult) -> list[str]:
-    """Return what was lost of the reference beside vision."""
     beside = result.setup.beside
     return [] if beside is None else [f"{beside.entry.reference.name}: {loss}" for loss in beside.losses]
 
@@ -255,7 +253,6 @@ def _measured(result: RunResult, values: dict[str, Any], led: Any, studies: Sequ
 
 
 def _beside(beside: Fused, log: Log) -> tuple[dict[str, Any] | None, str]:
-    """Return what a reference did to the live estimates, and the line of it; None where it was not used."""
     lives = log.lives.array(53)
     try:
         row = beside.row(lives[lives[:, 0] >= beside.begin_s, 17:].reshape(-1, 6, 6))
@@ -386,7 +383,6 @@ def _figures(
     picture: Image | None,
     workcell: Callable[[], Image] | None,
 ) -> Mapping[str, Section]:
-    """Return the sections of the page that hold figures."""
     begin_s, end_s = (-np.inf, -np.inf) if result.open_s is None else result.open_s
     run, alone = tracks.between(begin_s, most=_POINTS), tracks.between(begin_s, end_s, most=_POINTS)
     drawn: dict[str, Callable[[], Any]] = {

@@ -75,7 +75,6 @@ def read_config(path: Path) -> ServeConfig:
 
 
 def _service(path: Path, given: Any) -> dict[str, Any]:  # noqa: ANN401 - whatever TOML holds
-    """Return the values of the table ``serve``."""
     if not isinstance(given, dict):
         raise InputError(f"{path}: serve is {given!r}: expected a table [serve]")
     found: dict[str, Any] = {}
@@ -93,7 +92,6 @@ def _service(path: Path, given: Any) -> dict[str, Any]:  # noqa: ANN401 - whatev
 
 
 def _arguments(path: Path, command: click.Command, given: dict[str, Any]) -> tuple[str, ...]:
-    """Return a table's keys and values as arguments of the command."""
     known = {_key(each): each for each in command.params}
     out: list[str] = []
     for key, value in given.items():

@@ -155,7 +155,6 @@ class Service:
         return code
 
     def _take_all(self, heard: socket.socket) -> None:
-        """Take what has come."""
         with suppress(BlockingIOError):
             while True:
                 self._take(heard.recv(65536))
@@ -214,7 +213,6 @@ class Service:
             lines.add(line)
 
     def _end(self) -> None:
-        """End the child as Ctrl-C does, so that its files are whole; kill it where it does not."""
         child = self._child
         if child is None or child.poll() is not None:
             return
@@ -226,7 +224,6 @@ class Service:
             child.wait()
 
     def _event(self, event: str, text: str, **values: object) -> None:
-        """Log an event, and report it."""
         self._log.info("%s", text)
         self._report({"time": datetime.now(UTC).isoformat(timespec="milliseconds"), "event": event, **values})
 

@@ -92,7 +92,6 @@ class _Window:
 
 
 def _mean(values: Array, unit: float, *, root: bool = False) -> float | None:
-    """Return a mean, its root perhaps, in another unit; None of nothing."""
     if not len(values):
         return None
     mean = float(np.mean(values))
@@ -201,7 +200,6 @@ class CellSink(Sink):
             self._put_state()
 
     def _put_state(self) -> None:
-        """Put what the shots since the last time showed."""
         now, window = time.monotonic(), self._window
         state = {
             "t": round(time.time(), 3),

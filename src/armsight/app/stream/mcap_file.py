@@ -178,7 +178,6 @@ def _written(path: Path, published: Published) -> Callable[[list[Datum], str], N
 
 
 def _dropped(sink: Sink) -> NoteDatum:
-    """Return the note that data were dropped."""
     return NoteDatum(0.0, f"{sink.dropped} of {sink.taken} data were dropped: the disk is too slow", "warning")
 
 

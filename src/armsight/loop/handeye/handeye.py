@@ -458,7 +458,6 @@ def _spread(rows: NDArray[np.int64], most: int) -> NDArray[np.int64]:
 
 
 def _first(poses: Poses) -> list[_Guess]:
-    """Return closed-form starts, most plausible first."""
     part = poses.rows(_spread(np.arange(len(poses.A)), 300))
     return [_Guess(Z, X) for X, Z in starts(part.A, part.right_side)[:3]]
 

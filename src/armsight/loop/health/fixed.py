@@ -211,7 +211,6 @@ class FixedWatch:
         self.changes = ranked(changes)
 
     def _fitted(self, suspect: Suspect) -> _Fitted:
-        """Return a change that is fitted at all beginnings."""
         rows = self._of(suspect)
         wide = self._wide[rows]
         C = self._C[:, rows[:, None], rows] * np.outer(wide, wide) + np.eye(len(rows))

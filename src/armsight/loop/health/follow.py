@@ -337,7 +337,6 @@ class RigFollower:
 
 
 def _moved(motion: BaseMotion, measurements: Sequence[KeptMeasurement]) -> Moved | None:
-    """Return a motion of the rig by all that was measured."""
     motion.take(measurements)
     return motion.moved
 
@@ -348,7 +347,6 @@ def remeasured(rig: StereoRig, body: Body, pose: PoseEstimate) -> PoseEstimate |
 
 
 def _differing(poses: Sequence[PoseEstimate]) -> list[PoseEstimate]:
-    """Return poses that differ from the one before."""
     kept: list[PoseEstimate] = []
     for pose in poses:
         if not kept or differ(kept[-1].T_left_body, pose.T_left_body):
@@ -357,7 +355,6 @@ def _differing(poses: Sequence[PoseEstimate]) -> list[PoseEstimate]:
 
 
 def _some(poses: Sequence[PoseEstimate]) -> list[SeenShot]:
-    """Return the detections of some of the poses, if there are many."""
     return [seen_shot(str(k), pose) for k, pose in enumerate(poses[:: -(-len(poses) // _MOST_SHOTS) or 1])]
 
 

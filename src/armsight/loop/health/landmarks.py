@@ -71,7 +71,6 @@ class _Landmark:
 
 
 def _limit(freedom: int) -> float:
-    """Return the chi-square of an alarm of some degrees of freedom: a mean is tested some times a second."""
     return chi_square_limit(freedom, FALSE_ALARMS_PER_MINUTE / 360.0)
 
 

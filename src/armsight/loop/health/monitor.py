@@ -247,7 +247,6 @@ class HealthMonitor:
         return self._estimator.remembered()
 
     def _go_back(self, since_s: float) -> Remembered | None:
-        """Go on with what the estimator knew before a time, s, and begin its tests anew; return it."""
         self._doubted_s = -np.inf
         if self._estimator is None or self._arm is None:
             return None
@@ -284,7 +283,6 @@ class HealthMonitor:
         return correction.cause in (found.cause, *found.alternatives)
 
     def _renew(self, correction: RigCorrection) -> None:
-        """Begin the tests of cameras and bodies anew."""
         if correction.update is not None:
             self._watch_cameras(correction.update.rig)
         self._scene = None
@@ -292,7 +290,6 @@ class HealthMonitor:
             self._landmarks = LandmarkWatch(self._fixed_names)
 
     def _watch_cameras(self, rig: StereoRig) -> None:
-        """Begin the tests of cameras, as they are now, anew."""
         self._rig, self._cameras = RigWatch(rig, self._body, self._sync_s, printed=self._printed), rig
         self._suspected, self._cameras_s = None, np.inf
 

@@ -405,7 +405,6 @@ class RigWatch:
         return rig, body, found if self._poses > 1 else _of_one_pose(found)
 
     def _sum(self, shot: ShotResiduals, estimate: PoseEstimate) -> None:
-        """Add a shot to the stay it belongs to, which counts as one shot; test when it is time."""
         T = estimate.T_left_body
         moved = self._began is None or differ(self._began, T)
         size = 1 + self._size
@@ -479,7 +478,6 @@ class RigWatch:
         return due and self._poses >= _LENS_POSES
 
     def _keep(self, newest: _Newest, *, again: bool) -> None:
-        """Keep the newest test, or keep it again where something that passes explains it."""
         if newest.every is not newest.fits and self._every is self._fits:
             self._every = self._fits[0].copied(), self._fits[1].copied()
         changed_s = min(self._shape.changed_s, self._onset.begin_s if self._alarms else np.inf)

@@ -134,7 +134,6 @@ class _Spots:
         return len(self.uv) >= _LEAST
 
     def _choose(self) -> None:
-        """Choose the most conspicuous stable spot of each cell, and keep how it looks."""
         mean, side = np.asarray(self._sum / _LEARNED, np.float32), 2 * _HALF + 1
         noise = np.sqrt(np.maximum(self._squares / _LEARNED - mean * mean, 0.0))
         self._sum = self._squares = np.zeros((0, 0), np.float32)

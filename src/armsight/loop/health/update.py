@@ -221,7 +221,6 @@ class _Change(Record):
 
 
 def _left(sums: ResidualSums, x: Array) -> float:
-    """Return the sum of squares that parameters (K,) leave."""
     return max(sums.square - 2.0 * float(x @ sums.b) + float(x @ sums.H @ x), 0.0)
 
 
@@ -267,7 +266,6 @@ def _checked(
 
 
 def _prior(rig: StereoRig) -> Array:
-    """Return the covariance (P, P) of the parameters once the cameras may have moved."""
     free = free_directions(rig)
     return np.asarray(rig.cov + (free * _FREED**2) @ free.T)
 

@@ -188,7 +188,6 @@ def _toml(values: Mapping[str, Any]) -> list[str]:
 
 
 def _pose(T: Array) -> dict[str, list[float]]:
-    """Return a pose as position and quaternion wxyz."""
     return {"position_m": T[:3, 3].tolist(), "quaternion_wxyz": quaternion_wxyz(T[:3, :3]).tolist()}
 
 

@@ -128,7 +128,6 @@ def identify_wire(
 
 
 def _trimmed(arm: Arm, measured: Measured) -> tuple[Model, Array, float]:
-    """Return the table's model, its vector at the least trimmed squares, and the noise of its good rows, m."""
     model, x = with_placement(Model(arm, 1, False, ()), measured)
     prior = prior_sigma(model, dict.fromkeys(("base_rx", "base_ry", "base_rz"), 0.0))
     noise = (BEGIN_M, 0.0)

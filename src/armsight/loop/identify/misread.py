@@ -142,7 +142,6 @@ def _evaluated(poses: Poses) -> tuple[Poses, Array]:
 
 
 def _some(n: int, most: int) -> Rows:
-    """Return at most so many of n rows, evenly spread."""
     return np.linspace(0, n - 1, min(most, n)).round().astype(np.int64)
 
 

@@ -231,7 +231,6 @@ def _points(table: Columns) -> tuple[list[list[str]], float]:
 
 
 def _rotation_columns(table: Columns, convention: str | None) -> tuple[list[str], tuple[str, ...]]:
-    """Return the columns of the rotation, [] where there are none that are used, and a note then."""
     for names in (["qw", "qx", "qy", "qz"], [f"r{i}{j}" for i in "123" for j in "123"]):
         if names[0] in table.at:
             return names, ()

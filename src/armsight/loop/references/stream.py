@@ -143,13 +143,11 @@ def _saturated(column: Array) -> bool:
 
 
 def _longest(flags: NDArray[np.bool_]) -> int:
-    """Return the length of the longest run."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(int), [0]])))
     return int((edges[1::2] - edges[::2]).max(initial=0))
 
 
 def _rests(z: Array, period: float) -> tuple[slice, ...]:
-    """Return the rows of the rests."""
     size = max(round(BLOCK_S / period), 4)
     count = len(z) // size
     if count < 2:

@@ -361,7 +361,6 @@ class Loop:
         return Motion(twist, acceleration, np.diag(variance) * float(fit[1] @ fit[1]) / _MOTION_S**2, True)
 
     def _publish(self) -> None:
-        """Publish the shot that was measured in this iteration, and before it a mounting that is new."""
         if self._datum is None:
             return
         mounting = self.mounting
@@ -391,7 +390,6 @@ class Loop:
         return self.follower.measure(shot, self._expected, self._twist)
 
     def _newest(self) -> Shot | None:
-        """Return the newest shot, if there is one, with its time on the board's clock."""
         shot, clock = self.setup.poll(), self.setup.clock
         self._taken_s = time.perf_counter()
         self._expected = self._twist = None
@@ -548,7 +546,6 @@ class Loop:
             self.publisher.put(EventDatum(self.t_s, restored_event(state)))
 
     def _recalibrate(self, rig: StereoRig) -> None:
-        """Measure with another calibration of the cameras from now on."""
         self.follower.recalibrate(rig)
         self._skew = Skew(rig, self.setup.sync_s)
         self._measure_fixed = [measurer(rig, each) for each in self.setup.fixed]
@@ -635,7 +632,6 @@ class Loop:
         return JointCommand(newest.q_ref, np.zeros_like(newest.q_ref), newest.gravity_duty, duration_s)
 
     def _check_board(self) -> None:
-        """Raise a DeviceError if the board no longer follows commands."""
         status = self.board.status
         if status.state is BoardState.ENABLED:
             return
@@ -643,7 +639,6 @@ class Loop:
         raise DeviceError(f"the board changed to {status.state.name} at {status.t_s:.3f} s: {faults}")
 
     def _check_cameras(self, since_s: float) -> None:
-        """Raise a DeviceError if no shot has come for too long."""
         silent_s = self.t_s - max(self._shot_s, since_s)
         if silent_s > STALLED_S + 2.0 / self.setup.rate_hz:
             raise DeviceError(f"no shot has come for {silent_s:.1f} s: the cameras have stalled")
