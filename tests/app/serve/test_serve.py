@@ -14,8 +14,7 @@ import pytest
 
 from armsight.app.serve import service
 from armsight.app.serve.config import ServeConfig, read_config
-from armsight.app.serve.page import METRICS, state_pages
-from armsight.app.serve.service import Service
+from armsight.app.serve.service import METRICS, Service, state_pages
 from armsight.app.show.http import metrics_text
 from armsight.errors import InputError
 from cli_runs import assert_rejected

@@ -1,4 +1,4 @@
-"""The child process of a service: started, watched by what it publishes, ended, and started again when it was lost."""
+"""The child process of a service: started, watched by what it publishes, started again when it was lost; and its pages."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from typing import Any
 
 from armsight.app.interrupts import uninterrupted
 from armsight.app.serve.config import ServeConfig
-from armsight.app.serve.page import state_pages
+from armsight.app.show.http import Answer, Pages, metrics_text
 from armsight.errors import InputError
 
 #: s; a child without a shot for so long is started again; half: slow computers never begin, double: hangs last longer.
@@ -42,6 +42,17 @@ _LINES = 1000
 _ARMSIGHT = (sys.executable, "-P", "-m", "armsight")
 #: Lines of the child that only say that it goes on.
 _PROGRESS = re.compile(r"[a-z ]+: \d+( of \d+)?$")
+#: Metric -> its kind and what it is, as Prometheus shows it.
+METRICS = {
+    "up": ("gauge", "1 while shots arrive"),
+    "shots_total": ("counter", "shots since the service began"),
+    "missed_total": ("counter", "shots in which the target was not measured"),
+    "losses_total": ("counter", "times that the cameras or the process were lost"),
+    "shot_age_seconds": ("gauge", "time since the newest shot"),
+    "latency_seconds": ("gauge", "time from the newest exposure to its pose"),
+    "sigma_metres": ("gauge", "standard deviation of the newest position, root sum of squares of its axes"),
+    "process_resident_bytes": ("gauge", "memory of the process that measures"),
+}
 
 
 class Service:
@@ -254,3 +265,17 @@ def _close(logger: logging.Logger) -> None:
         logger.removeHandler(handler)
         with suppress(OSError):  # what a full disk did not take is lost
             handler.close()
+
+
+def state_pages(address: str, state: Callable[[], dict[str, Any]], values: Callable[[], dict[str, float]]) -> Pages:
+    """Serve both pages."""
+
+    def healthz(_: dict[str, str]) -> Answer:
+        now = state()
+        return 200 if now["healthy"] else 503, "application/json", (json.dumps(now) + "\n").encode()
+
+    def metrics(_: dict[str, str]) -> Answer:
+        rows = {name: {"": value} for name, value in values().items()}
+        return 200, "text/plain; version=0.0.4", metrics_text(METRICS, rows)
+
+    return Pages(address, {"/healthz": healthz, "/metrics": metrics}, "[serve] http", open_to=True)
