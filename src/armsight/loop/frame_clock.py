@@ -128,7 +128,7 @@ class FrameClock:
     def _follow_rate(self, stamp_s: float) -> None:
         """Correct the rate of the clock where the soonest images of seconds come ever sooner or later.
 
-        The slope is the median of those between any two seconds (Sen, 1968), of which nine in ten must agree: where few
+        The slope is the median of those between any two seconds (Sen, 1968), of which nine in ten must agree.
         """
         if len(self._soonest) <= _SEEN_S:
             return

@@ -160,7 +160,7 @@ def smoothed_anew(state: ErrorState, then: Smoothed) -> ErrorState:
 def bridged(noise_at: slice, before: Array, after: Array, ahead: Propagation, back: Propagation) -> tuple[Array, Array]:
     """Return the readings' noise (N, n) between the states before and after (N, size), and what is added to variances.
 
-    The noise is bounded by both ends, as a Gauss-Markov process is: its mean between them, and what is left of its
+    The noise is bounded by both ends, as a Gauss-Markov process is; faster vibration is known from the nearer end.
     """
     near, far = ahead.kept[:, noise_at] ** 2, back.kept[:, noise_at] ** 2
     whole = np.maximum(1.0 - near * far, _MIN_SHARE)

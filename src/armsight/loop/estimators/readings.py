@@ -175,7 +175,7 @@ def _shortened(
     """Replace angles ``motion[0]`` and ``variance`` (n,) of joints whose motion no parabola follows over a span of time, s.
 
     Those of parabolas over half of the span, a quarter of it and so on, and at last of a line between the two readings
-    around the time. Speeds stay those of the whole span. Noise that residuals show is counted; ``noise`` (n,) becomes its
+    around the time. Speeds stay those of the whole span. ``noise`` (n,) becomes what residuals show.
     """
     noise[:] = 1.0
     low, high = window(t, first, count, at, length)

@@ -258,7 +258,7 @@ class HandEye(Record):
 class _Guess(Record):
     """Transforms, scale, what is left of the time offset, and errors that vision shares between poses, in sigmas.
 
-    Lengths are in the unit of the measured body, in which a scale that is fitted is not drawn to small values by the
+    Lengths are in the unit of the measured body: ``per_m`` of them make one metre.
     """
 
     Z: Array
@@ -805,7 +805,7 @@ def _alone(s: Solved, linear: Linear) -> Array:
 def _suiting(whole: _Problem, guess: _Guess, nominal: _Model) -> tuple[Array, Array]:
     """Return the step (P,) to the mounting that suits the arm's model best, and its residuals (N, 6) of poses left out.
 
-    Where rotations and positions contradict each other by more than either scatters, that is the one of positions alone:
+    Where rotations and positions contradict each other by more than either scatters, that is the one of positions alone.
     """
     linear, own = nominal.linear, nominal.linear.own
     middle = {"seen_m": np.concatenate([own["lateral_m"], own["depth_m"]], axis=2)}

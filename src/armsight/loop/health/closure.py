@@ -285,7 +285,7 @@ class ClosureWatch:
     def _closest(self, begins: Array, found: Sequence[_Tested]) -> list[_Tested]:
         """Return all hypotheses at beginnings between the neighbours of those at which some come near their limits.
 
-        The block into which a change falls has an error that no beginning explains, beside which the others look small:
+        The block into which a change falls has an error that no beginning explains, beside which the others look small.
         """
         limits = _limits(self._parts.joints)
         near = [each for each in found if each.above > -_NEAR * limits[each.suspect.freedom]]

@@ -264,7 +264,7 @@ class HealthMonitor:
     def _left(self, correction: RigCorrection) -> tuple[HealthFinding, ...]:
         """Return what else they found: that goes on though its test does not know of it any more.
 
-        Cameras that moved against each other displace all poses, which arm and bodies then seem to explain: of what began
+        Cameras that moved against each other displace all poses, which arm and bodies then seem to explain.
         """
         left, cause = list[HealthFinding](), correction.cause
         for each in self._tested(correction):

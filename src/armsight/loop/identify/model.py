@@ -202,7 +202,7 @@ def gravity_levers(arm: Arm, q: Array, up_base: Array = UP) -> Array:
 def _side(lever: Array, approach: Array | None, joint: int) -> Array:
     """Return on which side of its backlash a link lies (N,), -1 to 1: by gravity, or by friction where that is stronger.
 
-    Where the two are about as strong it is the mean of both sides, weighted by how likely each is. Where the direction of
+    Where the two are about as strong it is the mean of both sides, weighted by how likely each is.
     """
     if np.abs(lever).max(initial=0.0) < FRICTION_M:
         return np.zeros(len(lever))  # gravity does not load it: its backlash is of kind ``backlash``

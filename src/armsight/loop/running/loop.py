@@ -150,7 +150,7 @@ _LEAST_WAIT_S = 0.001  # for the board, even when the loop is late: a lost board
 class Loop:
     """Runs controllers on a board, with cameras.
 
-    The constructor receives nothing; :meth:`open` returns a loop that has its first reading. It takes a setup, what
+    The constructor receives nothing; :meth:`open` returns a loop that has its first reading.
     """
 
     def __init__(self, setup: Setup, follower: Follower, log: Log, estimator: KalmanEstimator) -> None:
