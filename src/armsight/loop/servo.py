@@ -47,8 +47,7 @@ STEP_LEVER_M = 0.05
 DROOP_S = 0.2
 #: In motion the correction comes to what is asked for with this time constant, s: backlash would keep it twitching.
 FOLLOW_S = 0.08
-#: A direction is corrected from this singular value of the Jacobian on (linear rows over the arm's size), fully from
-#: that.
+#: A direction is corrected from this singular value of the Jacobian on (linear rows over the arm's size), then fully.
 UNCORRECTED_BELOW, CORRECTED_ABOVE = 0.02, 0.04
 #: The correction is at most this, rad, and displaces the tool by at most so much, m: beyond is another arm.
 MAX_CORRECTION_RAD = np.deg2rad(5.0)
@@ -220,11 +219,7 @@ class PoseServo:
     ) -> ServoStep:
         """Make the next command.
 
-        Args:
-            aim: its reference, of this period.
-            estimator: where the tool is.
-            trust: how far what the estimator took from vision may be relied on.
-            before: where that is not at all, an estimator that knows what was learned before; None where nothing was.
+        ``before``: where vision is not trusted at all, an estimator that knows what was learned before; None for none.
         """
         estimate = estimator.estimate()
         error = behind(aim.Ts_base_tool[0], estimate.T_base_tool)
@@ -387,8 +382,7 @@ def _bounded(
     """Write a command with a changed correction, as far as the limits allow.
 
     Returns:
-        Return the number of joints that a limit keeps from being corrected further; beyond n the tool's displacement is
-        bounded.
+        Return how many joints a limit keeps from being corrected further; beyond n the tool's displacement is bounded.
     """
     joints = q.shape[1]
     square, limited = 0.0, 0
@@ -430,9 +424,6 @@ def whole_steps(J: Array, requested: Array, steps: Array, gaps: Array | None = N
         requested: (n,) angles by which the joints would have to move the tool, rad.
         steps: (n,) the joints' steps, rad; 0 has no step.
         gaps: (2, n) backlash that each joint is taken through first, upwards and downwards, rad; None for none.
-
-    Returns:
-        (n,) changes of the joints, rad.
     """
     n = len(steps)
     gaps = np.zeros((2, n)) if gaps is None else gaps

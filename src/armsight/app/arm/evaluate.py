@@ -48,8 +48,7 @@ VERSION = 1  # version of report.json
 #: Fewest rests, and shots of one.
 MIN_RESTS, _SHOTS = 12, 2
 _SIGMAS = tuple(f"sigma_{name}" for name in ("x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad"))
-#: Delays that are tried, s; the least motion of a joint that shows its delay, rad; how much of a rest counts, s;
-#: motions.
+#: Delays that are tried, s; a joint's least motion that shows its delay, rad; how much of a rest counts, s; motions.
 _DELAYS_S, _MOVED_RAD, _AFTER_S, _MOTIONS = np.arange(0.0, 1.2, 0.005), np.radians(2.0), 0.5, 60
 _SAME_RAD = 1e-6  # poses that are at most this far apart by their commands, rad, are one pose
 #: Part of the error -> the kinds of parameters that make it, and its remedy.
@@ -353,8 +352,7 @@ def _joint(
 def _zero(arm: Arm, i: int, rests: RestPoses, found: Identified) -> tuple[float, float] | None:
     """Return by how much a joint really is further than it reads, deg, on the mean over the rests, and its sigma.
 
-    The mean of the sensor's curve hardly differs from another zero: the two count together. Sigma is that of the fitted
-    numbers, and how far leaving out the others (a length, a compliance) has moved the zero.
+    The mean of the sensor's curve counts with the zero; sigma has how far leaving out the others has moved it.
     """
     model, solution = found.model, found.solution
     weight, at = np.zeros(len(solution.x)), model.names.index(f"offset{i + 1}")
@@ -439,8 +437,6 @@ def plan_report(
     """Return the motions of the recording that a report needs, as a motion file, and the space (3,) it covers, m.
 
     Poses all over where the body is seen, each from two opposite sides of all joints, and five of them again and again.
-
-    ``cycles``: how often five of them come again.
     """
     rng, found = np.random.default_rng([seed, 40]), list[tuple[Array, Array]]()
     low, high = arm.q_min + 2 * _ASIDE_RAD, arm.q_max - 2 * _ASIDE_RAD

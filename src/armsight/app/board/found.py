@@ -41,8 +41,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _MARGIN_RAD = 0.05
-#: Of an elastic joint: factor of its stiffness, share of stall torque and acceleration that twist it, rad; half:
-#: slower, double: it rings.
+#: Of an elastic joint: factor of its stiffness, share of stall torque and acceleration that twist it, rad.
+#: Half: slower, double: it rings.
 _SOFTER, _SUDDEN, _ACCELERATION_TWIST_RAD = 1.5, 0.2, 0.0025
 _MOST_INVERTED_RAD = 1.0
 _MOST_UNEVEN = 0.5  # share of a ratio, as config.c holds it

@@ -213,10 +213,7 @@ def ar4_changes(path: Path, further_rad: Array) -> tuple[str, list[ZeroChange]]:
 
 
 def pot_changes(config: Configuration, further_rad: Array) -> list[ZeroChange]:
-    """Shift the potentiometers' tables of a configuration by the angles (6,), rad, by which joints really are further.
-
-    The soft limits go along: they stay where they are on the arm.
-    """
+    """Shift the potentiometers' tables of a configuration by the angles (6,), rad, by which joints really are further."""
     further, changes = _checked(further_rad, len(config["joint"])), []
     for k, joint in enumerate(config["joint"]):
         pot, count = joint["pot"], int(joint["pot"]["node_count"])

@@ -116,11 +116,7 @@ class Page(Record):
 
 
 def pages(path: str | Path, layout: Composite) -> tuple[tuple[Page, ...], list[str]]:
-    """Sort a body's markers by the plane they lie in.
-
-    Returns:
-        The pages, and what should be said about them.
-    """
+    """Sort a body's markers by the plane they lie in."""
     notes, groups = list[str](), list[list[Mark]]()
     for one in [*_patterns(layout), *_discs(path, layout, notes)]:
         for group in groups:

@@ -46,10 +46,8 @@ class Slice(Record):
 def predicted_sigmas(rig: StereoRig, p_left: Array, variance_px2: Array) -> tuple[Array, Array]:
     """Predict the uncertainty of triangulated points.
 
-    Args:
-        rig: the calibrated pair.
-        p_left: (N, 3) points, m, left camera's frame.
-        variance_px2: (2,) variance of a detection in the left and the right image, px^2.
+    ``p_left``: (N, 3) points, m, left camera's frame. ``variance_px2``: (2,) variance of a detection in the left and
+    the right image, px^2.
 
     Returns:
         (3, N) one sigma along the line of sight from between the cameras, m, by SHARES; (3, N) across it, in the worse
@@ -81,10 +79,7 @@ def target_points(calibration: Calibration) -> Array:
 
 
 def volume_slice(calibration: Calibration) -> Slice:
-    """Predict the sigmas over the plane through the targets' middle, from before the nearest to beyond the farthest.
-
-    The plane contains the left camera's X axis, or its Y axis if the cameras are mounted one above the other.
-    """
+    """Predict the sigmas over the plane through the targets' middle and the left X axis (Y, one above the other)."""
     rig, targets = calibration.rig, target_points(calibration)
     axis, z, middle = int(np.argmax(np.abs(rig.T_left_right[:2, 3]))), targets[..., 2], targets.mean(axis=1)
     depth = np.linspace((1 - BEYOND) * max(z.min(), 1e-3 * z.max()), (1 + BEYOND) * z.max(), _DEEP)
@@ -105,8 +100,8 @@ def volume_slice(calibration: Calibration) -> Slice:
     return Slice(axis, sideways, depth, np.isfinite(along[0]), along, lateral)
 
 
-#: A metric is good up to the first limit, and fair up to the second, px; sharp corners give 0.05 to 0.3. In proportion
-#: to images larger than LARGE_PX.
+#: A metric is good up to the first limit, fair up to the second, px (sharp corners: 0.05 to 0.3); in proportion where
+#: images are larger than LARGE_PX.
 EPIPOLAR_PX, LARGE_PX = (0.3, 1.0), 1280
 #: Held-out over fitted epipolar RMS: the degree of overfitting.
 OVERFIT = (1.25, 2.0)

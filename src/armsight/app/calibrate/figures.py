@@ -93,10 +93,7 @@ def round_steps(low: float, high: float) -> list[float]:
 
 
 def target_figure(calibration: Calibration) -> Figure | None:
-    """Plot the target's estimated deviation from its drawing: colour out of the plane, arrows within it, mm.
-
-    None where it was not estimated.
-    """
+    """Plot the target's estimated deviation from its drawing, mm: colour out of the plane, arrows within; None without."""
     drawing = target_drawing(calibration)
     if drawing is None or calibration.deviation_m < HELD_M:
         return None

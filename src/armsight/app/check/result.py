@@ -198,11 +198,7 @@ def read_limits(texts: Iterable[str]) -> dict[str, float]:
 
 
 def check_limits(lines: Sequence[MetricLine], limits: Mapping[str, float]) -> list[LimitResult | None]:
-    """Compare metrics with their limits.
-
-    Returns:
-        An outcome for each line; None where its metric has no limit.
-    """
+    """Compare metrics with their limits; None where one has no limit."""
     known = list(dict.fromkeys(line.name for line in lines))
     for name in limits:
         if name not in known:

@@ -301,10 +301,7 @@ def _ends(segment: PathSegment) -> Array:
 
 
 def _path(name: str, group: list[PathSegment], noise: Noise, notes: list[str]) -> list[list[Row]]:
-    """Return a path's rows, cycle by cycle, and note the cycles of which a part was not seen.
-
-    There is a row for every path point of the command: where the attained path crosses the plane square to it.
-    """
+    """Return a path's rows, cycle by cycle, and note the cycles of which a part was not seen."""
     p = group[0].p_ref
     gone = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(p, axis=0), axis=1))])  # arc lengths, m
     keep = np.concatenate([[True], np.diff(gone) > 0])
@@ -408,10 +405,7 @@ def reversals_of(track: JointTrack, circle: list[PathSegment]) -> list[Reversal]
 
 
 def _reversal_times(t_s: Array, q: Array) -> list[float]:
-    """Return the times at which a joint reverses that moves by enough before and after, s.
-
-    Where it stands in between, as it does between equal readings, it reverses in the middle of that.
-    """
+    """Return the times at which a joint reverses that moves by enough before and after, s; where it stands, the middle."""
     if not len(q):
         return []
     steps = np.diff(q)

@@ -203,10 +203,7 @@ RATES_HZ = (4.0, 15.0, 30.0, 60.0, 120.0)
 
 
 def rate_study(open_workcell: Callable[[float], Workcell], result: RunResult, progress: Progress) -> Study:
-    """Make the last motions of a run, up to its circle, with the loop closed at several rates of the cameras.
-
-    ``open_workcell`` opens a workcell with cameras of a rate, Hz; all else as in the run.
-    """
+    """Make the last motions of a run, up to its circle, with the loop closed at several rates of the cameras."""
 
     def at(rate: float) -> tuple[float, float, int]:
         progress(f"study: vision at {rate:g} Hz in the loop")
@@ -231,11 +228,7 @@ def rate_study(open_workcell: Callable[[float], Workcell], result: RunResult, pr
 
 
 def _circle(workcell: Workcell, result: RunResult) -> tuple[float, float, int]:
-    """Move to the circle and along it, without a rest.
-
-    Returns:
-        The RMS error of the fused estimate on the circle, m, the claimed one, m, and the number of readings.
-    """
+    """Move to the circle and along it; return the fused RMS error, m, the claimed one, and the readings' count."""
     assert result.handeye is not None
     setup, mounting, plan = setup_of(workcell), result.handeye.mounting, result.plan
     setup.board.enable()

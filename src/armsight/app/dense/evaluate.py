@@ -25,7 +25,6 @@ class SceneResult:
     """The errors and the speed of a method on a scene.
 
     Attributes:
-        weight: the scene's, in averages.
         all_pixels: errors over all pixels with a truth.
         nonocc: over those that both cameras see.
         measured: over those that the method measured, of the ones both cameras see.

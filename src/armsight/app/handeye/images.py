@@ -173,10 +173,7 @@ def see_with_rig(
 
 
 def _common(cov: Array, by: dict[int, Array], count: int) -> Array | None:
-    """Return what the independent errors of a rig of one sigma do to N poses (N, 6, K); None where they do nothing.
-
-    ``by`` has the poses' derivatives (6, P) by the rig's parameters; poses that are missing are zero.
-    """
+    """Return what the independent errors of a rig of one sigma do to N poses (N, 6, K); None where they do nothing."""
     values, vectors = np.linalg.eigh(cov)
     J = np.zeros((count, 6, len(cov)))
     for k, D in by.items():

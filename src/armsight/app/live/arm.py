@@ -572,8 +572,7 @@ class ArmStep(PageStep[ArmState]):
     def between_shots(self) -> None:
         """Wait, while a loop watches shots, until a command has followed from one, 0.1 s at most.
 
-        The loop shares the interpreter with all other threads: what is computed until the next shot delays no image's
-        command.
+        The loop shares the interpreter: what is computed until the next shot delays no image's command.
         """
         if self._loop is not None and time.monotonic() - self._answered_s < _WATCHES_S:
             self._answered.clear()

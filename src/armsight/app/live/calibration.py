@@ -44,11 +44,9 @@ from armsight.vision.rig import StereoRig
 STILL_PX, STILL_S, STILL_DETECTIONS = 0.8, 0.3, 3
 #: An edge spread up to this is sharp enough for a shot, px.
 _SHARP_SHOT_PX = 1.7 * SHARP_PX
-#: A pose is taken for this share of the best one's gain, the board's corners this share of its size from every shot
-#: before.
+#: A pose is taken for this share of the best one's gain, and corners this share of the board's size from all before.
 _WORTH, _OTHER_SHARE = 0.5, 0.06
-#: A person who stood still for the first time, s, has done what is possible: this share is enough; then another pose is
-#: due.
+#: A person who stood still for the first time, s, has done what is possible: this share is enough; then another pose.
 _PATIENT_S, _PATIENT_WORTH, _OTHER_POSE_S = 3.0, 0.15, 6.0
 #: First fit, fewest shots of a calibration that is called good, and folds while shots are still taken.
 FIRST_FIT, LEAST_SHOTS, _FOLDS = 4, 12, 5
@@ -124,10 +122,7 @@ def _sees(pair: Pair) -> tuple[bool, bool]:
 
 
 class CalibrationStep(Guided[CalibrationState]):
-    """The guided calibration with one board; ``changed`` is called with a rig once it is written.
-
-    Shots go to ``calibration`` in the folder of the session, the result to ``rig.json``.
-    """
+    """The guided calibration with one board: shots in ``calibration``, then ``rig.json``, given to ``changed``."""
 
     def __init__(
         self,

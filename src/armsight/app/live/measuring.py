@@ -522,8 +522,7 @@ def _mm(values: Array) -> tuple[float, ...]:
 def relative_pose(rig: StereoRig, first: PoseEstimate, second: PoseEstimate) -> tuple[Array, Array]:
     """Return T_first_second (4, 4), m, of two bodies in one shot, and its covariance (6, 6), right tangent [m; rad].
 
-    The noise of both adds up; the calibration moves both bodies, and what it does to both alike cancels: its covariance
-    passes through the difference of the derivatives.
+    The noise of both adds up; what the calibration does to both alike cancels.
     """
     T = inverse(first.T_left_body) @ second.T_left_body
     Ad = adjoint(inverse(T))

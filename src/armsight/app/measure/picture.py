@@ -245,13 +245,7 @@ def draw_shot(
     sizes: tuple[tuple[int, int], tuple[int, int]],
     marks: Marks | None,
 ) -> Canvas:
-    """Draw a shot.
-
-    ``header``: lines above the images. ``sizes``: (width, height) of the images that are not there, px.
-
-    Returns:
-        (H, WIDTH, 3) BGR picture.
-    """
+    """Draw a shot: (H, WIDTH, 3) BGR; ``header``: lines above; ``sizes``: (width, height) of missing images, px."""
     panels = [_Panel(side, image, size) for side, image, size in zip(SIDES, images, sizes, strict=True)]
     parts = [paragraph(header, INK, 0.6, WIDTH, _GAP)]
     if problem is not None:

@@ -274,8 +274,7 @@ class MeasureRun:
     def keep_noise(self) -> bool:
         """Say how noisy the cameras' discs were, and write the rig with that and with the shutters that were found.
 
-        Returns False where a rig was to be written and the shots showed nothing to write. Of shots that show a skew the
-        residuals are those of the motion, not of the discs.
+        Returns False where a rig was to be written and the shots showed nothing to write.
         """
         rig, shots, save_rig = self.rig, self.shots, self.options.save_rig
         found = None if shots.noise is None or shots.skewed else shots.noise.found()

@@ -45,10 +45,7 @@ class PictureFolder:
     def __init__(
         self, folder: Path, rig: StereoRig, body: Body, discs: DiscTarget | None = None, total: int | None = None
     ) -> None:
-        """Begin a run.
-
-        ``body``: what is measured; points of discs come last.
-        """
+        """Begin a run; of ``body`` points of discs come last."""
         self.folder, self.rig, self.body, self.discs = folder, rig, body, discs
         self._every = None if total is None else -(-total // EACH_UP_TO)
         self._shots = self._odd = 0
@@ -111,9 +108,5 @@ class PictureFolder:
 
 
 def _step(number: int, most: int) -> int:
-    """Return the step between shots with a picture at a shot's number.
-
-    It is 1 for the first ``most`` shots, and doubles each time the number of shots doubles: each doubling adds the
-    same number of pictures.
-    """
+    """Return the step between shots with a picture: 1 up to ``most`` shots, doubled as often as their number doubles."""
     return 1 << (number // most).bit_length()

@@ -25,11 +25,7 @@ from armsight.vision.sources.folder import COLUMNS, INDEX
 
 @dataclass(frozen=True)
 class Recording:
-    """What was stored.
-
-    Attributes:
-        interrupted: whether that was an interrupt from the keyboard.
-    """
+    """What was stored."""
 
     directory: Path
     shots: int

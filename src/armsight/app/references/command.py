@@ -24,8 +24,7 @@ RATE = 0.05
 UNIT = 0.2
 #: A rest is so long at least, s.
 REST_S = 0.5
-#: Readings are averaged over so long, s; half: twice the time, double: fast sweeps are cut (0.5 mm of a lever of 60
-#: mm).
+#: Readings are averaged over so long, s; half: twice the time, double: fast sweeps are cut (0.5 mm at 60 mm).
 AVERAGED_S = 0.02
 #: A smaller sweep is said to be small, deg; half: levers off by 10 mm pass, double: good sweeps are blamed.
 SMALL_DEG = 60.0

@@ -45,11 +45,10 @@ BAUD = 921_600
 FIRST_S = 3.0
 _WAIT_S = 0.1  # for a line: so soon a thread sees that it is to end
 _LINES_BYTES = 65_536
-#: s: stamps so far off their arrival, for so long, are of a clock that jumped; half: stalls pass for jumps, double:
-#: losses.
+#: s: stamps so far off their arrival, for so long, are of a clock that jumped; half: stalls are, double: more is lost.
 JUMP_S = 1.0
-#: Stamps that fall by more, or are later than now, s, are of a clock that jumped; half: overtaken ones are, double: 80
-#: ms not.
+#: Stamps that fall by more, or are later than now, s, are of a clock that jumped; half: overtaken ones are, double:
+#: few.
 STEP_S = 0.05
 
 

@@ -197,9 +197,6 @@ def run_experiment(
     before the drives are switched on. ``handeye``: a hand-eye calibration of this set-up; None to make one by visiting
     the targets. ``follow_rig``: whether a rig that moved is put right where the evidence suffices; it needs a
     covariance.
-
-    Returns:
-        All that was measured, also where something ended the run early.
     """
     result = RunResult(setup, rig, plan, handeye=handeye)
 

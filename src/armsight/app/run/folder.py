@@ -76,8 +76,7 @@ def run_in(
     """Run the experiment on real devices, with run.mcap in its folder and streams beside.
 
     ``files`` are the texts of motion.toml and body.toml, perhaps of references.toml, which are written first; run.mcap says
-    which ``command`` made it;
-    ``say`` is given what could not be recorded or published; ``how`` and the rest is as :func:`run_experiment` takes it.
+    which ``command`` made it; ``say`` is given what could not be recorded or published.
     """
     make_room(folder)
     for name, text in files.items():

@@ -31,7 +31,6 @@ class ServeConfig:
     Attributes:
         arguments: of `armsight measure`, without --output.
         folder: where relative paths begin: that of the file.
-        log_files: older logs that are kept.
     """
 
     arguments: tuple[str, ...]

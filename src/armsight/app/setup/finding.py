@@ -19,8 +19,8 @@ from armsight.vision.sources.v4l2 import VideoDevice, find_cameras
 
 #: s; between two looks at the ports; half: nothing, double: a plug that is moved fast is not seen.
 _LOOK_S = 0.2
-#: A covered lens: its view is this much darker, and no other by so much; half: a hand is not enough, double: a cloud
-#: is.
+#: A covered lens: its view is this much darker, and no other by so much; half: hands are not enough, double: clouds
+#: are.
 COVERED, NOT_COVERED = 0.45, 0.75
 _MOVED_RAD = np.radians(3.0)  # by a hand; half: backlash and noise pass for it, double: a stiff joint is pushed far
 _FRAMES = 8  # until a camera's exposure has settled; half: too dark an image, double: slower

@@ -46,7 +46,6 @@ class Lines:
     """Lines that belong together.
 
     Attributes:
-        lines: plain text.
         title: stands above them on the terminal, where they are indented; empty: they are not.
         most: so many are printed, and how many more there are; 0: none; the page folds those beyond ON_PAGE.
         none: what is said instead where there are none.
@@ -63,7 +62,6 @@ class Plot:
     """A figure on the page, and as PNG and SVG beside it, with its data as CSV.
 
     Attributes:
-        name: of its file, without the prefix.
         draw: plots it, or returns an image (H, W, 3) BGR; None where there is nothing to plot.
         caption: HTML; empty: it is a file alone.
         description: for who cannot see it.
@@ -110,10 +108,7 @@ class Report:
         sub: the line below it.
         headline: the result in one line; empty: the first section says it.
         assessed: grade and sentence: what was done, how good it is, and what to do next; None: the first section says it.
-        sections: by their anchors, in order.
-        notes: remarks.
         values: what programs read besides the facts.
-        prefix: of the figures' files; may be empty.
     """
 
     name: str
@@ -186,14 +181,6 @@ class Report:
 
     def write(self, folder: Path, files: Mapping[str, str | bytes] = MappingProxyType({})) -> Path:
         """Draw the figures, and write page, figures and further files into a folder.
-
-        Args:
-            folder: made where it does not exist; figures of an earlier report are replaced, or removed where there is
-                nothing to plot.
-            files: name -> text or bytes of what stands beside.
-
-        Returns:
-            The page, report.html.
 
         Raises:
             InputError: matplotlib is missing, or a file cannot be written; then none of the new ones is left.

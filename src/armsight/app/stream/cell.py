@@ -121,11 +121,7 @@ def tilt_and_size(rig: StereoRig, points: Array, pose: PoseEstimate) -> tuple[fl
 
 
 class CellSink(Sink):
-    """Sends what a command measures to the hub of its site.
-
-    Raises:
-        InputError: zenoh is not installed, or another process of this computer is this cell.
-    """
+    """Sends what a command measures to the hub of its site."""
 
     def __init__(self, cell: Cell, published: Published, mode: str) -> None:
         super().__init__(wakes=256, close_s=_CLOSE_S)

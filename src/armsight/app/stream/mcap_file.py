@@ -194,12 +194,7 @@ def _dropped(sink: Sink) -> NoteDatum:
 
 
 class LazyMcap:
-    """run.mcap in a folder, begun with the first datum; one of an earlier run is replaced.
-
-    Args:
-        say: is given a line where the packages are missing, and then nothing is written; and what ended the writing early.
-        process: whether it is written in a process of its own, which takes a second to begin: for long runs.
-    """
+    """run.mcap in a folder, begun with the first datum; an earlier one is replaced; ``say`` is given what is wrong."""
 
     def __init__(
         self,

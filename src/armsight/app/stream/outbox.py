@@ -31,9 +31,6 @@ class Outbox:
 
     Attributes:
         name: which numbering this is: a new disk begins at 1 again, under another name.
-
-    Raises:
-        InputError: another process of this computer is this cell, or nothing can be written there.
     """
 
     def __init__(self, folder: Path, cell: str) -> None:

@@ -58,11 +58,7 @@ class Streams:
 
 
 def open_streams(specs: Sequence[str], published: Published, say: Callable[[str], None]) -> Streams:
-    """Open the streams that a user names, and start them.
-
-    Raises:
-        InputError: an unknown kind, a port that is no number or in use, or a package is missing.
-    """
+    """Open the streams that a user names, and start them."""
     sinks: dict[str, Sink] = {}
     try:
         for spec in specs:

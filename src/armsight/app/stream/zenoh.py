@@ -49,11 +49,7 @@ class _RosPublisher:
 
 
 class Ros2Sink(Sink):
-    """Publishes to a ROS 2 system.
-
-    Raises:
-        InputError: no router answers, the domain is no number, or a package is missing.
-    """
+    """Publishes to a ROS 2 system."""
 
     def __init__(self, published: Published, host: str, port: int) -> None:
         try:

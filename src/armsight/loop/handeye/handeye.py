@@ -532,10 +532,7 @@ def _with_scale(problem: _Problem) -> tuple[_Problem, _Guess, NDArray[np.bool_]]
 
 
 def scale_between(poses: Poses) -> float:
-    """Return true lengths over those of the measured body, by closed forms from small parts of the poses.
-
-    Of the parts' answers it is that whose best residuals, of the share MIDDLE, are smallest.
-    """
+    """Return true lengths over those of the measured body, by closed forms from small parts of the poses."""
     p = poses.rows(_spread(np.arange(len(poses.A)), 300))
     A, B = p.A, p.right_side
     rng = np.random.default_rng(0)

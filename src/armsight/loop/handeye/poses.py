@@ -37,8 +37,8 @@ class Poses(Record):
     cov: Array  #: (N, 6, 6) covariance of B, right tangent, zero where unknown
     in_hand: bool  #: whether the rig is on the flange and the body stands still; else the body is on the flange
     centre: Array  #: (3,) the middle of what is seen of the body, body frame, m
-    #: (N, 6, K) what K independent errors that all poses share (the rig's calibration), of one sigma each, do to B,
-    #: right tangent; None where unknown
+    #: (N, 6, K) what K errors that all poses share (the rig's), of one sigma each, do to B, right tangent; None if
+    #: unknown
     common: Array | None = None
 
     def rows(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> Poses:
@@ -89,10 +89,7 @@ LEVER_M = 0.3
 
 
 def starts(A: Array, B: Array, seed: int = 0) -> list[tuple[Array, Array]]:
-    """Return candidates for X and Z of ``A_i X = Z B_i``, smallest median residual first.
-
-    ``A``: (N, 4, 4) poses, N >= 3.
-    """
+    """Return candidates for X and Z of ``A_i X = Z B_i``, smallest median residual first."""
     rng = np.random.default_rng(seed)
     found = [kronecker(A, B)]
     if len(A) > PART:

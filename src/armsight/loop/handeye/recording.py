@@ -331,8 +331,6 @@ def _tcp(robot: PoseTable, arm: Arm | None) -> list[str]:
 def links_of(robot: PoseTable, arm: Arm | None, at: Array) -> Callable[[Array], Array] | None:
     """Return what gives T_link_flange (M, L, 4, 4) of all links between rows of a table; None without a model or joints.
 
-    The joints are taken to give the table's very poses: such as scatter against them would be explained by errors of links.
-
     ``at``: (N,) what is called with, of each row: its number, or its time.
     """
     if arm is None or robot.q is None:

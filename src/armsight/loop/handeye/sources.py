@@ -126,8 +126,7 @@ def over_time(t_s: Array, poses: Poses, maps: dict[str, Array], scale: bool) -> 
         name: spread(F, maps[MAP_OF[name]]) for F, of in ((drift, OVER_TIME[0]), (walk, OVER_TIME[1])) for name in of
     }
     if poses.in_hand:
-        # The eye's pose in the body is off by steps exp(xi_j), each in the eye's own axes: in the body's they are
-        # Ad(T_body_rig) xi_j, and add up.
+        # The eye's pose in the body is off by steps exp(xi_j), each in the eye's own axes: in the body's they add up.
         axes = adjoint(inverse(poses.B))
         for name, part in (("walk_m", axes[..., :3]), ("walk_rad", axes[..., 3:])):
             columns[name] = np.cumsum(spread(np.vstack([0 * steps, np.diag(steps)]), part), axis=0)

@@ -124,9 +124,6 @@ def coarse_offset(hand: PoseStream, eye: PoseStream) -> float:
 
     Speeds are taken over intervals of several lengths, short ones for quick motions and long ones against noise; the length
     counts under which agreement stands out most. Faster than the slower stream ever rotates is a blunder of the other.
-
-    Raises:
-        CalibrationError: nothing rotates.
     """
     step = float(np.clip(np.median(np.diff(eye.t_s)), 0.005, 0.05))
     if max(float(np.quantile(_speeds(stream, step, OVER[0])[1], 0.9)) for stream in (hand, eye)) < MIN_SPEED_RAD_S:

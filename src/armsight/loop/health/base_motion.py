@@ -161,8 +161,7 @@ class BaseMotion:
     def put_right(self, at_s: float) -> None:
         """Go on with measurements after a time, s, that are corrected by the motion as it was found.
 
-        Those before it are not used. The arm's filter goes on from what it knew before: where the links are is not
-        known any more.
+        Those before it are not used; where the links are is not known any more.
         """
         n, d, self._right_s = self._n, slice(self._n, self._n + 6), at_s
         across = self._P[:n, n:].copy()

@@ -30,7 +30,7 @@ DATED_S = 0.7
 MARGIN = 1.4
 #: The estimate of a drift is off by about this share of it, in any direction (simulated drifts of constant rate).
 _OTHERWISE = 0.08
-#: Chi-square (5) below which a motion of the cameras may be one along their optical axis alone: beyond it once in a
+#: Chi-square (5) below which a motion of the cameras may be one along their optical axis alone, but for one in a
 #: hundred.
 _ALONG = chi_square_limit(5, 0.01)
 #: What the pair alone cannot distinguish from that.
@@ -167,8 +167,6 @@ class Change(Record):
     """A hypothesis: something changed, by so much.
 
     Attributes:
-        suspect: what changed.
-        begin_s: when, s.
         end_s: time of the newest measurement that was used, s.
         size: (D,) by how much: tangent of base or tool [m; rad], an angle, rad, or a time, s; of a ramp so far.
         cov: (D, D) its covariance.
@@ -244,10 +242,7 @@ def doubtful(changes: Sequence[Change]) -> bool:
 
 
 def suspected(measurement: PoseMeasurement, changes: Sequence[Change]) -> Array | None:
-    """Return the covariance (6, 6) of what hypotheses do to a pose measurement of the tool; None where they do nothing.
-
-    It is that of their mixture: of each the square of what it does, and its covariance; what happened besides adds to it.
-    """
+    """Return the covariance (6, 6) of what hypotheses do to a pose measurement of the tool; None where they do nothing."""
     shaken = [each for each in changes if each.suspect.kind == "shake"]
     changes = [each for each in changes if each.suspect.kind != "shake"]
     until_s = min((each.until_s for each in changes if each.until_s > measurement.t_s), default=np.inf)

@@ -33,8 +33,7 @@ from armsight.loop.health.change import (
     suspects,
 )
 
-#: A block lasts so long, s, and until all joints have travelled so far, rad, but at most so long, s: arms at rest
-#: repeat.
+#: A block lasts so long, s, and until all joints have travelled so far, rad, but at most so long, s.
 BLOCK_S, TRAVEL_RAD, MOST_S = 0.7, 0.1, 10.0
 #: Travel in which the filter forgets what no joint explains, rad.
 _POSE_TRAVEL_RAD = 1.0
@@ -48,8 +47,7 @@ _MOST_KEPT = 160
 _BLOCK_SIGMA, _BLOCKS = np.repeat([1.2e-4, np.radians(0.012)], 3), 8.0
 #: Priors so wide that they decide nothing: of a motion (m, rad), of a time, s, and of an angle, rad.
 _WIDE, _WIDE_S, _WIDE_RAD = np.repeat([0.05, 0.1], 3), 0.05, 0.1
-#: A motion that displaces the tool by less than this, m, is not reported, nor a smaller angle, rad (links in their
-#: backlash).
+#: A motion that displaces the tool by less, m, is not reported, nor a smaller angle, rad: links in their backlash.
 _LEAST_M, _LEAST_RAD = 2e-4, float(np.radians(0.3))
 #: By so much the chi-square of a drift must exceed that of a jump.
 _RARER = 5.0
@@ -248,11 +246,7 @@ class ClosureWatch:
         self._sums.add(np.array(self._t[blocks]), H_T @ changes, changes_T @ changes, right)
 
     def _estimate_noise(self) -> None:
-        """Estimate the covariance of the blocks' errors from what the model leaves of them; sum all blocks anew with it.
-
-        The change that explains most is fitted as well: it must not be taken for errors. Which one that is depends on the
-        errors, and these on it: it is looked for with the covariance as it was, then with the one that it leaves.
-        """
+        """Estimate the covariance of the blocks' errors from what the model leaves of them; sum all blocks anew with it."""
         blocks, errors = np.array(self._H)[:, :, self._model] * self._sigmas, np.array(self._e)
         for _ in range(2):
             # Akaike's criterion: by as much as it explains, less what its parameters explain by chance.

@@ -239,8 +239,7 @@ def _reopened_finding(count: int, first_s: float) -> HealthFinding:
     )
 
 
-#: Terms of the polynomial that is removed of each window; half: arms' errors count as shaking, double: below 4 Hz does
-#: not.
+#: Terms of the polynomial that is removed of each window; half: arms' errors shake, double: below 4 Hz nothing does.
 _TERMS = 3
 #: Shots of a window at the least; half: the polynomial takes most of what they show, double: slow cameras are not watched.
 _LEAST = 8

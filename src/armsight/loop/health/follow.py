@@ -39,8 +39,7 @@ if TYPE_CHECKING:
 SHARE = 0.5
 #: Most shots of an update; and after one that was rejected so large a share of its shots must be new.
 _MOST_SHOTS, _NEW = 60, 0.25
-#: Largest standard deviation of the tool's position by what is put right of the rig, m; and by how much what else may have
-#: moved may displace the tool further, m.
+#: Largest sigma of the tool's position by what is put right, m; and by how much what else moved may displace it, m.
 MOST_SIGMA_M, MOST_APART_M = 2e-4, 2e-4
 #: The same where the arm's poses show it, which is refined: without vision the tool is uncertain by 0.5 mm and more.
 _MOST_BY_ARM_M = 4e-4
@@ -308,10 +307,7 @@ class RigFollower:
     def refined(
         self, right: RigCorrection, T_base_rig: Array, at_s: float, moved: Moved | None
     ) -> RigCorrection | None:
-        """Return a correction by the arm's poses that replaces an earlier one; None where they hardly say more of it.
-
-        ``moved``: what is left of the motion.
-        """
+        """Return a correction by the arm's poses that replaces an earlier one; None where they hardly say more of it."""
         assert right.tool_m is not None
         if moved is None:
             return None

@@ -13,8 +13,7 @@ from armsight.loop.finding import HealthFinding
 
 #: So many repeated shots, and this share of all, are reported.
 _LEAST, _SHARE = 3, 0.01
-#: A period that begins so late, s, is a stall; so many are reported if they are this share of all periods, or a single one
-#: of so long, s: a board that hears nothing for so long stops its arm.
+#: A period that begins so late, s, is a stall; so many are reported at this share of all, or one of so long, s.
 _STALL_S, _STALLS, _STALLED_SHARE, _LONG_S = 0.02, 5, 0.01, 0.1
 
 

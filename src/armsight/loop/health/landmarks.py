@@ -26,8 +26,8 @@ from armsight.loop.health.change import FOCAL, along_axis
 
 #: Poses of a mean.
 _SHOTS = 5
-#: Of the noise of one pose this share of the variance stays in each mean (where a disc lies in its pixels), and of the
-#: calibration's covariance this share differs between two positions of a body that hardly moved.
+#: Of a pose's noise this share of the variance stays in each mean, and of the calibration's covariance this share
+#: differs.
 _STAYS, _DIFFERS = 0.1, 2.5e-3
 #: A body that moved by less, m, is not reported.
 _LEAST_M = 1e-4

@@ -34,11 +34,9 @@ DOUBT_S = 2.0
 #: Knowledge is kept every so often, s, to go on from: all of the newest seconds, older ones each older by this factor.
 #: half of what the factor exceeds 1 by: 5 MB more, double: what was learned just before an old change is lost.
 _KEEP_S, _ALL_S, _RATIO = 1.0, 20.0, 1.2
-#: Stamps that ran fast are put right to so much, s; half: joints are blamed for the rest, double: moving poses are too
-#: wide.
+#: Stamps that ran fast are put right to so much, s; half: joints are blamed, double: moving poses are too wide.
 _RIGHT_S = 3e-3
-#: While a clock is known no better than this, s, the arm's tests wait; half: they may wait for long, double: joints are
-#: blamed.
+#: While a clock is known no better than this, s, the arm's tests wait; half: too long, double: joints are blamed.
 _KNOWN_S = 6e-4
 #: Rate and offset of a clock are said beyond so many sigmas.
 _CLOCK_SIGMAS = 4.0
@@ -49,7 +47,6 @@ class HealthMonitor:
 
     Args:
         rig: the calibrated pair; the pose of its cameras cannot be tested if it has no covariance.
-        body: the body that is measured.
         sync_s: standard deviation of the time between the two exposures of a shot, s.
         printed: whether the body is a print whose shape a calibration found: its points are not tested.
     """

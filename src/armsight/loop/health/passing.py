@@ -61,8 +61,8 @@ _DATED_S = 2.0
 _LEAST = 2
 #: Of the columns of a shot those of times: of the right camera, of the rows of the right and of the left one; acceleration.
 _TIMES = [0, 7, 8, 9]
-#: Standard deviation of the focal length of a test, as a share: so wide that it decides nothing beside the column's own.
-#: It stands so many rows after the parameters; against what stays its variance is this share of that.
+#: Standard deviation of a test's focal length, as a share: wide; its row after the parameters; its share against what
+#: stays.
 _FOCAL, _FOCAL_ROW, _FOCAL_VARIANCE = 0.05, 7, 0.01
 #: Newest doubtful tests explained together; half: slow breathing is taken for a change that stays, double: more time.
 TOGETHER = 12
@@ -237,8 +237,7 @@ def _without(
 ) -> tuple[ResidualSums, float]:
     """Return the sums of tests with a cause eliminated, and twice the logarithm of what chance explains with it.
 
-    A focal length is another in each test, the times that shots share are the same in all: what differs, shots have of
-    their own.
+    A focal length is another in each test, the times that shots share are the same in all.
     """
     sums, occam, prior = tests[0].every.copied(), 0.0, np.eye(len(_TIMES)) / _SHARED_S**2
     sums.scale(0.0)

@@ -39,8 +39,7 @@ _LEAST_POINTS, _APART_S = 4, 0.5
 _LINEAR = 0.005
 #: The body's motion at a shot is that of so many newest ones, if these are of so short a time, s.
 TRACK, _LONGEST_S = 5, 1.0
-#: The measured velocity is off by this share in any direction; half: late images blame rig and body, double: less is
-#: seen.
+#: The measured velocity is off by this share in any direction; half: late images blame rig and body, double: hide.
 UNKNOWN_SHARE = 0.2
 #: An acceleration moves the body like so many seconds of it, where times are of a second.
 _BENT_S = 0.1
@@ -105,10 +104,7 @@ class ExposedShot(NamedTuple):
         return self._replace(A=self.A[rows], roll=self.roll[rows], own=self.own[rows])
 
     def motion(self) -> tuple[Array, Array]:
-        """Return velocity and acceleration (6,) of the body in its axes, 1/s and 1/s^2; zero where they are unknown.
-
-        They are those of each second shot: what a shot has of its own and the next one not leaves them right.
-        """
+        """Return velocity and acceleration (6,) of the body in its axes, 1/s and 1/s^2; zero where they are unknown."""
         if len(self.track) < TRACK:
             return np.zeros(6), np.zeros(6)
         (first_s, first), (middle_s, middle), (last_s, last) = self.track[0], self.track[TRACK // 2], self.track[-1]
@@ -148,7 +144,6 @@ class ShotResiduals(NamedTuple):
     """What a shot says, its pose eliminated, of K parameters and M coefficients of what the camera models lack.
 
     Attributes:
-        t_s: its time.
         rows: (n, 1 + K + M) residuals and their derivatives, in standard deviations.
         response: (6, K + M) of its pose to these.
         every: as ``rows``, with points that do not fit, which may be displaced.
@@ -251,10 +246,7 @@ class ShotReader:
 
     @staticmethod
     def _displaced(A: Array, residuals: Array) -> NDArray[np.bool_]:
-        """Return (N,) whether a point may be the body's, displaced on it: what its four residuals say of the pose (4 N, 6).
-
-        Not one that is too far off, nor one of which the two cameras see different things.
-        """
+        """Return (N,) whether a point may be the body's, displaced on it, by its four residuals and the pose's (4 N, 6)."""
         J, r = A[:, :3].reshape(-1, 4, 3), residuals.reshape(-1, 4)
         H, b = np.einsum("nki,nkj->nij", J, J), np.einsum("nki,nk->ni", J, r)
         d = np.linalg.solve(H, b[..., None])[..., 0]
@@ -484,10 +476,7 @@ class History:
         return self._reduced[onset]
 
     def dated(self, count: int, oldest_s: float | None = None) -> tuple[float, Onset]:
-        """Return the least that a change of the next parameters leaves, and when that began and ended.
-
-        The test before its beginning, which may be of both times, counts as noise.
-        """
+        """Return the least that a change of the next parameters leaves, and when that began and ended."""
         settled_s, tests, times_s = self._settled.begin_s, len(self.kept), [each.begin_s for each in self.kept]
         times_s.insert(0, settled_s if oldest_s is None or oldest_s >= times_s[0] else oldest_s)
         ages = np.geomspace(1.0, tests, _BEGINS).round().astype(int)

@@ -162,7 +162,6 @@ class RigWatch:
         printed: whether the body is a print whose shape a calibration found: its points are not tested.
 
     Attributes:
-        rig: the pair.
         prior: (K, K) square root of the covariance of all parameters: the rig's, scale and points of the body, readout and
             skew, which are what is not known of them where detections are moved to one time, else zero.
         suspected: the change that the newest test found, where it matters and is more likely than not; it widens poses.
@@ -199,7 +198,7 @@ class RigWatch:
             rigid=printed or many,
             strained=not printed,
         )
-        # (K, K + 7 + C) what parameters, seven numbers and the shape's candidates change of the parameters, in units of
+        # (K, K + 7 + C) what parameters, seven numbers and the shape's candidates change of the parameters, over
         # priors.
         self._scaled = np.hstack([self.prior, self._by_fault * _WIDE, self._shape.by_wide])
         # The same with the coefficients of what the camera models lack, px.
@@ -207,7 +206,7 @@ class RigWatch:
         self._with_lens[: self._size, :-LENS] = self._scaled
         self._with_lens[self._size :, -LENS:] = np.eye(LENS)
         # What moves to and fro: the right camera's rotation (3), rad, a focal length against the other, of the right,
-        # of the left.
+        # the left.
         last, (apart_f, both_f) = rig.parameter_count, self._focal.T
         self._to_and_fro = np.column_stack([np.eye(self._size)[:, last - 3 : last], apart_f])
         self._alone = np.column_stack([apart_f - 0.5 * both_f, apart_f + 0.5 * both_f])

@@ -48,7 +48,7 @@ _HIDDEN = 0.4
 _LEAST, _MAJORITY = 10, 0.5
 #: Residuals beyond so many sigmas do not agree; rounds in which that settles.
 _AGREES, _ROUNDS = 4.0, 8
-#: A smaller rotation is not said, standard deviation, rad: mounts breathe. Half: compression is said, double: 0.5 mm is
+#: A smaller rotation is not said, standard deviation, rad: mounts breathe; half: compression is said, double: 0.5 mm
 #: not.
 _FLOOR_RAD = np.radians(0.001)
 #: Depths from this, m, on are tried for a spot, and patches of both cameras that correlate less are different ones.
@@ -68,7 +68,6 @@ class CameraMotion(NamedTuple):
         rotation: (3,) of the camera about its own axes, rad, if it rotated alone; covariance (3, 3).
         shift: (3,) of the camera, m, if it moved alone; covariance (3, 3); None where too few depths are known.
         favours: by how much the chi-square of a shift is larger than that of a rotation; 0 without a shift.
-        seen: how many spots agree.
     """
 
     rotation: tuple[Array, Array]

@@ -81,7 +81,6 @@ class ShapeError(Record):
         chi_square: by how much the first explains more than a change of the seven numbers does.
         seven: by how much the seven numbers explain more than they all do.
         alike: what explains nearly as much as the first.
-        onset: since when.
     """
 
     chosen: tuple[int, ...]
@@ -181,7 +180,6 @@ class ShapeWatch:
             may have changed; None where that is improbable, or known: then by what the body is off within its tolerance,
             where that displaces poses by more than their sigma.
         found: what the newest test found for certain.
-        said: what was found last.
     """
 
     def __init__(
@@ -199,8 +197,7 @@ class ShapeWatch:
     ) -> None:
         K, n = size, len(names)
         self._size, self._first, self._names = K, first, names
-        # (K, 2 + 3 N) what a unit of each candidate changes: focal lengths against each other, together, each
-        # coordinate.
+        # (K, 2 + 3 N) what a unit of each candidate changes: focal lengths against each other, together, coordinates.
         self._by_candidate = np.zeros((K, 2 + 3 * n))
         self._by_candidate[:, :2] = focal
         self._by_candidate[first : first + 3 * n, 2:] = np.eye(3 * n)

@@ -40,8 +40,8 @@ DEPTHS_M = (0.5, 1.0, 2.0)
 LEAST_STAYS, MOST_SIGMA_RAD = 8, float(np.radians(0.02))
 #: The cameras may have moved so far across the baseline (2), m, and about their axes (3), rad: the prior.
 _FREED = np.array([0.01, 0.01, *np.radians([2.0, 2.0, 2.0])])
-#: Standard deviations of a detection by which detections are gated, step by step of the fit, px: loosely while the rig is
-#: wrong, at the end by that of the rig (0). And the one that the fit starts with, before the residuals give it.
+#: Standard deviations by which detections are gated, step by step, px (0: the rig's); and the one that the fit starts
+#: with.
 _GATES_PX, _NOISE_PX = (20.0, 2.0, 0.0, 0.0), 0.1
 #: A rotation about the baseline's normal hardly changes epipolar distances: chance makes them so many times larger at most.
 _WORSE = 1.2
@@ -56,13 +56,11 @@ class RigUpdate(Record):
     """A rig whose relative pose was estimated again.
 
     Attributes:
-        rig: the new rig.
         rotation_rad: rotation of the right camera against the old rig.
         sigma_rad: standard deviation of the rotation about its worst axis.
         shift_m: distance of the right camera from where the old rig has it, across the baseline.
         depth_errors_m: error of the depth that the old rig measures on the left camera's axis at DEPTHS_M.
         epipolar_px: RMS distance of the detections from their epipolar lines (Sampson), before and after.
-        shots: number of shots that were used.
         stays: how many of them differ from one another.
         sigma_m: standard deviation of the body's position with the new rig, and what it would be with the calibration's, m.
     """

@@ -243,8 +243,7 @@ def joint_noise(model: Model, solution: Solution, prior: Array, measured: Measur
 def with_joint_noise(model: Model, x: Array, measured: Measured, sigma_rad: Array) -> Measured:
     """Return the poses with the joints' scatter added to their covariance.
 
-    Added, too, is the uncertainty on which side of its backlash a joint lies where gravity and friction are about as
-    strong.
+    Also the uncertainty on which side of its backlash a joint lies where gravity and friction are about as strong.
     """
     if measured.cov is None:
         return measured

@@ -103,9 +103,6 @@ def gravity_shows(
 
     ``sensor``: calibrated; its ``cov`` says how far it may be off. ``q``: (N, n) readings of the joints at the rests,
     rad. ``prior``: how far the arm may be off.
-
-    Raises:
-        InputError: too few rests.
     """
     if len(q) < LEAST_RESTS:
         raise InputError(

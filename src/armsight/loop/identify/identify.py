@@ -251,8 +251,6 @@ def identify(
 def begun(arm: Arm, measured: Measured) -> tuple[Model, Array, Array]:
     """Return the model, the vector (P,) of the nominal arm with base and tool estimated, and prior sigmas (P,).
 
-    The choice of the next poses starts from this.
-
     Raises:
         InputError: too few poses, or data that cannot be of this arm.
         CalibrationError: poses so alike that not even base and tool are observable.

@@ -72,9 +72,6 @@ def require_plausible(
     ``arm``: the model, where the robot's poses come from joints. ``detect_units``: whether lengths in another unit are
     converted, with a note, in place of an error. ``scale``: whether the target's size is fitted, and may be anything.
     ``streams``: whether the rows are of streams whose clocks agree roughly only: they are not shifted then.
-
-    Raises:
-        InputError: what is likely wrong, and what to do.
     """
     p, path = recording.poses, recording.robot.path
     given = misfit(p, scale=scale)
@@ -113,11 +110,7 @@ def require_plausible(
 
 
 def require_mounting(p: Poses) -> None:
-    """Reject poses that fit far better with the other mounting of the eye, as Python's callers give them.
-
-    Raises:
-        InputError: they do; or one of both lists holds inverse transforms.
-    """
+    """Reject poses that fit far better with the other mounting of the eye, as Python's callers give them."""
     given, (was, other) = misfit(p), ("in_hand", "to_hand") if p.in_hand else ("to_hand", "in_hand")
     if len(p.A) < COMMON or (given[0] < FITS_M and given[1] < PLAUSIBLE_M):
         return
@@ -146,10 +139,7 @@ def _some(n: int, most: int) -> Rows:
 
 
 def _determined(poses: Poses) -> bool:
-    """Return whether the flange rotates about two axes, as a calibration demands: closed forms say nothing otherwise.
-
-    Where the rotations of both sides contradict each other it is not the motion that is wrong.
-    """
+    """Return whether the flange rotates about two axes, as a calibration demands: closed forms say nothing otherwise."""
     part, e = _evaluated(poses)
     if not len(e):
         return True
@@ -414,16 +404,7 @@ _LEAST_M = 0.002  # lengths that differ by less are not exchanged, m
 
 
 def require_fitting(arm: Arm, q: Array, Ts_rig_body: Array) -> None:
-    """Reject a table with which no loop may be closed.
-
-    Args:
-        arm: as its table says it is.
-        q: (N, n) joint angles of the poses, rad.
-        Ts_rig_body: (N, 4, 4) measured poses of the body, m.
-
-    Raises:
-        CalibrationError: the poses contradict the table by far more than a cheap arm's errors.
-    """
+    """Reject a table with which no loop may be closed."""
 
     def off_by(arm: Arm, X: Array, Z: Array) -> tuple[float, float]:
         e = log_se3(inverse(Z @ Ts_rig_body) @ arm.forward(q) @ X)
@@ -480,8 +461,7 @@ def _mistakes(arm: Arm) -> Iterator[tuple[str, Arm]]:
             yield f"{names[i]} and {names[k]} are exchanged", replace(arm, a=a, d=d)
 
 
-#: Worse than this part of the space that the points span (RMS about their middle), and this many m, is another arm: a cheap
-#: one is off by 10 to 15 mm.
+#: Worse than this part of the points' spread (RMS), and this many m, is another arm: a cheap one is off by 10 to 15 mm.
 BAD_SHARE, BAD_M = 0.08, 0.015
 #: Only what fits this many times better is preferred to something simpler: by chance a wrong sign does at 3.4 sigma.
 CLEAR = 2.0
@@ -674,10 +654,7 @@ def _span(p: Array) -> float:
 
 
 def _search(arm: Arm, q: Array, p: Array, limit: float) -> list[Mistakes]:
-    """Return what fits within a limit, and as well as anything does, fewest mistakes first.
-
-    Signs in the given order and every order with the given signs are tried, then both together where neither fits.
-    """
+    """Return what fits within a limit, and as well as anything does, fewest mistakes first."""
     few = np.linspace(0, len(q) - 1, min(FEW, len(q))).astype(int)
     given = tuple(range(arm.joints))
     signs = list(itertools.product((1, -1), repeat=arm.joints))

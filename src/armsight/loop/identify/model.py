@@ -94,8 +94,8 @@ def _rotate(R: Array, k: int, angle: Array) -> None:
 WAVES, RIPPLES, FAST = (1, 2), (3, 4, 5, 6, 7, 8), (9, 10, 11, 12)
 #: With fewer measured numbers than this the model has no ripples: chance alone would determine their one prior.
 ENOUGH = 100
-#: With so many measured numbers per parameter each harmonic and load is selected by itself, whatever its prior. The
-#: fastest are then left out: selected one by one, no prior would bound them where the arm was not measured.
+#: With so many numbers per parameter each harmonic and load is selected by itself; the fastest, without a bound, are
+#: left out.
 PLENTY = 10
 #: A bearing's friction holds a link inside its backlash up to about this lever, m; over half of it the backlash closes.
 FRICTION_M = 2e-3
@@ -246,8 +246,8 @@ class Model(Record):
     #: (3, 3) rotation of the body in the last frame that the tool's start from, with full poses
     R_tool: Array = field(default_factory=lambda: np.eye(3))
     up_base: Array = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))  #: (3,) unit vector against gravity, base
-    #: (n, 2) least and greatest reading of each joint in the poses fitted, rad, beyond which the sensors' curves fade;
-    #: None before the fit is done, and of an arm whose file does not say it
+    #: (n, 2) least and greatest reading of each joint in the poses fitted, rad, beyond which curves fade; None if
+    #: unknown
     q_seen: Array | None = None
     fade_rad: float = FADE_RAD  #: how far beyond them the curves have faded, rad
 
@@ -324,10 +324,7 @@ class Model(Record):
         return T
 
     def rotations(self, x: Array) -> list[tuple[int, Array, float]]:
-        """Return where the small rotations of base and body begin, their rotation vectors (3,), and on which side they act.
-
-        The side is 1 where a small rotation comes before the other (base), -1 where it comes after it (body).
-        """
+        """Return where the small rotations of base and body begin, their vectors (3,), and the side, 1 before, -1 after."""
         found = [(3, log_so3(self.T_rig_base(x)[:3, :3]), 1.0)]
         return [*found, (self.table_at - 3, log_so3(self.T_6_body(x)[:3, :3]), -1.0)] if self.full else found
 

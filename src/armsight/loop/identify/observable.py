@@ -37,8 +37,8 @@ class Observed(NamedTuple):
     """What can be fitted."""
 
     free: Mask  #: (P,) whether a parameter is observable
-    #: (P,) what may be off though not all of it is observable: ``free``, what moves the tool too little, and error
-    #: sources that are tied to others, which only their priors distinguish
+    #: (P,) what may be off though not all of it is observable: ``free``, what moves the tool too little, and tied
+    #: sources
     possible: Mask
     reasons: dict[str, str]  #: name -> why it is not observable, or with what its value is shared
     #: of the Jacobian of the free parameters, each column in units of a prior sigma (base and tool: 1 m, 1 rad)

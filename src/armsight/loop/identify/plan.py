@@ -35,7 +35,6 @@ from armsight.robot.kinematics.arm import Arm
 from armsight.vision.rig import StereoRig
 
 #: Returns the whitened Jacobians (N, M, F) of poses q (N, J) approached from sides (N, J), and which of them are allowed.
-#: Those of poses that are not allowed do not count, except the first.
 Information = Callable[[Array, Array], tuple[Array, Mask]]
 _BATCH = 250  # candidates compared at once: bounds the memory
 #: Levels that a joint is tried at, from both sides; most sweeps over all poses; least relative gain of a sweep to go on.
@@ -140,18 +139,14 @@ UNKNOWN = 0.1  # prior sigma of base and tool, m and rad, which have none in a f
 ROOM_RAD = 0.03  # poses keep this far from the joints' limits, rad: a joint must have room to come from either side
 #: A prior sigma of an error source says how large it may be (a data sheet's limit); it mostly is this part of it.
 TYPICAL_SHARE = 1 / 3
-#: Joints scatter by about this much from pose to pose, rad (0.1 mm at 1 m): friction, a sensor's noise. Without it an
-#: instrument of 0.03 mm would seem to learn everything from a few poses.
+#: Joints scatter by so much from pose to pose, rad (0.1 mm at 1 m): else 0.03 mm would teach everything.
 CHANCE_RAD = 1e-4
-#: Assumed of an instrument of which nothing is known, and beyond the cameras' covariance: sigma of a position, m, and of a
-#: rotation, rad.
+#: Assumed of an unknown instrument, and beyond the cameras' covariance: sigma of a position, m, and of a rotation, rad.
 NOISE, BESIDES = (1e-4, 5e-4), (1e-6, 1e-6)
-#: A body in the cameras: RMS distance of its markers from their middle, m, how many there are, and the sigma of each in an
-#: image, px. Half the distance: its rotation is known half as well.
+#: A body in the cameras: RMS distance of its markers from their middle, m, their count, and the sigma of each, px.
 SPREAD_M, MARKERS, SIGMA_PX = 0.04, 6, 0.1
 MARGIN_PX = 60.0  # a pose is seen where its body is this far from the images' edges, px
-#: Markers are on one side of a body: it is taken to be visible up to the rotation at which it was seen already, and this
-#: much more, rad.
+#: A body is taken to be visible up to the rotation at which it was seen already, and this much more, rad.
 MORE_RAD = np.radians(10.0)
 
 
@@ -247,8 +242,8 @@ class _Scene(Record):
     noise: tuple[float, float]  #: sigmas of position, m, and rotation, rad, beyond what the rig's geometry gives
     floor_m: float  #: how far above the base's plane the links must stay, m
     rig: StereoRig | None  #: the cameras; None: everything is seen
-    #: (2, 3) unit vectors in the body's axes from which each camera saw it on the whole, and (2,) the largest rotation
-    #: from them, rad; None where its rotation is not measured
+    #: (2, 3) unit vectors, body's axes, from which each camera saw it, and (2,) the largest rotation from them, rad, or
+    #: None
     sides: tuple[Array, Array] | None = None
 
     @staticmethod
@@ -379,8 +374,7 @@ def free_of_collision(model: Model, q: Array, floor_m: float = FLOOR_M) -> Mask:
     return out
 
 
-#: Candidates for a mounting: largest rotation from a pose it had, rad, how much larger its space may become, and
-#: its margin in the image, a tangent.
+#: Candidates for a mounting: largest rotation from a pose it had, rad, its larger space, its image's margin, a tangent.
 POSES, NEAR_RAD, WIDER, BESIDE = 1500, np.radians(25), 0.2, 0.02
 
 

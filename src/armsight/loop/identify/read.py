@@ -37,8 +37,8 @@ COLUMNS = (
     *_COV,
     *(f"approach{i}" for i in range(1, MOST_JOINTS + 1)),
 )
-#: Joined by time, a shot counts where no joint reads further from its angle than this, rad, so long before and after, s: an
-#: offset of the clocks would be taken for an error of a moving arm.
+#: Joined by time, a shot counts where no joint reads further from its angle than this, rad, so long before and after,
+#: s.
 REST_RAD, REST_S = 3e-3, 0.2
 
 

@@ -147,10 +147,7 @@ def identify_held_out(
 
 
 def _check_other(arm: Arm, measured: Measured, other: Measured) -> None:
-    """Reject poses to validate with that cannot be of the arm, before anything is fitted.
-
-    Fewer than MIN_POSES are evaluated in the set-up of ``measured``.
-    """
+    """Reject poses to validate with that cannot be of the arm, before anything is fitted."""
     require_alike(other, measured.points, measured.R_rig_body is not None)
     if len(other) >= MIN_POSES:
         try:

@@ -42,9 +42,6 @@ def handeye_poses(arm: Arm, around: Array, count: int, seed: int) -> Array:
     """Sample joint angles (count, n), rad, that show the body from many sides, near given ones (M, n) that have it in view.
 
     They are in the order of a short way: from the first of ``around`` always on to the nearest.
-
-    Raises:
-        InputError: the arm reaches too few such poses.
     """
     rng = np.random.default_rng([seed, 20])
     found: list[Array] = []
@@ -75,8 +72,7 @@ class HandEyeRun(Record):
     """The result of the hand-eye motions."""
 
     #: poses of cameras and body on the arm. They define the base and the tool frame of the run: the geometry of a real arm
-    #: defines its base only to within its own errors. So their covariance is zero here; how well the arm agrees with them
-    #: is in ``found``.
+    #: defines its base only to within its errors. So their covariance is zero; how well the arm agrees is in ``found``.
     mounting: Mounting
     found: HandEye  #: the hand-eye calibration
     q: Array  #: (N, n) potentiometer readings at rest at each pose that was used, rad
@@ -171,10 +167,7 @@ def handeye_of(arm: Arm, visited: Sequence[VisitedPose], missed: tuple[str, ...]
 
 
 def find_delay(loop: Loop, q_start: Array, q_middle: Array) -> Delay:
-    """Sweep the joints about a pose (n,), rad, where the arm then stands; estimate the images' delay and the shutters.
-
-    The loop's mounting is known; its shutters and its delay are set.
-    """
+    """Sweep the joints about a pose (n,), rad, where the arm then stands; estimate the images' delay and the shutters."""
     arm, log = loop.setup.arm, loop.log
     way = point_to_point(arm, q_start, q_middle)
     loop.go(way, DELAY_REST_S, RunSegment("calibration", "sweep's start", "joints"), watch=False)

@@ -187,8 +187,7 @@ class Loop:
         self._fixed_work: Future[None] | None = None
         self._fixed_s = self._health_s = -np.inf
         self._health_notes = HealthNotes()
-        # Of the fused track: up to when intervals are noted, and computed; those noted alone; readings that are not
-        # noted.
+        # Of the fused track: up to when intervals are noted, and computed; those noted alone; readings not noted.
         self._noted_s = self._written_s = -np.inf
         self._noted: list[Interval] = []
         self._read = deque[Array]()
@@ -585,11 +584,7 @@ class Loop:
             self._led_work = self._fixed_pool.submit(work)
 
     def find_led(self) -> None:
-        """Hold the arm until the sync LED was found by both cameras, where there is to be one.
-
-        Raises:
-            ArmsightError: it was not found; the message says why.
-        """
+        """Hold the arm until the sync LED was found by both cameras, where there is to be one."""
         led, begin_s = self.led, self.t_s
         if led is None:
             return

@@ -104,8 +104,8 @@ class HostClock:
         return replace(shot, t_s=t_s - self.offset_s)
 
 
-#: Residuals over their sigma below which a unit agrees (as links count as loose, 1/3 is usual), and the share of outliers;
-#: half: chance is a fault, double: a loose mount agrees.
+#: Residuals over their sigma below which a unit agrees (1/3 is usual), and outliers' share; half: chance is a fault,
+#: double: a loose mount agrees.
 HONEST, OUTLIERS = 1.0, 0.01
 #: Sigmas of its calibration from which on a parameter that is found off is said; half: chance is, double: 2 ms are not.
 OFF = 5.0
@@ -299,8 +299,7 @@ class Setup:
     gravity: Callable[[Array], Array]
     rate_hz: float  #: rate of the cameras, Hz
     sync_s: float  #: standard deviation of the time between the two exposures of a shot, s
-    #: converts times of the computer, which stamps the shots, to the board's; None in lock-step simulation, where shots are
-    #: on the board's clock and time passes only in ``board.receive``.
+    #: converts the computer's times, which stamp the shots, to the board's; None in lock-step simulation
     clock: HostClock | None = None
     fixed: tuple[Target, ...] = ()  #: bodies in view that do not move
     #: how long each bit of the sync LED's code lasts, s; None where no LED is to be looked for.
