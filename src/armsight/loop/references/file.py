@@ -17,6 +17,7 @@ from __future__ import annotations
 import json
 import os
 import tomllib
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -39,9 +40,11 @@ _KEYS = ("kind", "source", "live", "class", "rate_hz", "delay_s", "sigma_delay_s
 INERTIAL_COLUMNS = tuple(
     f"{sensor}_{axis}_{unit}" for sensor, unit in (("gyro", "rad_s"), ("accelerometer", "m_s2")) for axis in "xyz"
 )
+FIELD_COLUMNS = ("field_x_t", "field_y_t", "field_z_t")  # of a magnetometer's, T
 _MOST_MB = 200  # of a recording
-#: Numbers at the end of a ``sensor_msgs/Imu``, each with its covariance (9), and where among them a reading stands.
-_IMU_BYTES, _IMU_VALUES = 37 * 8, np.r_[13:16, 25:28]
+#: ROS's messages: columns of a table with the same, bytes of the numbers at the end, where among them a reading stands.
+IMU, FIELD = "sensor_msgs/Imu", "sensor_msgs/MagneticField"
+_MESSAGES = {IMU: (INERTIAL_COLUMNS, 37 * 8, np.r_[13:16, 25:28]), FIELD: (FIELD_COLUMNS, 12 * 8, np.r_[0:3])}
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,38 +141,40 @@ def written(entry: Entry, folder: Path) -> str:
     return "\n".join([*lines, f"covariance = [\n{rows}\n]"]) + "\n"
 
 
-def read_recording(path: Path) -> tuple[Array, Array]:
-    """Return times (N,), s, and values (N, 6) of an inertial unit: rad/s, then m/s2."""
+def read_recording(path: Path, kind: str = IMU) -> tuple[Array, Array]:
+    """Return times (N,), s, and values of a recording: of an IMU (N, 6), rad/s and m/s2, of a FIELD (N, 3), T."""
     if path.is_dir() or path.suffix.lower() in SUFFIXES:
-        return _of_bag(Bag(path))
-    columns = Columns.of_csv(path) if path.suffix.lower() not in (".jsonl", ".ndjson") else _json_lines(path)
-    return columns.numbers(["t_s"])[:, 0], columns.numbers(INERTIAL_COLUMNS)
+        return _of_bag(Bag(path), kind)
+    names = _MESSAGES[kind][0]
+    columns = Columns.of_csv(path) if path.suffix.lower() not in (".jsonl", ".ndjson") else _json_lines(path, names)
+    return columns.numbers(["t_s"])[:, 0], columns.numbers(names)
 
 
-def _of_bag(bag: Bag) -> tuple[Array, Array]:
-    """Return the readings of a recording of ROS, or of a run.mcap: of its one topic of ``sensor_msgs/Imu``."""
-    topics = [topic.name for topic in bag.of_kind("sensor_msgs/Imu")]
+def _of_bag(bag: Bag, kind: str) -> tuple[Array, Array]:
+    """Return the readings of a recording of ROS, or of a run.mcap: of its one topic of a kind."""
+    topics = [topic.name for topic in bag.of_kind(kind)]
     if len(topics) != 1:
         listed = ", ".join(topics) or bag.holds()
-        raise InputError(f"{bag.path}: expected one topic of sensor_msgs/Imu; there are {len(topics)}: {listed}")
-    found = [reading_of(message) for message in bag.messages(topics)]
+        raise InputError(f"{bag.path}: expected one topic of {kind}; there are {len(topics)}: {listed}")
+    found = [reading_of(message, kind) for message in bag.messages(topics)]
     return np.array([t for t, _ in found]), np.array([z for _, z in found])
 
 
-def reading_of(message: BagMessage) -> tuple[float, Array]:
-    """Return the time, s, and the reading (6,), rad/s and m/s2, of a message of ``sensor_msgs/Imu``."""
+def reading_of(message: BagMessage, kind: str = IMU) -> tuple[float, Array]:
+    """Return the time, s, and the reading of a message: (6,), rad/s and m/s2, or of a field (3,), T."""
+    _, size, rows = _MESSAGES[kind]
     stamp = message.stamp_ns() or message.arrival_ns
-    if len(message.data) < _IMU_BYTES:
+    if len(message.data) < size:
         raise InputError(f"{message.topic}: message {message.index + 1} is cut short: {len(message.data)} bytes")
     order = ">" if message.encoding == "cdr" and not message.data[1] & 1 else "<"
-    values = np.frombuffer(message.data[-_IMU_BYTES:], f"{order}f8").astype(float)
-    return stamp / S_NS, values[_IMU_VALUES]
+    values = np.frombuffer(message.data[-size:], f"{order}f8").astype(float)
+    return stamp / S_NS, values[rows]
 
 
-def _json_lines(path: Path) -> Columns:
+def _json_lines(path: Path, names: Sequence[str]) -> Columns:
     """Return the columns of a file of one JSON object a line."""
     rows = list[tuple[int, list[str]]]()
-    head = ["t_s", *INERTIAL_COLUMNS]
+    head = ["t_s", *names]
     for line, text in enumerate(read_text(path, _MOST_MB).splitlines(), 1):
         if not text.strip():
             continue

@@ -1,0 +1,172 @@
+"""A magnetometer on the tool: a witness of joint 1's zero, and of a base that was rotated.
+
+With R the sensor's attitude in the base and m the field there, it reads z = S R^T m + b: S is the soft iron, symmetric, b
+the hard iron, both of what rotates with the sensor. The field of a motor is in neither. Along m's horizontal part, and
+upwards, it shows, as a rotation about the vertical changes nothing there; what shows there is as large across, on average,
+where it is taken for a heading.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+from scipy.linalg import polar
+
+from armsight.data import Array, Record
+from armsight.errors import InputError
+from armsight.geometry.rotation import exp_so3, log_so3, skew
+from armsight.loop.references.reference import ExpectedReading, Reading, Reference, ToolMotion
+
+#: The Earth's field, T, is 22e-6 to 67e-6 (IGRF); half, double: the soft iron is as much too small, no heading differs.
+EARTH_T = 45e-6
+#: One sigma before a calibration: soft iron, relative; hard iron and field, T; half, double: nothing.
+_SOFT, _HARD_T, _FIELD_T = 0.3, 200e-6, 30e-6
+#: Attitudes for 10 unknowns a row at least; singular value, last over first, below which they do not span the space.
+_ATTITUDES, _SPANS = 12, 1e-2
+#: Symmetric matrices: the rows and columns of their upper triangle, and the matrix (6, 3, 3) of each of its numbers.
+_UPPER = np.triu_indices(3)
+_SYMMETRIC = np.array([np.eye(3)[[i]].T * np.eye(3)[j] for i, j in zip(*_UPPER, strict=True)])
+_SYMMETRIC = np.maximum(_SYMMETRIC, _SYMMETRIC.transpose(0, 2, 1))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Heading(Reference):
+    """A magnetometer.
+
+    Attributes:
+        R_tool_sensor: (3, 3) its mounting.
+        soft: (3, 3) soft iron and scale, symmetric.
+        hard_t: (3,) hard iron, T.
+        field_t: (3,) the field in the base, T.
+    """
+
+    R_tool_sensor: Array
+    soft: Array
+    hard_t: Array
+    field_t: Array
+
+    @staticmethod
+    def of(name: str) -> Heading:
+        """Return one of which nothing is known."""
+        cov = np.diag(np.repeat([np.pi, _SOFT, _HARD_T, _FIELD_T], [3, 6, 3, 3]) ** 2)
+        given = {
+            "R_tool_sensor": np.eye(3),
+            "soft": np.eye(3),
+            "hard_t": np.zeros(3),
+            "field_t": EARTH_T * np.eye(3)[0],
+        }
+        return Heading(name=name, cov=cov, sigma_delay_s=0.02, **given)
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """The field."""
+        return ("field",)
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """Rotation vector of the mounting, soft iron, hard iron and field."""
+        names = [f"rotation_{a}_rad" for a in "xyz"]
+        names += [f"soft_{'xyz'[i]}{'xyz'[j]}" for i, j in zip(*_UPPER, strict=True)]
+        names += [f"{what}_{a}_t" for what in ("hard", "field") for a in "xyz"]
+        values = [*log_so3(self.R_tool_sensor[None])[0], *self.soft[_UPPER], *self.hard_t, *self.field_t]
+        return dict(zip(names, map(float, values), strict=True))
+
+    def expected(self, motion: ToolMotion, channel: int) -> ExpectedReading:
+        """Return the field (3,), T, as the sensor reads it."""
+        to_sensor = self.soft @ self.R_tool_sensor.T
+        in_tool = motion.T_base_tool[:3, :3].T @ self.field_t
+        f = self.R_tool_sensor.T @ in_tool
+        by_soft, by_field = (_SYMMETRIC @ f).T, to_sensor @ motion.T_base_tool[:3, :3].T
+        by = np.hstack([self.soft @ skew(f), by_soft, np.eye(3), by_field])
+        by_tool = np.hstack([np.zeros((3, 3)), to_sensor @ skew(in_tool)])
+        return ExpectedReading(self.soft @ f + self.hard_t, by_tool, by)
+
+    def moved(self, step: Array) -> Self:
+        """Return it with a mounting rotated on the right by ``step[:3]``, the other parameters added."""
+        rotation, soft, hard, field = np.split(step, [3, 9, 12])
+        return replace(
+            self,
+            R_tool_sensor=self.R_tool_sensor @ exp_so3(rotation),
+            soft=self.soft + np.tensordot(soft, _SYMMETRIC, 1),
+            hard_t=self.hard_t + hard,
+            field_t=self.field_t + field,
+        )
+
+    def begun(self, readings: Sequence[Reading], motion: Callable[[float], ToolMotion]) -> Self:
+        """Return it with parameters near the truth, in closed form, for ``calibrate``.
+
+        z = A R^T m + b is linear in the products of A and m, which one singular value makes two of again; A is soft iron
+        times rotation.
+
+        Raises:
+            InputError: too few attitudes, or all about one axis.
+        """
+        if len(readings) < _ATTITUDES:
+            raise InputError(f"{self.name}: {len(readings)} attitudes; {_ATTITUDES} at least are needed")
+        R = np.array([motion(each.t_s - self.delay_s).T_base_tool[:3, :3] for each in readings])
+        z, by = np.array([each.z for each in readings]), R.transpose(0, 2, 1).reshape(-1, 9)
+        spread = np.linalg.svd(by - by.mean(axis=0), compute_uv=False)
+        if spread[-1] < _SPANS * spread[0]:
+            raise InputError(f"{self.name}: the tool rotates about one axis alone: give it attitudes about two axes")
+        found = np.linalg.lstsq(np.column_stack([by, np.ones(len(z))]), z, rcond=None)[0]
+        U, s, Vt = np.linalg.svd(found[:9].T.reshape(9, 3))
+        A, m = U[:, 0].reshape(3, 3), s[0] * Vt[0]
+        sign = np.sign(np.linalg.det(A))
+        size = np.linalg.norm(m) / EARTH_T
+        rotation, soft = polar(sign * size * A, side="left")
+        return replace(self, R_tool_sensor=rotation.T, soft=soft, hard_t=found[9], field_t=sign * m / size)
+
+
+@dataclass(frozen=True, eq=False)
+class HeadingOff(Record):
+    """By how much the field says that the arm's heading is off: joint 1's zero, or the base was rotated.
+
+    Attributes:
+        angle_rad: rotation of the base about its z since the calibration.
+        sigma_rad: its standard deviation, disturbances and calibration included.
+        disturbance_t: (N,) field of motors and iron at each reading, T, as far as it shows.
+    """
+
+    angle_rad: float
+    sigma_rad: float
+    disturbance_t: Array
+
+
+def heading_off(sensor: Heading, readings: Sequence[Reading], motion: Callable[[float], ToolMotion]) -> HeadingOff:
+    """Compare the heading of the arm with that of the field.
+
+    Args:
+        sensor: calibrated, as :func:`~armsight.loop.references.calibrate.calibrate` does it.
+        readings: at two attitudes or more; with drives as they are in use.
+        motion: returns where the arm believes its tool at a time, s.
+
+    Raises:
+        InputError: fewer than two readings, or a field so steep that it has no heading.
+    """
+    m = sensor.field_t
+    level = float(np.hypot(m[0], m[1]))
+    if len(readings) < 2 or level < 0.05 * np.linalg.norm(m):
+        raise InputError(f"{sensor.name}: expected two readings, and a field with a horizontal part")
+    angles, shown, noise, by = [], [], [], []
+    for each in readings:
+        at = motion(each.t_s - sensor.delay_s)
+        expected = sensor.expected(at, each.channel)
+        to_base = at.T_base_tool[:3, :3] @ sensor.R_tool_sensor @ np.linalg.inv(sensor.soft)
+        f = m + to_base @ (each.z - expected.z)
+        across = np.array([-m[1], m[0], 0.0]) @ to_base / level**2
+        angles.append(np.arctan2(m[0] * f[1] - m[1] * f[0], m[0] * f[0] + m[1] * f[1]))
+        shown.append([np.hypot(f[0], f[1]) - level, f[2] - m[2]])
+        noise.append(across @ each.cov @ across)
+        by.append(across @ expected.by_parameters)
+    squares = np.square(shown).mean(axis=1) / level**2
+    weights = 1.0 / (np.array(noise) + squares + np.median(squares))
+    weights /= weights.sum()
+    begin = float(np.angle(weights @ np.exp(1j * np.array(angles))))
+    apart = np.angle(np.exp(1j * (np.array(angles) - begin)))
+    angle, shared = float(weights @ apart), weights @ np.array(by)
+    scatter = (weights**2) @ np.maximum((apart - angle) ** 2, squares) * len(readings) / (len(readings) - 1)
+    sigma = float(np.sqrt(scatter + shared @ sensor.cov @ shared))
+    return HeadingOff(-(begin + angle), sigma, level * np.sqrt(squares))

@@ -1,0 +1,150 @@
+"""A magnetometer as a witness of the heading: motors disturb it, which its model does not know."""
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from armsight.errors import InputError
+from armsight.geometry.pose import pose
+from armsight.geometry.rotation import exp_so3, log_so3
+from armsight.loop.references.calibrate import calibrate
+from armsight.loop.references.file import FIELD as FIELD_MESSAGE
+from armsight.loop.references.file import read_recording
+from armsight.loop.references.heading import EARTH_T, Heading, heading_off
+from armsight.loop.references.reference import Reading, ToolMotion
+
+NOISE_T = 0.4e-6
+#: Central Europe: 20 uT north, 45 uT down; in a base that looks somewhere.
+FIELD = exp_so3(np.array([0.0, 0.0, 0.7])) @ np.array([20e-6, 0.0, -45e-6])
+
+
+def dipole(at, moment):
+    """The field (3,), T, of a dipole (3,), A m2, at the base's axis 0.3 m above it."""
+    apart = at - [0.0, 0.0, 0.3]
+    r = np.linalg.norm(apart)
+    return 1e-7 * (3 * apart * (apart @ moment) / r**2 - moment) / r**3
+
+
+def recorded(rng, sensor, count, rotated=0.0, motor=0.3):
+    """Return readings and poses: the base rotated about z, a motor with changing current near, rounded numbers."""
+    Ts, readings = [], []
+    back = exp_so3(np.array([0.0, 0.0, -rotated]))
+    for k in range(count):
+        R, p = exp_so3(rng.normal(0, 1.0, 3)), rng.uniform([-0.4, -0.4, 0.1], [0.4, 0.4, 0.6])
+        p[:2] += 0.15 * np.sign(p[:2])
+        field = back @ FIELD + dipole(p, motor * rng.normal(size=3))
+        z = sensor.soft @ (R @ sensor.R_tool_sensor).T @ field + sensor.hard_t + rng.normal(0, NOISE_T, 3)
+        Ts.append(pose(R, p))
+        readings.append(Reading(float(k), 0, np.round(z / 0.15e-6) * 0.15e-6, NOISE_T**2 * np.eye(3)))
+    return readings, lambda t: ToolMotion(Ts[int(t)])
+
+
+def some(rng):
+    """A sensor mounted anyhow, near iron."""
+    A = rng.normal(0, 0.05, (3, 3))
+    soft = np.eye(3) + (A + A.T) / 2
+    mounting = exp_so3(rng.normal(0, 1.5, 3))
+    return Heading(
+        name="m",
+        cov=np.zeros((15, 15)),
+        R_tool_sensor=mounting,
+        soft=soft,
+        hard_t=rng.normal(0, 60e-6, 3),
+        field_t=FIELD,
+    )
+
+
+def calibrated(rng, sensor, count=60):
+    readings, motion = recorded(rng, sensor, count)
+    return calibrate(Heading.of("m").begun(readings, motion), readings, motion)
+
+
+def test_the_closed_form_finds_exact_readings():
+    rng = np.random.default_rng(3)
+    sensor = some(rng)
+    readings, motion = recorded(rng, sensor, 20, motor=0.0)
+    exact = [Reading(each.t_s, 0, sensor.expected(motion(each.t_s), 0).z, each.cov) for each in readings]
+    found = Heading.of("m").begun(exact, motion)
+    assert np.linalg.norm(log_so3((found.R_tool_sensor.T @ sensor.R_tool_sensor)[None])) < 1e-7
+    scale = np.linalg.norm(FIELD) / EARTH_T  # length of the field and size of the soft iron cannot be told apart
+    np.testing.assert_allclose(found.soft, sensor.soft * scale, atol=1e-9)
+    np.testing.assert_allclose(found.hard_t, sensor.hard_t, atol=1e-12)
+
+
+def test_derivatives():
+    rng = np.random.default_rng(4)
+    sensor, T = some(rng), pose(exp_so3(rng.normal(size=3)), rng.normal(size=3))
+    at = sensor.expected(ToolMotion(T), 0)
+    for k in range(15):
+        step = np.zeros(15)
+        step[k] = 1e-6
+        ahead, behind = (sensor.moved(sign * step).expected(ToolMotion(T), 0).z for sign in (1, -1))
+        np.testing.assert_allclose(at.by_parameters[:, k], (ahead - behind) / 2e-6, atol=1e-9)
+    for k in range(3):
+        step = 1e-6 * np.eye(3)[k]
+        ahead, behind = (
+            sensor.expected(ToolMotion(pose(T[:3, :3] @ exp_so3(sign * step), T[:3, 3])), 0).z for sign in (1, -1)
+        )
+        np.testing.assert_allclose(at.by_tool[:, 3 + k], (ahead - behind) / 2e-6, atol=1e-10)
+
+
+def test_a_base_that_was_rotated_is_found_within_its_sigma_beside_motors():
+    off, sigmas = [], []
+    for seed in range(30):
+        rng = np.random.default_rng([7, seed])
+        sensor, rotated = some(rng), np.radians(rng.uniform(-20, 20))
+        found = heading_off(calibrated(rng, sensor).reference, *recorded(rng, sensor, 20, rotated))
+        off.append(found.angle_rad - rotated)
+        sigmas.append(found.sigma_rad)
+    low, high = chi2.ppf([1e-3, 1 - 1e-3], len(off))
+    assert low < np.sum(np.square(off) / np.square(sigmas)) < high
+    assert np.sqrt(np.mean(np.square(off))) < np.radians(2.0)  # what such a sensor is good for
+
+
+def test_readings_near_a_motor_show_its_field_and_sigma_grows_there():
+    rng = np.random.default_rng(11)
+    sensor = some(rng)
+    reference = calibrated(rng, sensor).reference
+    quiet, loud = (heading_off(reference, *recorded(rng, sensor, 20, motor=motor)) for motor in (0.0, 3.0))
+    assert np.median(loud.disturbance_t) > 5 * np.median(quiet.disturbance_t)
+    assert loud.sigma_rad > 2 * quiet.sigma_rad
+    assert abs(loud.angle_rad) < 3 * loud.sigma_rad
+
+
+def test_too_few_or_flat_attitudes_are_rejected():
+    rng = np.random.default_rng(5)
+    sensor = some(rng)
+    readings, motion = recorded(rng, sensor, 11)
+    with pytest.raises(InputError, match="11 attitudes; 12 at least"):
+        Heading.of("m").begun(readings, motion)
+    Ts = [pose(exp_so3(np.array([0, 0, 0.3 * k])), np.zeros(3)) for k in range(20)]
+    flat = [Reading(float(k), 0, sensor.expected(ToolMotion(T), 0).z, np.eye(3)) for k, T in enumerate(Ts)]
+    with pytest.raises(InputError, match="about one axis alone"):
+        Heading.of("m").begun(flat, lambda t: ToolMotion(Ts[int(t)]))
+    steep = Heading(**{**vars(sensor), "field_t": np.array([1e-7, 0, -45e-6])})
+    with pytest.raises(InputError, match="horizontal part"):
+        heading_off(steep, readings, motion)
+
+
+@pytest.mark.parametrize("ros1", [True, False])
+def test_a_bags_magnetic_field_is_read(tmp_path, ros1):
+    from rosbags.rosbag1 import Writer as Writer1
+    from rosbags.rosbag2 import StoragePlugin
+    from rosbags.rosbag2 import Writer as Writer2
+    from rosbags.typesys import Stores, get_typestore
+
+    store, kind = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE), "sensor_msgs/msg/MagneticField"
+    path = tmp_path / ("a.bag" if ros1 else "a")
+    writer = Writer1(path) if ros1 else Writer2(path, version=9, storage_plugin=StoragePlugin.MCAP)
+    types, given = store.types, np.array([[20e-6, -3e-6, 40e-6], [21e-6, 0.0, 41e-6]])
+    with writer:
+        connection = writer.add_connection("/imu/mag", kind, typestore=store)
+        for k, field in enumerate(given):
+            header = types["std_msgs/msg/Header"](
+                *([k] if ros1 else []), types["builtin_interfaces/msg/Time"](5, k), "imu"
+            )
+            message = types[kind](header, types["geometry_msgs/msg/Vector3"](*field), np.zeros(9))
+            writer.write(connection, 10**9, (store.serialize_ros1 if ros1 else store.serialize_cdr)(message, kind))
+    t_s, z = read_recording(path, FIELD_MESSAGE)
+    np.testing.assert_array_equal(z, given)
+    np.testing.assert_allclose(t_s, [5.0, 5.0 + 1e-9], rtol=0, atol=1e-12)
