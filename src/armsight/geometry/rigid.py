@@ -11,6 +11,17 @@ from armsight.errors import InputError
 from armsight.geometry.pose import pose
 from armsight.geometry.rotation import Array
 
+#: Points lie on one line where their second singular value is below this share of the first: the rotation of such a body
+#: about the line is unobservable. Half: badly determined poses pass, double: narrow bodies are rejected.
+COLLINEAR = 1e-3
+
+
+def collinear(points: Array) -> bool:
+    """Whether points (N, 3), N >= 3, lie on one line or at one position."""
+    centred = points - points.sum(axis=0) / len(points)
+    spread = np.linalg.eigvalsh(centred.T @ centred)
+    return bool(spread[1] <= COLLINEAR**2 * spread[2])
+
 
 def fit_rigid(p_b: Array, p_a: Array, weights: Array | None = None) -> Array:
     """Fit ``T_a_b`` with ``p_a ~ T_a_b @ p_b`` in weighted least squares.

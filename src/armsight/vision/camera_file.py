@@ -195,7 +195,7 @@ def _distortion(entry: Mapping[str, Any]) -> tuple[str, Array, list[str]]:
     elif "k1" in by_name:
         order = ("k1", "k2", "k3", "k4") if kind in FISHEYES else _PARAMETERS
         d = checked([by_name.get(n, 0.0) for n in order], (None,), "k1 k2 ..")
-        d = d if kind in FISHEYES else _shortest(d)
+        d = d if kind in FISHEYES else next(d[:n] for n in (4, 5, 8) if not d[n:].any())
     elif kind in ("none", "rectified"):
         d = np.zeros(0)
     else:
@@ -234,11 +234,6 @@ def _kind(entry: Mapping[str, Any]) -> str:
             "(Kannala-Brandt) and none: calibrate again with one of them"
         )
     return kind
-
-
-def _shortest(numbers: Array) -> Array:
-    """Return Brown's coefficients (8,) without those zeros at the end that a shorter model leaves out."""
-    return next(numbers[:n] for n in (4, 5, 8) if not numbers[n:].any())
 
 
 def brown(coefficients: Array) -> tuple[str, Array]:

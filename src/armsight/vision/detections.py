@@ -22,7 +22,7 @@ from armsight.tables.lengths import number
 
 COLUMNS = ("shot", "camera", "marker", "u_px", "v_px")
 #: How many lines with the same mistake are named before the rest is counted.
-_NAMED = 3
+NAMED = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,4 +128,4 @@ def _number(text: str, path: str | Path, line: int, column: str) -> float:
 
 def _some(names: tuple[str, ...]) -> str:
     """List a few names."""
-    return ", ".join(names[:_NAMED]) + (f" ... {names[-1]}" if len(names) > _NAMED else "")
+    return ", ".join(names[:NAMED]) + (f" ... {names[-1]}" if len(names) > NAMED else "")

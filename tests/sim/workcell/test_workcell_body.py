@@ -6,14 +6,14 @@ import numpy as np
 
 from armsight.geometry.pose import transform
 from armsight.sim.workcell.body import body_patterns, body_target, body_text
-from armsight.vision.markers.targets import load_body_toml
+from armsight.vision.markers.targets import open_target
 from cli_runs import run
 
 
 def test_the_file_is_the_target(tmp_path):
     path = tmp_path / "body.toml"
     path.write_text(body_text())
-    read, made = load_body_toml(path).discs, body_target().discs
+    read, made = open_target(path).discs, body_target().discs
     assert read.body.point_names == made.body.point_names
     assert np.abs(read.body.points - made.body.points).max() < 1e-12
     assert np.abs(read.normals - made.normals).max() < 1e-8

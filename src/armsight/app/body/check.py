@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import pdist
 
 from armsight.data import Array, Body, Ids, Record
+from armsight.geometry.rigid import collinear
 from armsight.geometry.rotation import skew
 from armsight.vision.discs.pairing import SIZE_TOLERANCE, UNMODELLED_PX, UNMODELLED_SHARE
 from armsight.vision.discs.symmetry import Symmetry, flat, other_side, symmetries
-from armsight.vision.markers.body_file import collinear
 from armsight.vision.markers.discs import DiscTarget
 from armsight.vision.markers.targets import Composite
 from armsight.vision.pose.predict import FACING, look_direction, pose_covariance, separation, view

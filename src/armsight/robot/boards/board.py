@@ -30,7 +30,7 @@ from armsight.robot.boards.configuration import (
     check_gains,
     check_pin,
 )
-from armsight.robot.boards.contract import Abilities
+from armsight.robot.boards.contract import STOPS, WRAP, Abilities
 from armsight.robot.boards.link import Link
 from armsight.robot.boards.reports import (
     BoardStatus,
@@ -51,9 +51,7 @@ _Answer = TypeVar("_Answer")
 _HELLOS = 20
 _STEPS = 5  # between one hello and the next
 _TELEMETRY_STEPS = 300  # the rarest message comes once a second at 9600 baud
-_WRAP = 1 << 32
 _LONGEST_TICKS = 10000
-_STOPS = 3  # an emergency stop goes out so many times: a disturbed byte must not swallow it
 _STORE_S = 3.0  # a flash memory takes its time
 _PART = 200  # bytes of a CONFIG_PART
 _FIELDS = CONFIG.fields
@@ -191,7 +189,7 @@ class Board:
 
     def _time_s(self, tick: int) -> float:
         """Return the time of a tick, s: ticks wrap, and messages of neighbouring ticks may come in any order."""
-        ahead = (tick - self._tick + _WRAP // 2) % _WRAP - _WRAP // 2
+        ahead = (tick - self._tick + WRAP // 2) % WRAP - WRAP // 2
         if self._started and ahead < -self._ticks_per_s:
             raise self._restarted()
         self._tick += ahead
@@ -265,7 +263,7 @@ class Board:
     def stop(self) -> None:
         """Stop in an emergency: the drives go off until ``Command.CLEAR_STOP``."""
         sequence = self._next()
-        for _ in range(_STOPS):
+        for _ in range(STOPS):
             self._say("stop", sequence)
 
     def set_gains(self, gains: Array, *, checked: bool = True) -> int:
@@ -284,7 +282,8 @@ class Board:
             status = self.status
             if status.rejected_sequence == sequence and status.rejected_count:
                 raise DeviceError(f"{self.name} rejected the command: {status.rejection.text}")
-            if status.acknowledged_count and not _older(status.acknowledged_sequence, sequence):
+            # Numbers wrap: what is not older than this one.
+            if status.acknowledged_count and (status.acknowledged_sequence - sequence) % WRAP < WRAP // 2:
                 return
         raise DeviceError(
             f"{self.name} did not say within {wait_s:g} s whether it acknowledged; it is {self.status.state.name}"
@@ -370,7 +369,7 @@ class Board:
 
     def _next(self) -> int:
         """Return the number of the next command."""
-        self._sequence = (self._sequence + 1) % _WRAP
+        self._sequence = (self._sequence + 1) % WRAP
         return self._sequence
 
 
@@ -405,8 +404,3 @@ def _six(name: str, values: Array) -> list[float]:
         joint = int(np.argmin(np.isfinite(numbers)))
         raise InputError(f"{name} of joint {joint + 1} is {numbers[joint]}; it must be finite")
     return six
-
-
-def _older(sequence: int, other: int) -> bool:
-    """Return whether a number is older than another; they wrap."""
-    return (sequence - other) % _WRAP >= _WRAP // 2

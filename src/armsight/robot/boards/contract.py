@@ -20,6 +20,10 @@ from armsight.robot.boards.codes import BoardState, Command, Limited
 from armsight.robot.boards.reports import BoardStatus, JointFault, JointReport, Welcome
 from armsight.robot.kinematics.arm import Arm
 
+WRAP = 1 << 32  # ticks and numbers of commands count modulo this
+#: What stops an arm goes out so many times: a disturbed byte must not swallow it; half: one may, double: longer to send.
+STOPS = 3
+
 
 @dataclass(frozen=True)
 class Abilities:

@@ -14,6 +14,7 @@ import numpy as np
 
 from armsight.data import Array
 from armsight.errors import DeviceError, InputError
+from armsight.robot.boards.contract import WRAP
 from armsight.robot.boards.frames import (
     ANSWER,
     ANSWER_FIELDS,
@@ -31,7 +32,6 @@ from armsight.robot.boards.frames import (
 from armsight.robot.boards.link import TICK_S, Emulator, Plant
 
 _BITS_PER_BYTE = 10
-_WRAP = 1 << 32
 _FLOAT = np.dtype("<f4")
 
 
@@ -162,7 +162,7 @@ class EmulatedLink:
         request = REQUEST_FIELDS.pack(
             REQUEST_MAGIC,
             VERSION,
-            self._ticks % _WRAP,
+            self._ticks % WRAP,
             self._restart,
             self._overrun,
             bool(sensed.stop_pressed),
@@ -180,7 +180,7 @@ class EmulatedLink:
         reply = self._emulator.tick(self._request())
         fields = ANSWER_FIELDS.unpack_from(reply) if len(reply) == ANSWER.itemsize else (0,) * 8
         magic, version, tick, drives_on, shorted, brakes_open, led, length = fields
-        if magic != ANSWER_MAGIC or version != VERSION or tick != self._ticks % _WRAP:
+        if magic != ANSWER_MAGIC or version != VERSION or tick != self._ticks % WRAP:
             raise DeviceError(
                 f"the emulated board did not answer tick {self._ticks} with a frame of version {VERSION}: its image and"
                 " this armsight do not belong together; build it anew with `armsight board build`"

@@ -94,7 +94,7 @@ class WorkshopPlant:
             counts[joint] = self.encoded.reading(joint) if self.encoded else 0
         current = (sensed.current_ma * np.array(wiring.motor_signs))[list(wiring.motors)]
         current[list(wiring.dead_motors)] = 0
-        return replace_sensed(sensed, counts, current)
+        return sensed._replace(counts=counts.astype(np.uint32), current_ma=current.astype(np.int32))
 
     def step(self, duty: Array, awake: bool, braked: bool = False) -> None:
         """Let 1 ms pass with these duties (6,)."""
@@ -138,11 +138,6 @@ class WorkshopPlant:
     def arrived(self) -> bool:
         """Whether the hand has its joint where it brings it."""
         return self.hold is not None and abs(self._felt(self.hold[0]) - self.hold[1]) < 0.02 + _PROTRACTOR_RAD
-
-
-def replace_sensed(sensed: Sensed, counts: Array, current_ma: Array) -> Sensed:
-    """Return other readings with the same supply and stop."""
-    return sensed._replace(counts=counts.astype(np.uint32), current_ma=current_ma.astype(np.int32))
 
 
 def drawn_wiring(seed: int) -> Wiring:

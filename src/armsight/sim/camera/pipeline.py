@@ -25,7 +25,6 @@ from armsight.sim.camera.stages import (
     Jpeg,
     Lamp,
     Photosensor,
-    SpatialDenoise,
     TemporalDenoise,
     ToneCurve,
 )
@@ -200,7 +199,8 @@ class SimulatedCamera:
         """Return the file's image: luma (h, w) uint8 denoised, sharpened, resized, compressed; colour from ``ycrcb``."""
         stages = self.pipeline
         if stages.denoise is not None:
-            luma = _bilateral(luma, stages.denoise)
+            by = stages.denoise
+            luma = np.asarray(cv2.bilateralFilter(luma, by.diameter_px, by.sigma_grey, by.sigma_px))
         if stages.temporal_denoise is not None:
             y = luma.astype(np.float32)
             if self._previous is not None:
@@ -293,12 +293,6 @@ def disc_kernel(radius_px: float, parts: int = 32) -> Array:
     inside = np.add.outer(at**2, at**2) <= radius_px**2
     share = inside.reshape(n, parts, n, parts).mean(axis=(1, 3))
     return np.asarray(share / share.sum())
-
-
-def _bilateral(luma: Image, stage: SpatialDenoise) -> Image:
-    """Return a luma (h, w) uint8 without what of its noise is below the edges."""
-    filtered = cv2.bilateralFilter(luma, stage.diameter_px, stage.sigma_grey, stage.sigma_px)
-    return np.asarray(filtered)
 
 
 def _mix(y: Radiance, previous: Radiance, stage: TemporalDenoise) -> None:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from armsight.data import Array, Record
 from armsight.vision.calibrate.result import RejectedPair
+from armsight.vision.detections import NAMED
 from armsight.vision.pose.bundle import DAMPING, NEAR, BundleModel, BundleSolution, BundleState, Observations, minimise
 
 #: A corner this many standard deviations off the robust fit is gross: one in 10^7 for clean noise.
@@ -31,7 +32,6 @@ _ROUNDS = 6
 #: A step that lowers the cost by less than this share is a round's last; half and double: no detection changes sides.
 _ROUGHLY = 1e-4
 #: As many pairs of which corners were dropped have a line of their own.
-_NAMED = 3
 _DROPPED = "dropped as gross errors"
 _MEDIAN_CHI2_2 = 1.3863  # median of the chi-square distribution of two degrees of freedom
 
@@ -125,9 +125,9 @@ def screen(
 def merged_notes(notes: Sequence[str]) -> list[str]:
     """Return a calibration's notes with one for all pairs of which corners were dropped, where those are many."""
     dropped = {note: int(note.rpartition(": ")[2].split()[0]) for note in notes if note.endswith(_DROPPED)}
-    if len(dropped) <= _NAMED:
+    if len(dropped) <= NAMED:
         return list(notes)
-    worst = sorted(dropped, key=lambda note: -dropped[note])[:_NAMED]
+    worst = sorted(dropped, key=lambda note: -dropped[note])[:NAMED]
     most = ", ".join(f"{note.rpartition(': ')[0]} ({dropped[note]})" for note in worst)
     line = f"{sum(dropped.values())} points in {len(dropped)} pairs {_DROPPED}; most in {most}; all: --json, --report"
     return [*(note for note in notes if note not in dropped), line]

@@ -99,14 +99,6 @@ def check_sizes(left: Image, right: Image) -> None:
         raise InputError(f"the left image is {w}x{h} px and the right one {m}x{k}; both must be of one size")
 
 
-def check_search(search: Search, width: int) -> None:
-    """Reject a search whose greatest disparity is not within the image (InputError)."""
-    if search.last >= width:
-        raise InputError(
-            f"disparities up to {search.last} px are outside an image {width} px wide; the greatest must be below its width"
-        )
-
-
 def untextured(image: Image, side: str) -> str | None:
     """Return the reason why an image has nothing to match, or None."""
     smooth, surround = (cv2.GaussianBlur(image.astype(np.float32), (0, 0), sigma) for sigma in (1.5, 6.0))
@@ -139,7 +131,10 @@ def match_pair(
     """
     a, b = plain_grey(left, "left"), plain_grey(right, "right")
     check_sizes(a, b)
-    check_search(search, a.shape[1])
+    if search.last >= (width := a.shape[1]):
+        raise InputError(
+            f"disparities up to {search.last} px are outside an image {width} px wide; the greatest must be below its width"
+        )
     for image, side in zip((a, b), SIDES, strict=True):
         if (problem := untextured(image, side)) is not None:
             return Disparity.none((image.shape[0], image.shape[1]), search, problem)

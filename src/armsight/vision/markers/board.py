@@ -6,6 +6,7 @@ To add a kind of board: write one file with a class that fulfils :class:`Calibra
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from armsight.errors import InputError
@@ -23,8 +24,8 @@ from armsight.vision.markers.spec import Fields
 BOARDS: dict[str, tuple[str, Callable[[Fields], CalibrationBoard]]] = {
     "chessboard": (Chessboard.form, Chessboard.from_fields),
     "charuco": (Charuco.form, Charuco.from_fields),
-    "circles": (CircleGrid.form, CircleGrid.from_fields),
-    "acircles": (CircleGrid.staggered_form, CircleGrid.staggered_from_fields),
+    "circles": (CircleGrid.form, partial(CircleGrid.from_fields, staggered=False)),
+    "acircles": (CircleGrid.staggered_form, partial(CircleGrid.from_fields, staggered=True)),
     "aprilgrid": (AprilGrid.form, AprilGrid.from_fields),
 }
 

@@ -21,6 +21,7 @@ from armsight.files import read_table, read_toml, write_text
 from armsight.geometry.check import checked
 from armsight.geometry.near import pairs_within
 from armsight.geometry.pose import pose
+from armsight.geometry.rigid import collinear
 from armsight.geometry.rotation import from_euler_zyx, from_quaternion_wxyz
 from armsight.tables.lengths import BODY, check_length, number
 
@@ -178,9 +179,6 @@ def _own_table(where: str, entry: Mapping[str, Any], kinds: Collection[str]) -> 
 
 #: Largest body with discs, and largest radius of a disc, m: a larger one has a wrong unit in its file.
 DISC_BODY_MAX_M, DISC_RADIUS_MAX_M = 10.0, 0.5
-#: Points lie on one line where their second singular value is below this share of the first, as in
-#: :mod:`~armsight.vision.pose.locate`: the rotation of such a body about the line is unobservable.
-COLLINEAR = 1e-3
 #: Two discs may share a position where they are the two faces of a thin plate: the cosine between their normals is
 #: below this.
 _OPPOSED = -0.5
@@ -226,12 +224,6 @@ def check_points(path: str | Path, body: Body) -> None:
             f"{path}: its points ({', '.join(body.point_names[:3])}{', ...' if count > 3 else ''}) lie on one line, so the "
             "rotation about that line is unobservable: move one of them off it"
         )
-
-
-def collinear(points: Array) -> bool:
-    """Whether points (N, 3), N >= 3, lie on one line or at one position."""
-    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    return bool(spread[1] <= COLLINEAR * spread[0])
 
 
 #: Headers that are read; all lengths are metres. The first is the one written.

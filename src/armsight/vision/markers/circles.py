@@ -87,14 +87,22 @@ class CircleGrid(Record, CalibrationBoard):
     staggered_form = "acircles:COLUMNSxROWS:PITCH[:OPTION...] (staggered), such as acircles:4x11:20mm"
 
     @staticmethod
-    def from_fields(fields: Fields) -> CircleGrid:
-        """Build the square grid a spec names."""
-        return _from_fields(fields, staggered=False)
-
-    @staticmethod
-    def staggered_from_fields(fields: Fields) -> CircleGrid:
-        """Build the staggered grid a spec names."""
-        return _from_fields(fields, staggered=True)
+    def from_fields(fields: Fields, staggered: bool) -> CircleGrid:
+        """Build the grid a spec names."""
+        columns, rows = fields.counts(0, least=2)
+        pitch_m, options = fields.length_m(1), fields.options("radius=", "dark", "light", "rings=")
+        radius_m = fields.length_of(options["radius"]) if "radius" in options else None
+        if radius_m is not None and not 2 * radius_m < pitch_m * (np.sqrt(2) if staggered else 1.0):
+            raise fields.error("has discs that overlap")
+        if "dark" in options and "light" in options:
+            raise fields.error("has discs both dark and light")
+        rings = tuple(
+            fields.pair(text, "column x row such as 2x7") for text in options.get("rings", "").split(",") if text
+        )
+        if any(column >= columns or row >= rows for column, row in rings) or len(set(rings)) < len(rings):
+            raise fields.error("has rings beside the grid or twice: columns and rows are counted from 0")
+        light = "light" in options if options.keys() & {"dark", "light"} else None
+        return CircleGrid(columns, rows, pitch_m, staggered, radius_m, light, rings)
 
     @staticmethod
     def in_view(image: Grey, pitch_m: float) -> CircleGrid | None:
@@ -292,19 +300,3 @@ def _displaced(cells: Ids, theta: Array) -> NDArray[np.bool_]:
         out[i] = guess is not None and abs(guess[0] - own) > _DISPLACED * radius[i]
         seen[x, y] = own
     return out
-
-
-def _from_fields(fields: Fields, staggered: bool) -> CircleGrid:
-    """Build the grid a spec names."""
-    columns, rows = fields.counts(0, least=2)
-    pitch_m, options = fields.length_m(1), fields.options("radius=", "dark", "light", "rings=")
-    radius_m = fields.length_of(options["radius"]) if "radius" in options else None
-    if radius_m is not None and not 2 * radius_m < pitch_m * (np.sqrt(2) if staggered else 1.0):
-        raise fields.error("has discs that overlap")
-    if "dark" in options and "light" in options:
-        raise fields.error("has discs both dark and light")
-    rings = tuple(fields.pair(text, "column x row such as 2x7") for text in options.get("rings", "").split(",") if text)
-    if any(column >= columns or row >= rows for column, row in rings) or len(set(rings)) < len(rings):
-        raise fields.error("has rings beside the grid or twice: columns and rows are counted from 0")
-    light = "light" in options if options.keys() & {"dark", "light"} else None
-    return CircleGrid(columns, rows, pitch_m, staggered, radius_m, light, rings)

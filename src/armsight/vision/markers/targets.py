@@ -93,12 +93,6 @@ def read_layout(path: str | Path) -> Composite:
     return body
 
 
-def load_body_toml(path: str | Path) -> Target:
-    """Make the target that a body file describes; errors as :func:`read_layout`."""
-    body = read_layout(path)
-    return body.parts[0] if len(body.parts) == 1 and body.discs is None else body
-
-
 def open_target(spec: str | Path) -> Target:
     """Make a target that can be found in images: of a board's spec, a TOML body file, or a board file of ``calibrate``.
 
@@ -113,7 +107,10 @@ def open_target(spec: str | Path) -> Target:
         )
     if kind == "board":
         return open_board(spec)
-    return load_board_file(spec) if _is_board_file(spec) else load_body_toml(spec)
+    if "board" in read_toml(spec):
+        return load_board_file(spec)
+    body = read_layout(spec)
+    return body.parts[0] if len(body.parts) == 1 and body.discs is None else body
 
 
 def open_fixed(specs: Sequence[str], target: str) -> tuple[Target, ...]:
@@ -171,11 +168,6 @@ def _codes(target: Target) -> set[tuple[str, int]]:
 def _distances(points: Array) -> Array:
     """Return the distances between points (N, 3), each pair's twice, sorted."""
     return np.sort(np.concatenate([np.linalg.norm(points - each, axis=1) for each in points]))
-
-
-def _is_board_file(path: str) -> bool:
-    """Say whether a TOML file describes a board as calibrated."""
-    return "board" in read_toml(path)
 
 
 def open_body(spec: str | Path) -> Body:

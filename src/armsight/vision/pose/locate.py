@@ -22,29 +22,20 @@ from numpy.typing import NDArray
 from armsight.data import SIDES, Array, Body, Dropped, Missed, Points, PoseEstimate
 from armsight.estimate.chance import chi_square_limit
 from armsight.geometry.pose import inverse, pose, transform
-from armsight.geometry.rigid import fit_rigid, fit_scale
+from armsight.geometry.rigid import collinear, fit_rigid, fit_scale
 from armsight.geometry.rotation import skew
+from armsight.vision.detections import NAMED
 from armsight.vision.pose.pnp import consensus_poses
 from armsight.vision.pose.posefit import PixelObservations, PoseFit, fit_pose, whitened
 from armsight.vision.rig import StereoRig
 
-_COLLINEAR = 1e-3
 #: Residuals beyond chance and beyond this share of the body's apparent size are implausible: a wrong size, wrong names.
 #: A bent or badly printed body deviates by a few hundredths.
 _ALIKE = 0.2
 #: A body whose points are too far apart or too close together by this share, and by so many sigmas, is another body.
 _SIZE_TOLERANCE, _SIZE_SIGMAS = 0.02, 6.0
-#: Of markers with a wrong size so many are named.
-_NAMED = 3
 #: Residuals beyond this quantile of their chi-square distribution are a misfit, not chance.
 _MISFIT_QUANTILE = 0.999
-
-
-def collinear(points: Array) -> bool:
-    """Whether points (N, 3), N >= 3, lie on one line, about which a rotation is unobservable."""
-    centred = points - points.sum(axis=0) / len(points)
-    spread = np.linalg.eigvalsh(centred.T @ centred)
-    return bool(spread[1] <= _COLLINEAR**2 * spread[2])
 
 
 def implausible(
@@ -95,8 +86,8 @@ def _wrong_size(rig: StereoRig, body: Body, points: Points, T_left_body: Array) 
     """
     scale, sigma = _scale(rig, body.points[points.ids], points, T_left_body)
     if wrong := _wrong_markers(rig, body, points, T_left_body, scale):
-        more = f" and {len(wrong) - _NAMED} more" if len(wrong) > _NAMED else ""
-        named = ", ".join(wrong[:_NAMED])
+        more = f" and {len(wrong) - NAMED} more" if len(wrong) > NAMED else ""
+        named = ", ".join(wrong[:NAMED])
         return f"markers of {body.name} have another size than its file says: {named}{more}; correct the file"
     if abs(scale - 1) <= max(_SIZE_TOLERANCE, _SIZE_SIGMAS * sigma):
         return None

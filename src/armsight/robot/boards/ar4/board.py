@@ -32,7 +32,7 @@ from armsight.robot.boards.ar4.models import (
     ar4_model,
 )
 from armsight.robot.boards.codes import Alarm, BoardState, Command
-from armsight.robot.boards.contract import Abilities, PolledBoard
+from armsight.robot.boards.contract import STOPS, Abilities, PolledBoard
 from armsight.robot.boards.link import Link
 from armsight.robot.boards.reports import BoardStatus, JointFault, JointReport, Welcome
 
@@ -52,7 +52,6 @@ _ANSWER_S, _START_S, _TRIES = 0.2, 0.6, 4
 _POLL_S, _DRAIN_S = 0.001, 0.05
 #: Homing of a group of joints: to the switches, away from them, to the rest position.
 _HOMING_S = 60.0
-_STOPS = 3
 _MARGIN_DEG = 5.0  # what an encoder may show beyond the limits and beyond the fastest motion, degrees
 _Answer = TypeVar("_Answer", Ar4Start, Ar4Values, Ar4Stopped)
 ABILITIES = Abilities(
@@ -160,7 +159,7 @@ class Ar4Board(PolledBoard):
 
     def stop(self) -> None:
         """Slow all joints down to rest, where the drives hold them; they cannot be switched off by the host."""
-        for _ in range(_STOPS):
+        for _ in range(STOPS):
             self._link.write(lines.move([0.0] * JOINTS, speeds=True))
         self._enabled = False
 

@@ -15,7 +15,7 @@ import numpy as np
 from armsight.data import Array, JointCommand
 from armsight.errors import DeviceError, InputError
 from armsight.robot.boards.codes import BoardState, Command
-from armsight.robot.boards.contract import Abilities, PolledBoard
+from armsight.robot.boards.contract import STOPS, Abilities, PolledBoard
 from armsight.robot.boards.feetech.bus import ServoBus
 from armsight.robot.boards.feetech.calibration import NAMES, ServoCalibration, uncalibrated
 from armsight.robot.boards.feetech.registers import (
@@ -43,8 +43,6 @@ _GOAL_SPEED, _ACCELERATION = 1700, 164
 #: What they follow with LATENCY_S, rad/s and rad/s^2.
 _MOST_SPEED, _MOST_ACCELERATION = 1.5, 10.0
 _REST_RAD_S = 0.35  # a count that comes and goes between two readings looks like a speed of up to this, rad/s
-#: The torque goes off so many times: a disturbed byte must not swallow it.
-_STOPS = 3
 ABILITIES = Abilities(
     len(NAMES),
     RATE_HZ,
@@ -156,7 +154,7 @@ class FeetechBoard(PolledBoard):
 
     def stop(self) -> None:
         """Switch the torque off at once: the arm sinks."""
-        for _ in range(_STOPS):
+        for _ in range(STOPS):
             self.bus.write_all(TORQUE, {id: TORQUE.encode(0) for id in self.calibration.ids})
         self._enabled = False
 
