@@ -129,6 +129,7 @@ class Aim(Record):
 
     Attributes:
         ahead: the joints a period from now, as the motion has them.
+        q: (2, n) angles now and ahead, rad.
         qd: (2, n) their speeds, rad/s.
         Ts_base_tool: (2, 4, 4) where they put the tool.
         most: (n,) by how much the correction of each joint may change in the period, rad.

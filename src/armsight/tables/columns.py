@@ -126,9 +126,7 @@ def _of_a_maker(bare: list[str], ours: list[str], unit: str, rotation: str | Non
     makers = [
         (maker, angles, convention)
         for maker, (*angles, convention) in _MAKERS.items()
-        if {*"xyz", *angles} <= set(found)
-        and (maker != "Doosan" or rotation == "ZYZ")
-        and (maker != "KUKA" or rotation != "ZYZ")
+        if {*"xyz", *angles} <= set(found) and maker != ("KUKA" if rotation == "ZYZ" else "Doosan")
     ]
     if len(makers) != 1 or {"qw", "r11", "rx", "rx_deg", "rx_rad"} & set(ours):
         return {}, "", ""

@@ -349,11 +349,7 @@ class Readings:
         self._gap = np.maximum(width_rad, MIN_GAP_RAD)
 
     def add(self, states: JointStates) -> None:
-        """Take readings.
-
-        Raises:
-            InputError: wrong shapes, NaN, or times that do not rise.
-        """
+        """Take readings; wrong shapes, NaN, or times that do not rise are an InputError."""
         t, q = np.asarray(states.t_s, dtype=float), np.asarray(states.q, dtype=float)
         if t.ndim != 1 or q.shape != (len(t), self._joints):
             checked(t, (None,), "JointStates.t_s")

@@ -27,6 +27,8 @@ class Reading(Record):
     """One reading of a sensor.
 
     Attributes:
+        t_s: when, s, as its clock stamps it; its delay is still in it.
+        channel: which of the reference's channels.
         z: (m,) what was read, SI units.
         cov: (m, m) covariance of its noise.
     """

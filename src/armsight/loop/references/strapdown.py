@@ -65,6 +65,7 @@ class Samples(Record):
     """Samples of an inertial unit, in order of time.
 
     Attributes:
+        t_s: (N,) when, s, as its clock stamps them; its delay is still in them.
         z: (N, 6) angular velocity, rad/s, and specific force, m/s2, as read.
         density: (6,) of their noise, per sqrt(Hz).
     """
@@ -427,11 +428,7 @@ class Strapdown:
         return float(self._t[self._first + self._count - 1]) if self._count else -np.inf
 
     def add(self, samples: Samples) -> None:
-        """Take samples; of clipped ones nothing is known.
-
-        Raises:
-            InputError: wrong shapes, NaN, or times that do not rise.
-        """
+        """Take samples, nothing of clipped ones; wrong shapes, NaN, or times that do not rise are an InputError."""
         t, z = np.asarray(samples.t_s, float) - self.sensor.delay_s, np.asarray(samples.z, float)
         steps = np.diff(t, prepend=self.newest_s)
         if z.shape != (len(t), 6) or not np.isfinite(z).all() or not (steps > 0.0).all():

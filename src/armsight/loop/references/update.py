@@ -29,8 +29,7 @@ class Gained(NamedTuple):
 
     Attributes:
         gain: (K, m) what of its residual is added to the state.
-        P: (K, K) covariance after it.
-        considered: after it.
+        P, considered: (K, K) covariance, and what hangs on references, after it.
         square: squared Mahalanobis distance of the residual.
         S: (m, m) covariance of the residual.
     """
