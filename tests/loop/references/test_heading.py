@@ -10,7 +10,7 @@ from armsight.geometry.rotation import exp_so3, log_so3
 from armsight.loop.references.calibrate import calibrate
 from armsight.loop.references.file import FIELD as FIELD_MESSAGE
 from armsight.loop.references.file import read_recording
-from armsight.loop.references.heading import EARTH_T, Heading, heading_off
+from armsight.loop.references.heading import EARTH_T, Magnetometer, heading_off
 from armsight.loop.references.reference import Reading, ToolMotion
 
 NOISE_T = 0.4e-6
@@ -44,7 +44,7 @@ def some(rng):
     A = rng.normal(0, 0.05, (3, 3))
     soft = np.eye(3) + (A + A.T) / 2
     mounting = exp_so3(rng.normal(0, 1.5, 3))
-    return Heading(
+    return Magnetometer(
         name="m",
         cov=np.zeros((15, 15)),
         R_tool_sensor=mounting,
@@ -56,7 +56,7 @@ def some(rng):
 
 def calibrated(rng, sensor, count=60):
     readings, motion = recorded(rng, sensor, count)
-    return calibrate(Heading.of("m").begun(readings, motion), readings, motion)
+    return calibrate(Magnetometer.of("m").begun(readings, motion), readings, motion)
 
 
 def test_the_closed_form_finds_exact_readings():
@@ -64,9 +64,9 @@ def test_the_closed_form_finds_exact_readings():
     sensor = some(rng)
     readings, motion = recorded(rng, sensor, 20, motor=0.0)
     exact = [Reading(each.t_s, 0, sensor.expected(motion(each.t_s), 0).z, each.cov) for each in readings]
-    found = Heading.of("m").begun(exact, motion)
+    found = Magnetometer.of("m").begun(exact, motion)
     assert np.linalg.norm(log_so3((found.R_tool_sensor.T @ sensor.R_tool_sensor)[None])) < 1e-7
-    scale = np.linalg.norm(FIELD) / EARTH_T  # length of the field and size of the soft iron cannot be told apart
+    scale = np.linalg.norm(FIELD) / EARTH_T  # length of the field and size of the soft iron are not observable apart
     np.testing.assert_allclose(found.soft, sensor.soft * scale, atol=1e-9)
     np.testing.assert_allclose(found.hard_t, sensor.hard_t, atol=1e-12)
 
@@ -116,12 +116,12 @@ def test_too_few_or_flat_attitudes_are_rejected():
     sensor = some(rng)
     readings, motion = recorded(rng, sensor, 11)
     with pytest.raises(InputError, match="11 attitudes; 12 at least"):
-        Heading.of("m").begun(readings, motion)
+        Magnetometer.of("m").begun(readings, motion)
     Ts = [pose(exp_so3(np.array([0, 0, 0.3 * k])), np.zeros(3)) for k in range(20)]
     flat = [Reading(float(k), 0, sensor.expected(ToolMotion(T), 0).z, np.eye(3)) for k, T in enumerate(Ts)]
     with pytest.raises(InputError, match="about one axis alone"):
-        Heading.of("m").begun(flat, lambda t: ToolMotion(Ts[int(t)]))
-    steep = Heading(**{**vars(sensor), "field_t": np.array([1e-7, 0, -45e-6])})
+        Magnetometer.of("m").begun(flat, lambda t: ToolMotion(Ts[int(t)]))
+    steep = Magnetometer(**{**vars(sensor), "field_t": np.array([1e-7, 0, -45e-6])})
     with pytest.raises(InputError, match="horizontal part"):
         heading_off(steep, readings, motion)
 

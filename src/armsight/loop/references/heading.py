@@ -33,7 +33,7 @@ _SYMMETRIC = np.maximum(_SYMMETRIC, _SYMMETRIC.transpose(0, 2, 1))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Heading(Reference):
+class Magnetometer(Reference):
     """A magnetometer.
 
     Attributes:
@@ -49,7 +49,7 @@ class Heading(Reference):
     field_t: Array
 
     @staticmethod
-    def of(name: str) -> Heading:
+    def of(name: str) -> Magnetometer:
         """Return one of which nothing is known."""
         cov = np.diag(np.repeat([np.pi, _SOFT, _HARD_T, _FIELD_T], [3, 6, 3, 3]) ** 2)
         given = {
@@ -58,7 +58,7 @@ class Heading(Reference):
             "hard_t": np.zeros(3),
             "field_t": EARTH_T * np.eye(3)[0],
         }
-        return Heading(name=name, cov=cov, sigma_delay_s=0.02, **given)
+        return Magnetometer(name=name, cov=cov, sigma_delay_s=0.02, **given)
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -135,7 +135,7 @@ class HeadingOff(Record):
     disturbance_t: Array
 
 
-def heading_off(sensor: Heading, readings: Sequence[Reading], motion: Callable[[float], ToolMotion]) -> HeadingOff:
+def heading_off(sensor: Magnetometer, readings: Sequence[Reading], motion: Callable[[float], ToolMotion]) -> HeadingOff:
     """Compare the heading of the arm with that of the field.
 
     Args:
