@@ -104,35 +104,32 @@ def pose_error(F: Frame, G: Frame, error: Array) -> float:
     return total
 
 
-@kernel(nogil=True, fastmath={"contract", "nsz"})
-def _solve(A: Array, g: Array, damping: float, step: Array) -> bool:
-    """Solve (A + damping I) step = g by Cholesky; False where that cannot be done.
+@kernel(nogil=True, fastmath={"contract", "nsz"}, forceinline=True)
+def solve(A: Array, g: Array, m: int, damping: float, root: Array) -> bool:
+    """Solve (A + damping I) x = g of m unknowns by Cholesky, x in place of g; False where that cannot be done.
 
-    A's upper half and g are read; the factor goes below A's diagonal, its own diagonal into ``step`` until the end.
+    A's upper half is read; the factor goes below its diagonal, its own diagonal into ``root``.
     """
-    for i in range(6):
+    for i in range(m):
         for j in range(i + 1):
             total = A[j, i]
             for k in range(j):
                 total -= A[i, k] * A[j, k]
             if j < i:
-                A[i, j] = total / step[j]
+                A[i, j] = total / root[j]
             elif total + damping > 0.0:
-                step[i] = math.sqrt(total + damping)
+                root[i] = math.sqrt(total + damping)
             else:
                 return False
-    for i in range(6):
         total = g[i]
         for k in range(i):
             total -= A[i, k] * g[k]
-        g[i] = total / step[i]
-    for i in range(5, -1, -1):
+        g[i] = total / root[i]
+    for i in range(m - 1, -1, -1):
         total = g[i]
-        for k in range(i + 1, 6):
+        for k in range(i + 1, m):
             total -= A[k, i] * g[k]
-        g[i] = total / step[i]
-    for i in range(6):
-        step[i] = g[i]
+        g[i] = total / root[i]
     return True
 
 
@@ -163,7 +160,7 @@ def descend(table: Array, G: Frame, q: Array, low: Array, high: Array, most: int
 
     Return the squared length of the error that is left.
     """
-    J, A, e, g, step, trial = work[0:6], work[6:12], work[12], work[13], work[14], work[15]
+    J, A, e, g, root, trial = work[0:6], work[6:12], work[12], work[13], work[14], work[15]
     cost = np.inf
     damping, better = 0.0, True
     for _ in range(most):
@@ -175,11 +172,11 @@ def descend(table: Array, G: Frame, q: Array, low: Array, high: Array, most: int
         _normal(J, e, q, low, high, A, g)
         size = 0.0
         after = np.inf
-        if _solve(A, g, damping + 1e-18, step):
+        if solve(A, g, 6, damping + 1e-18, root):
             for i in range(6):
-                size = max(size, abs(step[i]))
+                size = max(size, abs(g[i]))
             for i in range(6):
-                trial[i] = min(high[i], max(low[i], q[i] + step[i] / max(1.0, size)))
+                trial[i] = min(high[i], max(low[i], q[i] + g[i] / max(1.0, size)))
             after = pose_error(tool_six(table, trial), G, g)
         better = after < cost
         if better:

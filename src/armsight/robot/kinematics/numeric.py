@@ -20,7 +20,7 @@ import numpy as np
 from armsight.data import Array
 from armsight.kernels import kernel
 from armsight.robot.kinematics.chain import Frame, jacobian_base, tool_frame
-from armsight.robot.kinematics.inverse import pose_error, rigid
+from armsight.robot.kinematics.inverse import pose_error, rigid, solve
 
 #: An error below this, m or rad, is none.
 REACHED = 3e-10
@@ -43,35 +43,6 @@ _LEVEL_STEPS, _LEVEL_RAD, _STILL, _FIRM = 60, 0.3, 1e-13, 1e-14
 #: Motions that change a direction less than this, squared, rad per rad, are not used for it: to gain a hundredth of a
 #: radian the wrist would rotate by half a revolution.
 _WEAK = 1e-2
-
-
-@kernel(nogil=True, fastmath={"contract", "nsz"})
-def _solve(A: Array, g: Array, m: int, damping: float, root: Array) -> bool:
-    """Solve (A + damping I) x = g of m unknowns by Cholesky, x in place of g; False where that cannot be done.
-
-    A's upper half is read; the factor goes below its diagonal, its own diagonal into ``root``.
-    """
-    for i in range(m):
-        for j in range(i + 1):
-            total = A[j, i]
-            for k in range(j):
-                total -= A[i, k] * A[j, k]
-            if j < i:
-                A[i, j] = total / root[j]
-            elif total + damping > 0.0:
-                root[i] = math.sqrt(total + damping)
-            else:
-                return False
-        total = g[i]
-        for k in range(i):
-            total -= A[i, k] * g[k]
-        g[i] = total / root[i]
-    for i in range(m - 1, -1, -1):
-        total = g[i]
-        for k in range(i + 1, m):
-            total -= A[k, i] * g[k]
-        g[i] = total / root[i]
-    return True
 
 
 @kernel(nogil=True, fastmath={"contract", "nsz"})
@@ -115,7 +86,7 @@ def _step(
                 for k in range(6):
                     total += J[k, i] * J[k, j]
                 A[i, j] = total
-        good = _solve(A, g, n, damping, step)
+        good = solve(A, g, n, damping, step)
         for i in range(n):
             step[i] = g[i]
         return good
@@ -126,7 +97,7 @@ def _step(
                 total += J[i, k] * J[j, k]
             A[i, j] = total
         g[i] = e[i]
-    good = _solve(A, g, 6, damping, step)
+    good = solve(A, g, 6, damping, step)
     for i in range(n):
         total = 0.0
         for k in range(6):
@@ -286,7 +257,7 @@ def _position_level(J: Array, e: Array, n: int, step: Array, work: Array) -> int
             for i in range(n):
                 total += J[k, i] * J[j, i]
             A[k, j] = total
-    good, count = _solve(A, g, 3, _FIRM, y), 0
+    good, count = solve(A, g, 3, _FIRM, y), 0
     for i in range(n):
         step[i] = g[0] * J[0, i] + g[1] * J[1, i] + g[2] * J[2, i] if good else 0.0
     for k in range(3):

@@ -15,7 +15,7 @@ from armsight.robot.boards.codes import Reaction
 from armsight.robot.boards.configuration import CONFIG, SYNC_LED_TICKS, Configuration, check_configuration, pin_number
 from armsight.robot.kinematics.arm import Arm
 from armsight.sim.workcell.arm import pot_travel
-from armsight.sim.workcell.motors import SUPPLY_V, Motors, Solids, gravity_torque, inertia
+from armsight.sim.workcell.motors import ACCELERATION_SPARE, SUPPLY_V, Motors, Solids, gravity_torque, inertia
 from armsight.sim.workcell.plant import COUNTS, HIGH_SHARE, LOW_SHARE
 
 #: Natural frequency, rad/s, of each joint's loop; its damping; integral gain per proportional gain, 1/s; filter of the
@@ -23,7 +23,7 @@ from armsight.sim.workcell.plant import COUNTS, HIGH_SHARE, LOW_SHARE
 #: integral frees it, and a loop that is closed on vision meanwhile winds up and hunts.
 NATURAL_RAD_S = np.array([50.0, 70.0, 80.0, 85.0, 90.0, 90.0])
 DAMPING, INTEGRAL_PER_S, FILTER_S = 1.0, 8.0, 0.004
-_ACCELERATION_SPARE, _JERK_S = 2.0, 0.01  # likewise; time from none to all of it
+_JERK_S = 0.01  # from no acceleration to all of it; half: rougher, double: slower
 _BRAKE_TICKS = 20
 SYNC_LED_PIN = "PB13"
 _SPEED_SPARE = 1.2  # of the reference's limit over the arm's own
@@ -52,7 +52,7 @@ def configuration(model: Arm, parts: Solids, motors: Motors, *, sync_led: bool =
     joint["soft_min_rad"], joint["soft_max_rad"] = model.q_min, model.q_max
     joint["speed_limit_rad_s"] = _SPEED_SPARE * model.qd_max
     joint["deceleration_rad_s2"] = model.qdd_max
-    joint["acceleration_rad_s2"] = _ACCELERATION_SPARE * model.qdd_max
+    joint["acceleration_rad_s2"] = ACCELERATION_SPARE * model.qdd_max
     joint["jerk_rad_s3"] = joint["acceleration_rad_s2"] / _JERK_S
     joint["gravity_slew_per_s"] = 5.0
     motor = joint["motor"]

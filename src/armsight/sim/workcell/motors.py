@@ -136,7 +136,7 @@ def inertia(arm: Arm, parts: Solids, q: Array) -> Array:
 SUPPLY_V = 24.0
 #: No-load speed over the joint's greatest; greatest torque and stall torque over what is needed.
 _SPEED_SPARE, _TORQUE_SPARE, _STALL_SPARE = 1.7, 2.5, 6.0
-_ACCELERATION_SPARE = 2.0  # a joint could accelerate so many times as hard as it may
+ACCELERATION_SPARE = 2.0  # a joint could accelerate so many times as hard as it may
 _TIME_CONSTANT_S = 0.012  # of the motor alone, unloaded
 _TORQUE_CONSTANT = 0.04  # N m/A: of the whole family
 #: Friction: dry, of the torque needed; viscous, of the motor's own damping; of the bearing, of the torque needed.
@@ -190,7 +190,7 @@ def chosen(model: Arm, parts: Solids, friction: float = 1.0) -> Motors:
     poses = rng.uniform(model.q_min, model.q_max, (_POSES, 6))
     gravity = np.max([np.abs(gravity_torque(model, parts, q)) for q in poses], axis=0)
     load = np.max([inertia(model, parts, q) for q in poses], axis=0)
-    needed = gravity + _ACCELERATION_SPARE * load * model.qdd_max
+    needed = gravity + ACCELERATION_SPARE * load * model.qdd_max
     needed = np.maximum(needed, _LEAST * needed.max())
     constant = np.full(6, _TORQUE_CONSTANT)
     gear = SUPPLY_V / (constant * _SPEED_SPARE * model.qd_max)
