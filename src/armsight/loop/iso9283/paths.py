@@ -195,8 +195,8 @@ def circle_metrics(
 def _widest(statistic: Callable[[Array], Array], radii: Array, errors: Array) -> Metric:
     """Return a largest difference of radii (2, B), with samples (D, 2, B) of their errors.
 
-    The largest of many is picked where the error is large too, more than adding errors once more shows. But no error makes
-    it larger by more than that error's own largest difference: that bounds its lower end.
+    The largest of many is picked where the error is large too; but no error makes it larger by more than its own
+    difference.
     """
     metric = beyond_noise(statistic, radii, errors)
     return metric if metric.clean is None else replace(metric, low=metric.raw - float(metric.resolvable or 0.0))
@@ -232,8 +232,6 @@ def _binned(ways: list[tuple[Array, Array]]) -> tuple[Array, Array, Array]:
 def _backlash(steps: Array, variances: Array) -> Metric:
     """Return the mean of jumps (1, k) of variances (1, k) with its interval; negative where the radius falls.
 
-    Backlash cannot make the radius fall, but the interval has a sign and can reach below 0.
-
     Where jumps differ by more than their sigmas the interval is that of their scatter (Birge, Phys. Rev. 40, 1932).
     """
     value, freedom = float(steps.mean()), steps.size - 1
@@ -255,10 +253,7 @@ def _fitted(p: Array) -> tuple[Array, float]:
 
 
 def _step(angle: Array, r: Array, at: float, way: float) -> tuple[float, float]:
-    """Return the jump of the radius at an angle, in the sense of motion, m, and its variance: two lines through its sides.
-
-    ``angle`` and ``r`` (N,) are the polar coordinates of the positions, deg and m.
-    """
+    """Return the jump of the radius at an angle, in the sense of motion, m, and its variance: lines through both sides."""
     from_it = way * ((angle - at + 180) % 360 - 180)
     sides = []
     for side in (-1.0, 1.0):

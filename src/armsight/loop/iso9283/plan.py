@@ -31,15 +31,7 @@ MAX_ROTATION_RAD = 0.3
 
 
 class CheckPlan(NamedTuple):
-    """Poses to go to.
-
-    Attributes:
-        names: of the poses.
-        Ts_base_tool: (N, 4, 4).
-        q: (N, n) joint angles, rad.
-        side_m: of the cube.
-        centre: (3,) of the cube, base, m.
-    """
+    """Poses to go to: names, T_base_tool (N, 4, 4), joint angles (N, n), rad, side and middle of the cube, base, m."""
 
     names: tuple[str, ...]
     Ts_base_tool: Array
@@ -68,9 +60,6 @@ def plan_check(
     ``wide``: a hundred poses all over the cube, rotated too, instead of the standard's five. ``allowed``: returns which
     poses (N, 4, 4) may be used, such as those that the cameras see. ``feasible``: returns whether a plan can be carried
     out; if not, the next cube is tried.
-
-    Raises:
-        InputError: not even the smallest cube will do.
     """
     if centre is not None and not np.isfinite(centre).all():
         raise InputError("the cube's centre must be three finite numbers")

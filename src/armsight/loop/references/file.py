@@ -68,11 +68,7 @@ class Entry(Record):
 
 
 def read_references(path: Path) -> list[Entry]:
-    """Read ``references.toml``.
-
-    Raises:
-        InputError: the table, what was found and what is expected.
-    """
+    """Read ``references.toml``."""
     tables = read_toml(path)
     if not tables or not all(isinstance(table, dict) for table in tables.values()):
         raise InputError(f"{path}: expected a table a reference, such as [imu] with kind and source")

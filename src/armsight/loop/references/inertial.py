@@ -93,9 +93,6 @@ class Inertial(Reference):
 
         ``kind``: of :data:`INERTIAL_CLASSES`. ``T_tool_sensor``: (4, 4) its mounting, roughly; None: unknown, the
         identity.
-
-        Raises:
-            InputError: no such class.
         """
         if kind not in INERTIAL_CLASSES:
             raise InputError(f"{name}: no class of inertial units {kind!r}; there are {', '.join(INERTIAL_CLASSES)}")

@@ -93,11 +93,7 @@ class Settling(NamedTuple):
 
 
 def check_stream(t_s: Array, z: Array, source: str) -> StreamCheck:
-    """Return what a stream is like.
-
-    Raises:
-        InputError: too short, no numbers, or times that run backwards.
-    """
+    """Return what a stream is like."""
     if len(t_s) < 20:
         raise InputError(f"{source}: {len(t_s)} readings; 20 at least are needed")
     if not (np.isfinite(t_s).all() and np.isfinite(z).all()):
@@ -131,10 +127,7 @@ def check_stream(t_s: Array, z: Array, source: str) -> StreamCheck:
 
 
 def _saturated(column: Array) -> bool:
-    """Return whether a column (N,) stands at its greatest or least value more often than next to it: its range ends there.
-
-    Of a coarse column at rest the values next to the last one are as frequent.
-    """
+    """Return whether a column (N,) stands at its greatest or least value more often than next to it: a range's end."""
     values, counts = np.unique(column, return_counts=True)
     if len(values) < 4:
         return False
