@@ -11,7 +11,7 @@ from armsight.geometry.pose import inverse
 from armsight.robot.boards.codes import BoardState
 from armsight.robot.trajectories import point_to_point
 from armsight.sim.references.inertial import InertialErrors, InertialUnit
-from armsight.sim.workcell.workcell import _T_TOOL_UNIT, Workcell
+from armsight.sim.workcell.workcell import _T_TOOL_UNIT, CHESSBOARD, Workcell
 from armsight.vision.markers.board import open_board
 
 pytestmark = pytest.mark.usefixtures("host_firmware")
@@ -145,8 +145,8 @@ def test_a_card_hides_the_body_from_both_cameras(workcell):
 
 def test_the_board_is_seen(workcell):
     before = workcell.t_s
-    board = open_board(workcell.chessboard_spec)
-    for shot in workcell.chessboard_shots(4):
+    board = open_board(CHESSBOARD)
+    for shot in workcell.board_shots(4):
         for side in ("left", "right"):
             assert board.detect(shot.image(side)).problem is None
     assert workcell.t_s == before
@@ -189,7 +189,7 @@ def _numbers(seed):
         _, readings = go(workcell, workcell.model.home, workcell.poses[0], 0.0, lambda: polled.append(workcell.poll()))
         shots = [shot for shot in polled if shot is not None]
         images = np.stack([image for shot in shots for image in (shot.left, shot.right)])
-        return readings, images, [shot.t_s for shot in shots], workcell.truth.q, next(workcell.chessboard_shots(1)).left
+        return readings, images, [shot.t_s for shot in shots], workcell.truth.q, next(workcell.board_shots(1)).left
 
 
 def test_a_picture_of_the_workcell(workcell):
@@ -243,7 +243,7 @@ def test_a_workcell_like_another_sees_the_same_room_at_another_rate():
 def test_cameras_of_a_preset_give_the_same_images_again():
     def shots(cameras):
         with Workcell.open(seed=4, emulator="host", cameras=cameras) as workcell:
-            board = next(workcell.chessboard_shots(1))
+            board = next(workcell.board_shots(1))
             return [board, *(workcell.source.read() for _ in range(3))]
 
     first, second, clean = (shots(f"{name}320x240@30") for name in ("cheap-webcam:", "cheap-webcam:", ""))

@@ -1,13 +1,18 @@
 """The body on the tool: its file says what its patterns show."""
 
 import json
+from pathlib import Path
 
 import numpy as np
+import pytest
 
+from armsight.errors import InputError
 from armsight.geometry.pose import transform
-from armsight.sim.workcell.body import body_patterns, body_target, body_text
+from armsight.sim.workcell.body import body_patterns, body_target, body_text, patterns_of
 from armsight.vision.markers.targets import open_target
 from cli_runs import run
+
+EXAMPLES = Path(__file__).parents[3] / "examples"
 
 
 def test_the_file_is_the_target(tmp_path):
@@ -36,3 +41,27 @@ def test_the_check_calls_it_usable(tmp_path, capsys):
     path.write_text(body_text())
     assert run("body", "check", path, "--json") == 0
     assert json.loads(capsys.readouterr().out)["assessment"] == "usable"
+
+
+def test_any_body_of_discs_is_painted_as_its_file_has_it(tmp_path):
+    leaning = 'name = "two"\n' + "".join(
+        f'[[markers]]\nname = "{n}"\nposition_mm = {p}\nnormal = {v}\ndisc = {{ radius_mm = 6.0, bright = true }}\n'
+        for n, p, v in (
+            ("A", [0, 0, 0], [0, 0, -1]),
+            ("B", [20, 0, 0], [0, 0, -1]),
+            ("C", [50, 0, 9], [0.6, 0.0, -0.8]),
+        )
+    )
+    (tmp_path / "two.toml").write_text(leaning)
+    for path in (tmp_path / "two.toml", EXAMPLES / "arm_plate.toml"):
+        target = open_target(str(path))
+        shown = [(p.T_body_pattern, disc) for p in patterns_of(target) for disc in p.discs]
+        at = [transform(T, np.array([*disc[:2], 0.0])) for T, disc in shown]
+        order = [int(np.argmin(np.linalg.norm(np.array(at) - point, axis=1))) for point in target.body.points]
+        assert sorted(order) == list(range(len(at)))
+        np.testing.assert_allclose(np.array(at)[order], target.body.points, atol=1e-9)
+        normals = [-shown[k][0][:3, 2] for k in order]
+        np.testing.assert_allclose(normals, target.discs.normals, atol=1e-6)
+    assert len(patterns_of(target)) == 1  # a plate is one face
+    with pytest.raises(InputError, match="simulated cameras show discs with normals"):
+        patterns_of(open_target("chessboard:9x6:20mm"))

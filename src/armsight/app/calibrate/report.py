@@ -265,9 +265,10 @@ def _parameters(calibration: Calibration) -> str:
 
 
 def _provenance(rig: StereoRig) -> str:
+    shown = {key: round(value, 6) if isinstance(value, float) else value for key, value in rig.provenance.items()}
     rows = [
         (text(key), text(value if isinstance(value, str) else json.dumps(value, ensure_ascii=False, default=str)))
-        for key, value in rig.provenance.items()
+        for key, value in shown.items()
     ]
     return table(("", ""), rows, "provenance") if rows else "<p>Nothing is recorded.</p>"
 

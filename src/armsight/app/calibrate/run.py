@@ -79,12 +79,12 @@ class GivenDetections:
         """Close nothing."""
 
 
-def _open(spec: str, folder: Path) -> Source:
+def _open(spec: str, folder: Path, target: str) -> Source:
     """Open a folder or a recording; what cameras see is stored in a new folder first, so that it is there afterwards."""
     if not spec.startswith((*LIVE, SIM)):
         return open_source(spec)
     stored = unused(folder)
-    opened = _SimulatedBoard(spec) if spec.startswith(SIM) else open_source(spec)
+    opened = _SimulatedBoard(spec, target) if spec.startswith(SIM) else open_source(spec)
     click.echo(f"recording for {_RECORDED_S:g} s into {stored}: move the target; Ctrl-C ends it earlier", err=True)
     with contextlib.closing(opened) as live, bar("recording shots", live.count) as advance:
         done = record(live, stored, seconds=_RECORDED_S, on_shot=lambda _: advance())
@@ -94,15 +94,15 @@ def _open(spec: str, folder: Path) -> Source:
 
 
 class _SimulatedBoard(Source):
-    """What the workcell's cameras see of the chessboard that a person shows them."""
+    """What the workcell's cameras see of the board that a person shows them."""
 
     count: int | None = _SIM_SHOTS
 
-    def __init__(self, spec: str) -> None:
+    def __init__(self, spec: str, target: str) -> None:
         from armsight.sim.workcell.workcell import Workcell
 
         self._workcell = Workcell.open(cameras=spec.removeprefix(SIM) or _SIM_CAMERAS)
-        self._shots = self._workcell.chessboard_shots(_SIM_SHOTS)
+        self._shots = self._workcell.board_shots(_SIM_SHOTS, target)
 
     def read(self) -> Shot | None:
         """Return the next shot; the workcell's time stands still, so it has none."""
@@ -124,7 +124,7 @@ class GivenImages:
         if len(alone) != len(SIDES):
             raise InputError(f"--alone {options.alone}: two globs are needed, LEFT,RIGHT; one of them may be empty")
         self._alone = [(side, file) for side, pattern in enumerate(alone) for file in _files_of(pattern)]
-        self._source, self.named["source"] = _open(spec, options.output.with_suffix(".board")), spec
+        self._source, self.named["source"] = _open(spec, options.output.with_suffix(".board"), self._spec), spec
         kind, _, rest = spec.partition(":")
         if kind == "pairs":
             self.named |= zip(SIDES, two_globs(rest), strict=True)

@@ -38,7 +38,7 @@ from armsight.robot.arm_file import open_arm
 from armsight.robot.kinematics.arm import Arm
 from armsight.sim.workcell.cameras import camera_name, open_cameras
 from armsight.sim.workcell.controlled import CONTROLLED
-from armsight.sim.workcell.workcell import DEFAULT_ARM, Workcell
+from armsight.sim.workcell.workcell import CHESSBOARD, DEFAULT_ARM, Workcell
 from armsight.vision.calibrate.boards import Pair, calibrate_boards
 from armsight.vision.calibrate.result import Calibration
 from armsight.vision.image import grey
@@ -92,10 +92,10 @@ def run_demo(demo: Demo, *, progress: Progress = lambda line: None) -> Report:
         write_text(folder / "motion.toml", motion)
         plan = read_motions(workcell.model, folder / "motion.toml")
         progress("rendering the calibration target")
-        shots = _ahead(workcell.chessboard_shots(pairs))
+        shots = _ahead(workcell.board_shots(pairs))
         first = next(shots)  # begun before, the second process would take a core from those that render it
         with contextlib.closing(Process(caller, "armsight.vision.calibrate.boards")) as second:
-            rig = _calibrated(workcell.chessboard_spec, chain([first], shots), progress, second).rig
+            rig = _calibrated(CHESSBOARD, chain([first], shots), progress, second).rig
         rig.save(folder / "rig.json")
         write_text(folder / "body.toml", workcell.body_text)
         targets = handeye_poses(workcell.model, np.vstack([workcell.model.home, workcell.poses]), handeyes, demo.seed)

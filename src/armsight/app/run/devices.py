@@ -256,12 +256,15 @@ def open_devices(devices: Devices) -> Iterator[Setup]:
         if source.startswith(SIM):
             from armsight.sim.workcell.workcell import Workcell
 
-            emulator = emulator_name(board)
-            cameras = source.removeprefix(SIM) or _SIM_CAMERAS
-            led = devices.sync_led
-            workcell = stack.enter_context(
-                Workcell.open(arm=_SIM_ARM, cameras=cameras, emulator=emulator, model=devices.arm, sync_led=led)
+            opened = Workcell.open(
+                arm=_SIM_ARM,
+                cameras=source.removeprefix(SIM) or _SIM_CAMERAS,
+                emulator=emulator_name(board),
+                model=devices.arm,
+                sync_led=devices.sync_led,
+                target=devices.target,
             )
+            workcell = stack.enter_context(opened)
             beside = None if devices.reference is None else simulated_unit(workcell, devices.reference, 0)
             yield replace(setup_of(workcell), target=devices.target, beside=beside)
             return
@@ -273,9 +276,9 @@ def open_devices(devices: Devices) -> Iterator[Setup]:
         if not stamped:
             taken = f"{_RATE_HZ:g} Hz is taken" if rate_hz is None else f"they come at {rate_hz:.1f} Hz, which is taken"
             click.echo(f"note: the times of the shots show no rate of the cameras: {taken}", err=True)
-        opened = stack.enter_context(open_motion_board(board))
-        require_joints(opened, board, devices.arm)
-        bit_s = sync_led_bit_s(opened, f"--board {board}") if devices.sync_led else None
+        controller = stack.enter_context(open_motion_board(board))
+        require_joints(controller, board, devices.arm)
+        bit_s = sync_led_bit_s(controller, f"--board {board}") if devices.sync_led else None
         beside, clock = None, HostClock()
         if devices.reference is not None:
             readings = LiveReadings(devices.reference, clock)
@@ -283,7 +286,7 @@ def open_devices(devices: Devices) -> Iterator[Setup]:
             beside = Fused(devices.reference, readings, readings.losses)
         yield Setup(
             devices.arm,
-            opened,
+            controller,
             shots.poll,
             devices.target,
             np.zeros_like,

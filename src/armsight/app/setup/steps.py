@@ -44,7 +44,6 @@ def _by_loop(arm: str, board: str, look: SetupStep, written: SetupStep) -> tuple
         SetupStep(
             "The first page is the board, glued to glass or aluminium, the second the plate on the arm.",
             f"body draw {BOARD} {PLATE} -o print.pdf",
-            simulated="--split",  # the simulated board is larger than this paper
         ),
         SetupStep(_SHOW, f"calibrate --source {CAMERAS} --target {BOARD} -o rig.json"),
         look,

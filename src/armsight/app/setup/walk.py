@@ -151,14 +151,8 @@ def _asked(question: str) -> str:
 def simulated(walk: SetupWalk, cameras: str) -> Iterator[None]:
     """Let a walk go through on the emulated arm before simulated cameras, with nobody at the terminal."""
     from armsight.app.board.command import emulated_arm
-    from armsight.app.setup.steps import BOARD
-    from armsight.sim.workcell.body import body_text
-    from armsight.sim.workcell.workcell import CHESSBOARD
 
-    if (body := Path("body.toml")).exists() and body.read_text(encoding="utf-8") != body_text():
-        raise InputError(f"{body}: is of another arm: a simulated walk takes a folder of its own")
-    write_text(body, body_text())
-    walk.words |= {CAMERAS: cameras, BOARD: CHESSBOARD, PLATE: "body.toml"}
+    walk.words |= {CAMERAS: cameras}
     walk.words |= {old: new for step in ARMS[walk.arm] for old, new in step.without}  # nobody has files of their own
     with contextlib.ExitStack() as stack:
         own = walk.arm == "six_r"

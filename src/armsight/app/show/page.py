@@ -48,15 +48,24 @@ table.headline td:nth-child(-n+4), table.headline th { white-space: nowrap; }
 table.headline td { font-variant-numeric: tabular-nums; } table.headline td:last-child { color: var(--muted); }
 table.headline { font-weight: 400; font-size: .95rem; }
 table.prose th { font-weight: 400; } table.prose td { min-width: 18rem; }
-table.numbers tbody th { white-space: nowrap; } table.numbers thead th { overflow-wrap: normal; }
+table.numbers th { overflow-wrap: break-word; } table.numbers thead th { overflow-wrap: normal; }
 table.numbers td { font-variant-numeric: tabular-nums; } td.number { white-space: nowrap; }
 summary { cursor: pointer; color: var(--link); margin: .6rem 0; }
 figure { margin: 0 0 1rem; } figure img { width: 100%; height: auto; display: block; background: #fff; }
 figcaption { background: var(--soft); padding: .6rem 1.1rem; margin-top: .6rem; font-size: .95rem; }
 figcaption p { margin: .3rem 0; }
-@media screen and (max-width: 48rem) { table { display: block; overflow-x: auto; }
-  th, td { overflow-wrap: break-word; } td:not(.number) { min-width: 7rem; }
+@media screen and (max-width: 48rem) { table { display: block; overflow-x: auto; font-size: .85rem;
+    background: linear-gradient(to left, var(--back) 50%, transparent) right / 2rem 100% no-repeat local,
+    linear-gradient(to left, var(--line), transparent) right / .8rem 100% no-repeat scroll; }  /* more to the right */
+  th, td { overflow-wrap: break-word; padding-right: .7rem; } td:not(.number) { min-width: 7rem; }
   td:last-child:not(.number):not(:empty) { min-width: 20rem; }
+  table.provenance td { min-width: 0 !important; overflow-wrap: anywhere; } table.headline { font-size: .78rem; }
+  table.headline tr { display: flex; flex-wrap: wrap; } table.headline tr > * { border: 0; flex: 1; min-width: 0;
+    overflow-wrap: normal; } table.headline tr > :first-child { flex: 1.4; }
+  table.headline tbody tr { border-bottom: 1px solid var(--line); } table.headline td:last-child { flex-basis: 100%; }
+  table.headline thead th:last-child { display: none; }
+  figure::before { content: "Swipe it: it is wider than the screen."; position: sticky; left: 0; font-size: .85rem;
+    color: var(--muted); }
   figure { overflow-x: auto; } figure img { width: 46rem; max-width: none; }  /* its letters stay readable: it scrolls */
   .zoom { width: 46rem; touch-action: pan-x pan-y !important; } figcaption { position: sticky; left: 0; }
   table.numbers tbody th, table.headline th { white-space: normal; } }

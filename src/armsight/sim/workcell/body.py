@@ -10,8 +10,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from armsight.data import Array, Body, Record
+from armsight.errors import InputError
 from armsight.geometry.pose import pose, transform
 from armsight.geometry.rotation import exp_so3
 from armsight.sim.render.scene import Pattern, plate
@@ -64,6 +66,29 @@ def body_patterns() -> tuple[Pattern, ...]:
         plate(*face.size_m, DARK, [(x, y, radius, BRIGHT) for _, x, y, radius in face.discs]).on_body(face.T_body_face)
         for face in _FACES
     )
+
+
+def patterns_of(target: Composite) -> tuple[Pattern, ...]:
+    """Return what is painted of a body of discs, a plate for those of each face."""
+    discs, own = target.discs, body_target().body.points
+    if target.body.points.shape == own.shape and np.allclose(target.body.points, own, rtol=0, atol=1e-6):
+        return body_patterns()
+    if discs is None or target.parts or np.isnan(discs.normals).any():
+        raise InputError(f"{target.body.name}: simulated cameras show discs with normals, such as the demo's body.toml")
+    offsets = np.sum(discs.normals * discs.body.points, axis=1)
+    planes = np.unique(np.column_stack([discs.normals, offsets]).round(6), axis=0)
+    found = []
+    for *normal, offset in planes:
+        face = np.flatnonzero(np.all(np.abs(discs.normals - normal) < 1e-5, axis=1) & (np.abs(offsets - offset) < 1e-5))
+        points, radii, bright = discs.body.points[face], discs.radii_m[face], bool(discs.bright[face[0]])
+        T = pose(Rotation.align_vectors(normal, (0.0, 0.0, -1.0))[0].as_matrix(), np.zeros(3))
+        xy = points @ T[:3, :2]
+        low, high = (f(xy + s * 1.5 * radii[:, None], axis=0) for f, s in ((np.min, -1), (np.max, 1)))
+        T[:3, 3] = T[:3, :3] @ np.array([*(low + high) / 2, (points @ T[:3, 2]).mean()])
+        spots = [(*(p - (low + high) / 2), r, BRIGHT if bright else DARK) for p, r in zip(xy, radii, strict=True)]
+        width, height = high - low
+        found.append(plate(width, height, DARK if bright else BRIGHT, spots).on_body(T))
+    return tuple(found)
 
 
 def body_target(scale: float = 1.0, depth: float = 1.0) -> Composite:

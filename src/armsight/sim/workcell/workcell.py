@@ -32,10 +32,10 @@ from armsight.sim.camera.stages import CameraPipeline
 from armsight.sim.example_rig import board_poses
 from armsight.sim.references.inertial import InertialUnit
 from armsight.sim.render.optics import Sensor
-from armsight.sim.render.scene import chessboard
+from armsight.sim.render.scene import charuco, chessboard
 from armsight.sim.workcell.arm import Imperfections, imperfections, sample_arm
 from armsight.sim.workcell.board import configuration, gravity_duty
-from armsight.sim.workcell.body import body_patterns, body_target, body_text
+from armsight.sim.workcell.body import body_target, body_text, patterns_of
 from armsight.sim.workcell.cameras import (
     BASELINE_M,
     DISTANCE_M,
@@ -50,6 +50,9 @@ from armsight.sim.workcell.controlled import CONTROLLED, Controlled, ControlledA
 from armsight.sim.workcell.images import LENS, WorkcellCamera, picture
 from armsight.sim.workcell.motors import chosen, solids
 from armsight.sim.workcell.plant import ArmPlant
+from armsight.vision.markers.board import open_board
+from armsight.vision.markers.charuco import Charuco
+from armsight.vision.markers.chessboard import Chessboard
 from armsight.vision.markers.targets import Composite
 from armsight.vision.rig import StereoRig
 
@@ -126,6 +129,7 @@ class _Parts(NamedTuple):
     default: bool
     p_led: Array | None
     processes: bool
+    target: Composite | None
 
 
 def _standing(
@@ -211,10 +215,10 @@ class Workcell:
         self._rig, self._room, self._cameras = parts.rig, parts.room, parts.cameras
         self._T_tool_body, self._T_base_rig = parts.T_tool_body, parts.T_base_rig
         self.link, self.board = parts.link, parts.board
-        self.target: Composite = body_target()
-        self.body_text, self.chessboard_spec = body_text(), CHESSBOARD
+        self.target = parts.target or body_target()
+        self.body_text = body_text()
         clock = (lambda: self.t_s, self.advance)
-        body = (body_patterns(), self._T_tool_body)
+        body = (patterns_of(self.target), self._T_tool_body)
         led = None if parts.p_led is None or self.link is None else (parts.p_led, self.link.sync_led)
         sees = (self.plant, self._cameras, self.timing, body, clock, self._seed, parts.pipeline)
         self.source = WorkcellSource(*sees, led, processes=parts.processes)
@@ -236,28 +240,16 @@ class Workcell:
         like: Workcell | None = None,
         sync_led: bool = False,
         processes: bool = False,
+        target: Composite | None = None,
     ) -> Self:
-        """Build a workcell; a second or so.
+        """Build a workcell; a second or so. The same ``seed`` gives the same numbers.
 
-        Args:
-            arm: how far the arm is from its table: nominal, used, worn, or a TOML file.
-            cameras: ``1280x720@60``, ``1920x1080@120``, ``webcams``, a preset or TOML file of a camera, and their like.
-            seed: of all that is sampled; the same seed gives the same numbers.
-            emulator: the emulator that runs the firmware: unicorn, qemu or host.
-            rig: parallel or verging.
-            model: the table that the arm was built to; ``six_r`` by default.
-            assumed: the table that it is assumed to have, as an identification found; ``model`` by default.
-            distance_m: from the cameras to the body of the arm at home; by default what suits its size.
-            baseline_m: between the cameras.
-            noise: of the sensors, grey levels; a preset has its own.
-            like: a workcell of the same arm, seed, rig and noise: what its cameras see of the room is not cast anew.
-            sync_led: whether an LED on the board's clock is in view.
-            processes: whether each camera's images are rendered in a process of its own, which takes a second to begin:
-                for long runs.
-
-        Raises:
-            InputError: an unknown name or a bad file, or ``like`` differs in more than the cameras' rate.
-            DeviceError: the firmware is not there or does not answer.
+        ``arm``: how far it is from its table: nominal, used, worn, or a TOML file; ``model``: the table that it was built
+        to, ``assumed``: the one that it is assumed to have. ``cameras``: 1280x720@60, webcams, a preset or TOML file of a
+        camera, and their like; ``rig``: parallel or verging; ``distance_m``: to the body of the arm at home; ``noise``:
+        grey levels. ``like``: a workcell of the same arm, seed, rig and noise, whose view of the room is used again.
+        ``sync_led``: an LED on the board's clock is in view. ``processes``: each camera is rendered in a process of its
+        own, for long runs. ``target``: the body on the tool.
         """
         if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**32:
             raise InputError(f"seed {seed!r}: must be a whole number from 0 to {2**32 - 1}")
@@ -300,7 +292,9 @@ class Workcell:
         T_tool_body = mount @ exp_se3(off)
         parts = (known, timing, seed, plant, true_rig, T_base_rig, T_tool_body, seen, room)
         p_led = transform(T_base_rig, distance_m * np.array(LED_AT)) if sync_led else None
-        return cls(_Parts(*parts, pipeline, link, board, gravity, built_to.name == DEFAULT_ARM, p_led, processes))
+        return cls(
+            _Parts(*parts, pipeline, link, board, gravity, built_to.name == DEFAULT_ARM, p_led, processes, target)
+        )
 
     @property
     def t_s(self) -> float:
@@ -337,9 +331,13 @@ class Workcell:
 
         return read
 
-    def chessboard_shots(self, count: int) -> Iterator[Shot]:
-        """Show a chessboard in ``count`` poses, as a person would who calibrates, past the arm; no time passes."""
-        pattern, shown = chessboard(9, 6, 0.030), 0
+    def board_shots(self, count: int, spec: str = CHESSBOARD) -> Iterator[Shot]:
+        """Show a board in ``count`` poses, as a person would who calibrates, past the arm; no time passes."""
+        board, shown = open_board(spec), 0
+        if not isinstance(board, Chessboard | Charuco) or (isinstance(board, Charuco) and board.first):
+            raise InputError(f"{spec}: simulated cameras show a chessboard or a charuco board")
+        size = (board.columns, board.rows, board.square_m)
+        pattern = charuco(*size, board.marker_m, board.family) if isinstance(board, Charuco) else chessboard(*size)
         rng = np.random.default_rng([self._seed, 10])
         while shown < count:
             for T in board_poses(rng, self._rig, pattern, count, fill=_CHESSBOARD_FILL):
@@ -353,7 +351,7 @@ class Workcell:
 
     def picture(self, size_px: tuple[int, int] = (1280, 720)) -> Image:
         """Return the workcell as it is now, seen from the side, (H, W, 3) BGR."""
-        body = (body_patterns(), self._T_tool_body)
+        body = (patterns_of(self.target), self._T_tool_body)
         return picture(size_px, self.plant, body, (self._T_base_rig, self._rig), self._seed)
 
     @property
