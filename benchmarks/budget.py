@@ -426,10 +426,9 @@ def drawn(plan: RigPlan, count: int, rng: np.random.Generator) -> Array:
         moved += np.append(np.zeros(len(root) - 6), [*(given.mount_m * rng.standard_normal(3)), 0, 0, 0])
         for first in (0, rig.left.parameters.size):
             moved[first : first + 2] += given.lens_share * rng.standard_normal() * rig.left.intrinsics[:2]
-        off = given.body_sigma_m[0] * rng.standard_normal(points.shape)
-        off += normals * (
-            given.body_sigma_m[1] * rng.standard_normal((len(points), 1)) - (off * normals).sum(1)[:, None]
-        )
+        off = given.body_sigma_m[0] * rng.standard_normal(points.shape)[plan.marker_of]
+        away = given.body_sigma_m[1] * rng.standard_normal((len(points), 1))[plan.marker_of]
+        off += normals * (away - (off * normals).sum(1)[:, None])
         body = points * (1 + given.body_scale * rng.standard_normal()) + off
         v = given.speed_m_s / np.sqrt(3) * np.append(rng.standard_normal(3), np.zeros(3))
         T, late = seen.T_left_body, given.skew_s + given.start_s * rng.standard_normal()

@@ -78,6 +78,7 @@ def budget_report(found: RigBudget, alternatives: Sequence[Alternative] = (), ru
             ],
         ),
         "map": ("Over the volume", [Plot("volume", partial(_map, found.found), caption, title)]),
+        "missing": ("Not in the budget", [Fact(f"not in the budget: {why}") for why in NOT_MODELLED]),
     }
     notes = [
         *(
@@ -86,7 +87,6 @@ def budget_report(found: RigBudget, alternatives: Sequence[Alternative] = (), ru
             else []
         ),
         Note("note", f"chosen: {_chosen(plan)}"),
-        *(Note("note", f"not in the budget: {why}") for why in NOT_MODELLED),
     ]
     headline = f"{plan.cameras.text}; {plan.baseline} apart, volume {plan.volume} at {plan.distance}"
     return Report("budget", "Before you buy", plan.volume, headline, sections, notes, values, "budget", _answer(found))
@@ -120,21 +120,18 @@ def _compared(alternatives: Sequence[Alternative]) -> list[TextTable]:
     """Return the table of alternatives; those of one group differ by less than the prediction is off."""
     if not alternatives:
         return []
-    asked = [_asked(one.budget.plan) for one in alternatives]
-    rows = tuple(
-        (
-            each.pop("camera"),
-            str(one.price),
-            "ABCDEFGHIJ"[one.group],
-            f"{one.budget.mm:.2g}",
-            f"{one.budget.deg:.2g}",
-            *map(str, each.values()),
-        )
-        for one, each in zip(alternatives, asked, strict=True)
-    )
-    columns = ("camera", "price class", "group", "mm", "deg", *asked[0])
+    reached, build = list[tuple[str, ...]](), list[tuple[str, ...]]()
+    for one in alternatives:
+        asked = _asked(one.budget.plan)
+        name, lens = asked.pop("camera"), f"{asked.pop('focal_widths')} ({asked.pop('focal_mm')} mm)"
+        found = (str(one.price), "ABCDEFGHIJ"[one.group], f"{one.budget.mm:.2g}", f"{one.budget.deg:.2g}")
+        reached.append((name, *found))
+        build.append((name, lens, *map(str, asked.values())))
     title = "the best of each class, 95 % in motion; those of one group differ by less than predictions are off"
-    return [TextTable(title, columns, rows)]
+    return [
+        TextTable(title, ("camera", "price class", "group", "mm", "deg"), tuple(reached)),
+        TextTable("what to build for it", ("camera", "focal_widths", *asked), tuple(build)),
+    ]
 
 
 def _answer(found: RigBudget) -> tuple[Grade, str]:
@@ -151,7 +148,7 @@ def _answer(found: RigBudget) -> tuple[Grade, str]:
     asked = f"{1e3 * requested[0]:g} mm" + (f", {math.degrees(requested[1]):g} deg" if requested[1] else "")
     grade: Grade = "good" if found.reached(move) else "fair" if found.reached(rest) else "poor"
     body_m = found.worst_m("print of the body")
-    floor = f" The print of the body alone costs {1e3 * body_m:.2g} mm: no camera reaches it."
+    floor = f" The print of the body alone costs {1e3 * body_m:.2g} mm: no camera reaches less."
     reached = {"good": "reached", "fair": "reached at rest only", "poor": "not reached"}[grade]
     return grade, f"{asked} requested: {reached}. {said}.{costs}.{floor if body_m > requested[0] else ''}"
 
@@ -175,11 +172,14 @@ def _map(found: Budget) -> Figure:
     figure = new_figure(3.2)
     ax = figure.subplots()
     level = 1e3 * found.at_level(found.cov())[0]
-    across, deep = 1e3 * found.p_left[:, 0], 1e3 * (found.p_left @ found.forward)
-    order = np.argsort(level)
-    shown = ax.scatter(across[order], deep[order], c=level[order], s=420, marker="s", cmap="viridis")
-    for k in order:
-        ax.annotate(f"{level[k]:.2f}", (across[k], deep[k]), ha="center", va="center", fontsize=7, color="white")
+    order = np.argsort(-level)
+    seen = np.round(1e4 * np.column_stack([found.p_left[:, 0], found.p_left @ found.forward]))[order]
+    k = order[np.unique(seen, axis=0, return_index=True)[1]]  # the worst height of each column
+    across, deep, level = 1e3 * found.p_left[k, 0], 1e3 * (found.p_left[k] @ found.forward), level[k]
+    shown = ax.scatter(across, deep, c=level, s=420, marker="s", cmap="viridis")
+    for x, y, each in zip(across, deep, level, strict=True):
+        dark = each < (level.min() + level.max()) / 2
+        ax.annotate(f"{each:.2f}", (x, y), ha="center", va="center", fontsize=7, color="white" if dark else "black")
     figure.colorbar(shown, ax=ax, label="mm")
     ax.set(xlabel="across, mm", ylabel="depth, mm")
     ax.margins(0.2)

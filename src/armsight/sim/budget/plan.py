@@ -31,13 +31,12 @@ from armsight.vision.calibrate.budget import (
     Budget,
     Conditions,
     calibration_covariance,
+    gate_px,
     of_three,
     pose_budget,
     volume_views,
 )
 from armsight.vision.camera import Camera
-from armsight.vision.discs.pairing import GATE_SIGMAS as PLANE_SIGMAS
-from armsight.vision.discs.pairing import UNMODELLED_PX
 from armsight.vision.follow.follower import APART_S
 from armsight.vision.markers.aprilgrid import AprilGrid
 from armsight.vision.markers.board import BOARDS, open_board
@@ -46,9 +45,7 @@ from armsight.vision.markers.charuco import Charuco
 from armsight.vision.markers.chessboard import Chessboard
 from armsight.vision.markers.marker import CalibrationBoard
 from armsight.vision.markers.targets import Composite, read_layout
-from armsight.vision.match import GATE_PX, GATE_SIGMAS
 from armsight.vision.pose.predict import PredictedView
-from armsight.vision.pose.shutter import LOOSE_PX
 from armsight.vision.rig import StereoRig
 
 #: A disc's diameter, a tag's and a square's side in the image below which detection is left to luck, px; half: half of them
@@ -118,6 +115,12 @@ def length_m(text: str, what: str) -> float:
     if found is None:
         raise InputError(f"{what} {text!r}: expected a length with its unit, such as 0.8m or 300mm")
     return float(found[1]) * _UNITS[found[2]]
+
+
+def _up(value: float) -> str:
+    """Return a number with two digits that is not below it."""
+    unit = 10 ** (math.floor(math.log10(value)) - 1)
+    return f"{math.ceil(value / unit - 1e-9) * unit:.2g}"
 
 
 def _plain(value: object) -> object:
@@ -433,13 +436,6 @@ class RigPlan:
         """Whether the exposures are so far apart that `run` and `live` search with a wider epipolar gate."""
         return max(self.timing["skew"], self.timing["start"]) > APART_S
 
-    def _gate_px(self, noise_px: float) -> float:
-        """Return how far a marker may be off its epipolar line, px."""
-        noise_px = math.hypot(noise_px, LOOSE_PX if self.apart else noise_px)
-        if self.layout.discs is not None:
-            return PLANE_SIGMAS * math.sqrt(2) * math.hypot(noise_px, UNMODELLED_PX)
-        return max(GATE_PX, GATE_SIGMAS * math.sqrt(2) * noise_px)
-
     def defocus_px(self, distance_m: float) -> float:
         """Return the radius of the blur away from the lens's focus, px: aperture times the difference of dioptres."""
         c = self.cameras
@@ -476,7 +472,7 @@ class RigPlan:
         if near < c.least_focus_m:
             raise InputError(
                 f"the lens of {c.name} does not focus nearer than {c.least_focus_m:g} m, the volume begins at {near:.2g} m"
-                f": a distance of {c.least_focus_m + size[2] / 2:.2g} m can be had"
+                f": a distance of {_up(c.least_focus_m + size[2] / 2)} m can be had"
             )
         if t["exposure"] > 1 / t["rate"]:
             raise InputError(
@@ -498,14 +494,15 @@ class RigPlan:
                 least = needed * self.focal_px / pixels + size[2] / 2
                 raise InputError(
                     f"the field of view is {seen:.2g} m {what} at {near:.2g} m, volume and body are {needed:.2g} m: "
-                    f"a distance of {least:.2g} m, or focal_widths = {near / needed * pixels / width:.2g}"
+                    f"a distance of {_up(least)} m, or focal_widths = {near / needed * pixels / width:.2g}"
                 )
         kind, px = self.marker(far)
         least_px = _LEAST_PX[kind]
         if px < least_px:
+            scale = "" if self.body else f" (body_scale = {_up(self.body_scale * least_px / px)})"
             raise InputError(
-                f"a {kind} is {px:.1f} px at {far:.2g} m, at least {least_px:g} are needed: markers {least_px / px:.1f} "
-                f"times as large (body_scale = {self.body_scale * least_px / px:.2g})"
+                f"a {kind} is {px:.1f} px at {far:.2g} m, at least {least_px:g} are needed: markers {_up(least_px / px)} "
+                f"times as large{scale}"
             )
         lost = sum(len(one.paired) < 3 for one in self.views)
         if lost:
@@ -543,7 +540,7 @@ class RigPlan:
         return Conditions(
             noise, self._cov_calibration(), self.board_print, self.marker_of, bent, self.body_size, mount, lens,
             t["skew"], t["start"], t["readout"], t["stamp"], speed, rotation,
-            self._gate_px(math.sqrt(sum(each**2 for each in noise.values()))),
+            gate_px(self.layout, self.focal_px / self.distance_m, math.hypot(*noise.values()), apart=self.apart),
             self.handeye_errors if self.arm else (0.0, 0.0), arm,
         )  # fmt: skip
 

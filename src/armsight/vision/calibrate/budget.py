@@ -8,6 +8,7 @@ What several causes share (the velocity that skew and readout multiply) adds bef
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -16,11 +17,18 @@ from scipy.special import erf, gammaincinv
 
 from armsight.data import Array, Ids, Record
 from armsight.errors import InputError
+from armsight.estimate.chance import chi_square_limit
 from armsight.geometry.pose import transform
 from armsight.geometry.rotation import exp_so3
 from armsight.vision.calibrate.boards import printed_board, rigid_board
+from armsight.vision.discs.assign import GATE_QUANTILE
+from armsight.vision.discs.pairing import GATE_SIGMAS as PLANE_SIGMAS
+from armsight.vision.discs.pairing import UNMODELLED_PX, UNMODELLED_SHARE
+from armsight.vision.markers.targets import Composite
+from armsight.vision.match import GATE_PX, GATE_SIGMAS
 from armsight.vision.pose.bundle import BundleState, Observations, minimise
 from armsight.vision.pose.predict import PoseDerivatives, PredictedView, pose_derivatives, view
+from armsight.vision.pose.shutter import LOOSE_PX
 from armsight.vision.rig import StereoRig
 
 #: Share of errors that a figure "at 95 %" covers.
@@ -214,6 +222,21 @@ def pose_budget(rig: StereoRig, points: Array, normals: Array, views: list[Predi
     # What is not seen at one position has as many sources as at the others.
     factors = {name: _stacked([one.get(name) for one in found]) for name in CAUSES if any(name in one for one in found)}
     return Budget(np.array(at), forward / np.linalg.norm(forward), factors, np.array(lost))
+
+
+def gate_px(layout: Composite, per_m: float, noise_px: float, *, apart: bool) -> float:
+    """Return how far a body's markers may be off their epipolar lines, px; ``per_m``: pixels of a metre there.
+
+    Where the exposures are ``apart``, `run` and `live` search with a wider gate.
+    """
+    noise_px = math.hypot(noise_px, LOOSE_PX if apart else noise_px)
+    if not (count := layout.disc_count):
+        return max(GATE_PX, GATE_SIGMAS * math.sqrt(2) * noise_px)
+    # One pair by its planes, and all of them by the chi-square of the pose, half of the distance in each image.
+    variance, size_m = noise_px**2 + UNMODELLED_PX**2, float(np.linalg.norm(np.ptp(layout.body.points, axis=0)))
+    made = (UNMODELLED_SHARE * size_m * per_m) ** 2
+    whole = 2 * (variance + made) * chi_square_limit(4 * count - 6, 1 - GATE_QUANTILE) / count
+    return math.sqrt(min(2 * PLANE_SIGMAS**2 * variance, whole))
 
 
 def _gated(
