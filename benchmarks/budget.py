@@ -117,7 +117,7 @@ KITS = {
     ),
     "Machine vision": (
         {"camera": "machine-vision-2mp", "baseline": "250mm"},
-        "At this distance the print decides; it is for small, far discs.",
+        "Here the print decides; it is for small, far discs.",
     ),
 }
 #: Board and body, measured after printing.

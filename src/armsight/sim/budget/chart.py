@@ -64,16 +64,10 @@ class Chart(NamedTuple):
 
 
 def marker_noise(pipeline: CameraPipeline, kind: str, size_px: float, moved_px: float = 0.0) -> float:
-    """Return the standard deviation of one marker's position along one axis, px.
+    """Return the standard deviation of the position of a disc, tag or chessboard corner along one axis, px.
 
-    Args:
-        pipeline: the camera's stages.
-        kind: disc, tag or chessboard.
-        size_px: diameter of a disc, side of a tag or of a square in the image.
-        moved_px: way of the marker during the exposure.
-
-    Raises:
-        InputError: at this size, or so blurred, most of such markers are not found.
+    ``size_px``: a disc's diameter, side of a tag or square; ``moved_px``: its way during the exposure. InputError: at
+    this size, or so blurred, most of such markers are not found.
     """
     at = math.log(min(size_px, _LAST_PX) / _FIRST_PX) / math.log(_RATIO)
     way = min(_WAYS, key=lambda each: abs(each - moved_px / size_px))
