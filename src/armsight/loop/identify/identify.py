@@ -239,7 +239,7 @@ def identify(
 ) -> Identified:
     """Fit an arm to all poses.
 
-    Args, errors: as :func:`~armsight.loop.identify.validate.identify_held_out`, which also evaluates it.
+    Args, errors: as ``armsight.identify``, which also evaluates it.
     """
     model, x, prior, seen = _begun(arm, measured, priors, progress)
     progress("base and tool")
