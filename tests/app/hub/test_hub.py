@@ -99,6 +99,20 @@ def test_a_cell_that_began_before_its_hub_arrives_with_all_its_events(hub_at, ce
     assert [each["kind"] for each in json.loads(fetched(hub, "events"))] == ["ended", "health", "health", "began"]
 
 
+def test_a_storm_of_findings_is_thinned_counted_and_said(hub_at, cell_at, port, wait):
+    """What arrives, what the outbox left out and what the queue before it dropped are all."""
+    hub, cell = hub_at(port), cell_at(f"a@127.0.0.1:{port}")
+    for number in range(3000):
+        cell.put(NoteDatum(0.0, f"storm {number}", "warning"))
+    wait(lambda: not cell._queue)
+    cell.close()
+    wait(lambda: shown(hub)["a"]["level"] == -1)
+    events = hub._store.events()
+    left_out = sum(int(each["text"].split()[0]) for each in events if each["kind"] == "thinned")
+    assert left_out + sum(each["kind"] == "health" for each in events) == 3000
+    assert left_out > 2500
+
+
 def test_events_arrive_once_although_the_hub_is_killed(hub_at, cell_at, port, tmp_path, wait):
     code = (
         "import sys, threading; from pathlib import Path; from armsight.app.hub.service import Hub;"
@@ -314,6 +328,12 @@ def test_an_address_beyond_this_computer_needs_keys(tmp_path):
         Hub(tmp_path, "tcp/0.0.0.0:7447", "127.0.0.1:0", None, print)
     with pytest.raises(InputError, match="needs the keys of a site"):
         Hub(tmp_path, "tls/0.0.0.0:7447", "127.0.0.1:0", None, print)
+
+
+def test_thirty_tabs_are_one_look_at_the_cells(hub_at, port, monkeypatch):
+    monkeypatch.setattr("armsight.app.hub.service._STATE_S", 600.0)
+    hub = hub_at(port)
+    assert len({fetched(hub, "state") for _ in range(30)}) == 1
 
 
 def test_a_page_of_another_name_is_answered_nothing(hub_at, port):

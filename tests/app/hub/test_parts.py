@@ -1,5 +1,6 @@
 """The parts of a hub by themselves: who a cell is, its outbox, its keys, drifts, the order of cells, the store, a push."""
 
+import errno
 import json
 import math
 import time
@@ -91,7 +92,7 @@ def test_a_storm_of_events_is_thinned_counted_and_said(tmp_path, monkeypatch):
     *_, said, last = box.waiting(10**9)
     assert (said["kind"], last["text"]) == ("thinned", "after")
     left_out = 3000 - sum(each["kind"] == "health" for each in box.waiting(10**9)) + 1
-    assert said["text"].startswith(f"{left_out} events were left out")
+    assert said["text"].startswith(f"{left_out} events or shots were left out")
     box.close()
 
 
@@ -214,7 +215,10 @@ def test_the_store_keeps_each_event_once_and_finds_it(tmp_path):
     assert store.add_events("lab", "a", message, 6.0) == 3
     assert store.add_events("lab", "a", message, 7.0) == 3
     assert store.add_events("lab", "a", {"events": []}, 7.0) == 0
-    assert store.count() == 3
+    ahead = {"outbox": "y", "events": [{**event, "n": 1, "t": 5.0 + 365 * 86400, "text": "of a clock a year ahead"}]}
+    assert store.add_events("lab", "b", ahead, 5.5) == 1
+    assert [(each["cell"], each["n"]) for each in store.events()] == [("a", 3), ("a", 2), ("a", 1), ("b", 1)]
+    assert store.count() == 4
     assert len(store.events("RIG off_axis")) == 3
     assert store.events("rig offXaxis") == store.events("'; DROP TABLE events") == []
     with pytest.raises(InputError, match="another hub uses it"):
@@ -225,6 +229,23 @@ def test_the_store_keeps_each_event_once_and_finds_it(tmp_path):
     duckdb = pytest.importorskip("duckdb")
     query = f"SELECT cell, day, error_mm FROM read_parquet('{tmp_path}/states/*/*/*.parquet', hive_partitioning = true)"
     assert [(str(c), str(d), e) for c, d, e in duckdb.sql(query).fetchall()] == [("lab.a", "1970-01-01", 0.05)]
+
+
+def test_on_a_full_disk_the_cells_keep_their_events(tmp_path):
+    store = Store(tmp_path)
+    (pages,) = store._db.execute("PRAGMA page_count").fetchone()
+    store._db.execute(f"PRAGMA max_page_count = {pages}")
+    message = {"outbox": "x", "events": [{"n": n, "text": "x" * 2000} for n in range(1, 9)]}
+    assert store.add_events("lab", "a", message, 6.0) == 0
+    assert store.problem == "events are not stored, the cells keep them: database or disk is full"
+    cell = connected("a", 1000.0)
+    (tmp_path / "states").write_text("")  # nor can states be written
+    store.add_state(cell, cell.state)
+    store.flush()
+    store._db.execute("PRAGMA max_page_count = 1000000")
+    assert store.add_events("lab", "a", message, 7.0) == 8
+    assert store.problem.startswith("states are not stored: ")
+    store.close()
 
 
 def test_numbers_in_names_count_as_numbers():
@@ -284,6 +305,39 @@ def test_a_push_makes_no_bucket(tmp_path, armsight):
     Buckets.pseudo_dirs.append("archive")
     assert armsight("hub", "push", folder, "buckets://archive/x", "--cell", "a", "--json").code == 0
     assert sum(name.endswith("manifest.json") for name in Buckets.store) == 2
+
+
+def test_a_store_that_is_full_or_does_not_answer_is_one_line(tmp_path, armsight, monkeypatch):
+    import asyncio
+
+    import fsspec
+    from fsspec.asyn import AsyncFileSystem
+    from fsspec.implementations.memory import MemoryFileSystem
+
+    class Silent(AsyncFileSystem):
+        protocol = "silent"
+
+        async def _exists(self, path, **kwargs):
+            await asyncio.sleep(60.0)
+
+    class Full(MemoryFileSystem):
+        protocol, store, pseudo_dirs, root_marker = "full", {}, ["", "archive"], ""
+
+        @classmethod
+        def _strip_protocol(cls, path):
+            return path.removeprefix("full://").strip("/")
+
+        def _open(self, *arguments, **named):
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    for kind in (Silent, Full):
+        fsspec.register_implementation(kind.protocol, kind, clobber=True)
+    monkeypatch.setattr("armsight.app.hub.push._ANSWER_S", 0.2)
+    folder = runs(tmp_path / "runs")
+    said = armsight("hub", "push", folder, "silent://bucket", "--cell", "a")
+    assert_rejected(said, "silent://bucket: no answer for 0 s; started again it goes on where it was")
+    said = armsight("hub", "push", folder, "full://archive", "--cell", "a")
+    assert_rejected(said, "full://archive: No space left on device; started again it goes on where it was")
 
 
 def test_clocks_of_two_tables(tmp_path, armsight):
@@ -346,6 +400,7 @@ def test_half_a_pair_of_utf_16_is_stored_as_a_question_mark(tmp_path):
     store.close()
     assert store.problem == ""
     assert parsed(b"") == "a message that is no JSON"
+    assert parsed(bytes(10_000_000)) == "a message of 10000000 bytes: at most 65536 are read"
 
 
 def test_unreadable_events_do_not_hold_up_the_others(tmp_path):

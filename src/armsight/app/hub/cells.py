@@ -68,9 +68,8 @@ ENDED, WELL, LOOK, DRIFTING, FINDING, LOST = range(-1, 5)
 
 def number(value: object) -> float | None:
     """Return a number of JSON; None where it is none, or not finite."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e300:
-        return None
-    return float(value)
+    is_none = isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e300
+    return None if is_none else float(value)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
@@ -220,8 +219,7 @@ class CellView:
 
     def _odd(self, now_s: float) -> str:
         """Return what is worth a look and forbids nothing."""
-        state, limit = self.state, self.about.get("limit_mm")
-        error, missed = state.get("error_mm"), state.get("missed")
+        limit, error, missed = self.about.get("limit_mm"), self.state.get("error_mm"), self.state.get("missed")
         if len(self.sessions) > 1:
             return f"{len(self.sessions)} processes have this name: give each cell its own"
         if abs(self.offset_s) > _CLOCK_S:

@@ -53,8 +53,8 @@ def command(
 
     check_folder(output, problem="no hub can be kept here")
     host_and_port(http, "--http")
-    listening = endpoint(listen, "--listen")
-    hub = Hub(output, listening, http, keys, lambda line: click.echo(f"note: {line}", err=True), mqtt)
+    note = lambda line: click.echo(f"note: {line}", err=True)  # noqa: E731
+    hub = Hub(output, endpoint(listen, "--listen"), http, keys, note, mqtt)
     try:
         if as_json:
             click.echo(json.dumps({"address": hub.pages.address, "listen": listen, "directory": str(output)}))

@@ -21,6 +21,8 @@ from armsight.errors import ArmsightError, InputError
 
 #: bytes that are read and sent at once; half: more calls, double: a coarser limit of the rate.
 _CHUNK = 1 << 20
+#: s that a store may take for its first answer; half: a slow one is not used, double: a dead one keeps the cell longer.
+_ANSWER_S = 30.0
 _MANIFEST = "manifest.json"
 
 
@@ -60,7 +62,9 @@ def push(cell: Cell, folder: Path, store: str, rate_mb_s: float, advance: Callab
     resting = Outbox(state_folder() / "cells" / cell.site / cell.name, cell.name)
     try:
         fs, root = fsspec.core.url_to_fs(store)
-        if (bucket := root.partition("/")[0]) and not fs.exists(bucket):  # s3fs would make one of a mistyped name
+        # By itself s3fs waits for minutes, and the cell with it; and it makes a bucket of a mistyped name.
+        waits = {"timeout": _ANSWER_S} if fs.async_impl else {}
+        if (bucket := root.partition("/")[0]) and not fs.exists(bucket, **waits):
             raise InputError(f"{store}: no {bucket!r} is there, or it cannot be reached: is its name right?")
         for run in runs:
             day = datetime.fromtimestamp(min(each.stat().st_mtime for each in _files(run)), UTC)
@@ -71,8 +75,8 @@ def push(cell: Cell, folder: Path, store: str, rate_mb_s: float, advance: Callab
     except (ImportError, ValueError) as error:
         raise InputError(f"{store}: {error}") from None
     except Exception as error:  # noqa: BLE001 - a store's library has errors of its own; our own code has its tests
-        why = error.strerror if isinstance(error, OSError) else None
-        raise ArmsightError(f"{store}: {why or error}; started again it goes on where it was") from None
+        why = getattr(error, "strerror", None) or str(error) or f"no answer for {_ANSWER_S:.0f} s"
+        raise ArmsightError(f"{store}: {why}; started again it goes on where it was") from None
     finally:
         resting.close()
 

@@ -37,10 +37,7 @@ _GAUGES = {
     "cell_temperature_celsius": ("temperature_c", "of the hottest motor"),
     "cell_clock_seconds": ("clock_s", "the cell's clock less the hub's"),
 }
-_OF_HUB = {
-    "hub_events": ("gauge", "events stored"),
-    "hub_dropped_total": ("counter", "states dropped because too many waited"),
-}
+_OF_HUB = {"hub_events": ("gauge", "events"), "hub_dropped_total": ("counter", "states dropped: too many waited")}
 #: s between two events of rejected connections; half: twice as many from a cell with a wrong key, double: counted later.
 _REJECTED_S = 60.0
 #: s after which a cell that did not say who it is is asked again; half: nothing, double: its limit is missing longer.

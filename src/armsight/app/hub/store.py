@@ -31,7 +31,6 @@ _MOST = 1_000_000
 _TABLES = (
     "CREATE TABLE IF NOT EXISTS events (site TEXT, cell TEXT, outbox TEXT, n INTEGER, t REAL, arrived REAL, kind TEXT,"
     " level TEXT, text TEXT, PRIMARY KEY (site, cell, outbox, n)) WITHOUT ROWID",
-    "CREATE INDEX IF NOT EXISTS by_time ON events (t)",
     "CREATE INDEX IF NOT EXISTS by_arrival ON events (arrived)",
     "CREATE TABLE IF NOT EXISTS cells (site TEXT, cell TEXT, about TEXT, PRIMARY KEY (site, cell))",
 )
@@ -108,7 +107,7 @@ class Store:
         return cells
 
     def events(self, words: str = "", site: str = "", cell: str = "") -> list[dict[str, Any]]:
-        """Return the newest events that hold all words, of one cell where it is named."""
+        """Return the events that hold all words, of one cell where it is named, in the order of their arrival."""
         where, values = ["1"], list[str]()
         for word in words.split()[:8]:
             where.append("(text || ' ' || kind || ' ' || level || ' ' || site || ' ' || cell) LIKE ? ESCAPE '\\'")
@@ -118,7 +117,7 @@ class Store:
                 where.append(f"{key} = ?")
                 values.append(value)
         names = "site, cell, n, t, arrived, kind, level, text"
-        query = f"SELECT {names} FROM events WHERE {' AND '.join(where)} ORDER BY t DESC, n DESC LIMIT {_FOUND}"
+        query = f"SELECT {names} FROM events WHERE {' AND '.join(where)} ORDER BY arrived DESC, n DESC LIMIT {_FOUND}"
         found: list[dict[str, Any]] = []
         with closing(sqlite3.connect(self._folder / "events.sqlite", timeout=0.2)) as db:
             end, db.row_factory = time.monotonic() + _SEARCH_S, sqlite3.Row

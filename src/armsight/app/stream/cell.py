@@ -129,7 +129,7 @@ class CellSink(Sink):
         self._cell, self._published, self._mode = cell, published, mode
         self._outbox = Outbox(state_folder() / "cells" / cell.site / cell.name, cell.name)
         self._lock = threading.Lock()  # of the outbox: this thread adds, the other one sends
-        self._window, self._shots, self._findings = _Window(), 0, tuple[str, ...]()
+        self._window, self._shots, self._dropped, self._findings = _Window(), 0, 0, tuple[str, ...]()
         self._began = self._state_at = time.monotonic()
         self._looked = 0.0
         self._newest: Shot | None = None
@@ -237,6 +237,8 @@ class CellSink(Sink):
     def _event(self, kind: str, level: str, text: str) -> None:
         with self._lock:
             event = {"t": round(time.time(), 3), "kind": kind, "level": level, "text": text[:2000]}
+            self._outbox.thinned += self.dropped - self._dropped
+            self._dropped = self.dropped
             self._outbox.add(event, thin=kind == "health")
 
     def about(self) -> dict[str, Any]:

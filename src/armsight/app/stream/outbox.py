@@ -71,7 +71,7 @@ class Outbox:
         self._left = max(self._left - 1.0, 0.0)
         try:
             if self.thinned and (self._left > 1.0 or not thin):
-                text = f"{self.thinned} events were left out: too many at once, or the disk is full"
+                text = f"{self.thinned} events or shots were left out: too many at once, or the disk is full"
                 self._store({**event, "kind": "thinned", "level": "warning", "text": text})
                 self.thinned = 0
             self._store(event)
