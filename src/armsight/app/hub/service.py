@@ -203,6 +203,7 @@ class Hub:
                 ask = not cell.about and at_s - cell.asked_s > _ASK_AGAIN_S
             if ask:
                 cell.asked_s = at_s
+                self._store.keep_about(cell)  # it is known after a restart, whether it answers or not
                 self._asking.submit(self._ask_about, cell)
 
     def _ask_about(self, cell: CellView) -> None:
