@@ -121,7 +121,12 @@ def _no_text(path: str | Path, error: UnicodeDecodeError) -> str:
 def read_json(path: str | Path, what: str = "") -> Any:  # noqa: ANN401 - whatever JSON holds
     """Read a JSON file.
 
-    ``what``: it is expected to be, for the message: "a rig file".
+    Args:
+        path: the file.
+        what: what the file is expected to be, for the message: "a rig file".
+
+    Raises:
+        InputError: as :func:`read_text`, or not JSON; the message names the line.
     """
     return parsed_json(read_text(path), path, what)
 
@@ -129,7 +134,14 @@ def read_json(path: str | Path, what: str = "") -> Any:  # noqa: ANN401 - whatev
 def require_version(path: str | Path, what: str, version: object, newest: int) -> None:
     """Reject what a newer armsight wrote.
 
-    ``what``: it is, for the message. ``version``: as the file says; what is no number passes.
+    Args:
+        path: the file.
+        what: what the file is, for the message: "rig file".
+        version: as the file says; what is no number passes.
+        newest: version that this armsight knows.
+
+    Raises:
+        InputError: it is newer.
     """
     if isinstance(version, int | float) and version > newest:
         raise InputError(f"{path}: {what} version {version}, this armsight reads up to {newest}: update armsight")

@@ -46,7 +46,7 @@ class HealthFinding:
     """Something that no longer holds, and because of which results must not be trusted.
 
     Attributes:
-        cause: what is wrong.
+        cause: what is wrong: rig, body, fixed, time, lens, joint, estimator, host.
         what: what was found, one sentence.
         since_s: since when, s on the clock of the shots; None where the shots have no times.
         size: by how much, in ``unit``.

@@ -382,8 +382,26 @@ def _bounded(
 ) -> int:
     """Write a command with a changed correction, as far as the limits allow.
 
+    Args:
+        q: (2, n) the motion's joints now and ahead, rad.
+        qd: (2, n) their speeds, rad/s.
+        J: (6, n) Jacobian.
+        q_min: (n,) least angles, rad.
+        q_max: (n,) largest angles, rad.
+        qd_max: (n,) largest speeds, rad/s.
+        most: (n,) largest change of the correction, rad.
+        most_rad: largest correction, rad.
+        most_m: largest displacement of the tool by it, m.
+        period_s: in which the joints are to be there, s.
+        correction: (n,) correction before, rad.
+        change: (n,) change asked of it, rad.
+        wished: (n,) written: the correction without limits of the angles, rad.
+        now: (n,) written: the correction, rad.
+        q_ref: (n,) written: the command, rad.
+        qd_ref: (n,) written: its speeds, rad/s.
+
     Returns:
-        Return how many joints a limit keeps from being corrected further; beyond n the tool's displacement is bounded.
+        Number of joints that a limit keeps from being corrected further; beyond n where the tool's displacement is bounded.
     """
     joints = q.shape[1]
     square, limited = 0.0, 0

@@ -89,10 +89,18 @@ def gate(rig: StereoRig, body: Body, seen: Correspondences) -> Correspondences:
 def match(
     rig: StereoRig, body: Body, left: Detections, right: Detections, *, symmetries: tuple[Ids, ...] = ()
 ) -> Correspondences:
-    """Match one shot's detections: identity, then the epipolar gate; points seen by one camera are kept.
+    """Match one shot's detections: identity, then the epipolar gate.
 
-    ``symmetries``: permutations (M,) under which the body looks the same, so that its points may have been named by any
-    of them; the one with which most pairs agree with the rig is applied to the right camera.
+    Args:
+        rig: the calibrated pair.
+        body: the body of both detections.
+        left: detections of the left camera.
+        right: detections of the right camera.
+        symmetries: permutations (M,) under which the body looks the same, so that its points may have been named by any
+            of them; the one with which most pairs agree with the rig is applied to the right camera.
+
+    Returns:
+        The correspondences; points seen by one camera only are kept, for they constrain the pose too.
     """
     best = join(left, right)
     if symmetries and best.paired.any():

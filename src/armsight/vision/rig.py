@@ -175,8 +175,10 @@ class StereoRig(Record):
     def cov_with(self, common: Array) -> Array:
         """Return the covariance (P, P) of the rig's parameters as an image shows them.
 
-        What moves all points of a camera's image by c + k x, ``common`` (2, 2, 3), is another principal point and focal
-        length.
+        What moves all points of an image by c + k x is another principal point and focal length.
+
+        Args:
+            common: (2, 2, 3) of each camera, as :class:`~armsight.data.Correspondences` have it.
         """
         cov = np.array(self.cov)
         for first, camera, shifts in zip((0, 4 + len(self.left.distortion)), self.cameras, common, strict=True):
@@ -257,7 +259,11 @@ class StereoRig(Record):
         return rectify(self)
 
     def save(self, path: str | Path) -> None:
-        """Write the rig as JSON, in one step; InputError if it cannot be written."""
+        """Write the rig as JSON, in one step.
+
+        Raises:
+            InputError: the file cannot be written.
+        """
         write_text(path, self.to_text())
 
     def to_text(self) -> str:
@@ -290,12 +296,20 @@ class StereoRig(Record):
 
     @staticmethod
     def load(path: str | Path) -> StereoRig:
-        """Read a rig file; InputError names it where it is missing, no rig, of a newer version, or inconsistent."""
+        """Read a rig file.
+
+        Raises:
+            InputError: missing, not a rig, of a newer version, or inconsistent; the message names the file.
+        """
         return StereoRig.from_text(read_text(path), path)
 
     @staticmethod
     def load_trusted(path: str | Path) -> StereoRig:
-        """Return the rig of a file to measure with; InputError also where its calibration contradicts its images."""
+        """Return the rig of a file to measure with.
+
+        Raises:
+            InputError: as :meth:`load`, or its calibration said that its images contradict each other.
+        """
         rig = StereoRig.load(path)
         if (by_px := rig.provenance.get(CONTRADICTED)) is not None:
             raise InputError(
@@ -306,7 +320,11 @@ class StereoRig(Record):
 
     @staticmethod
     def from_text(text: str, path: str | Path) -> StereoRig:
-        """Return the rig of a rig file's text, errors as :meth:`load`; ``path`` is where it comes from, for messages."""
+        """Return the rig of a rig file's text; ``path`` is where it comes from, for messages.
+
+        Raises:
+            InputError: not a rig, of a newer version, or inconsistent; the message names the file.
+        """
         document = _document(text, path)
         try:
             left, right = (_camera(document[side]) for side in ("left", "right"))

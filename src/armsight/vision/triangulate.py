@@ -232,9 +232,16 @@ def _ahead(p: Array, ray_left: Array, q: Array, ray_right: Array) -> bool:
 
 
 def triangulate(rig: StereoRig, body: Body, seen: Correspondences) -> Points:
-    """Triangulate one shot's gated correspondences; the rig's ``sigma_px`` adds to the detections' covariance.
+    """Triangulate one shot's matched points.
 
-    A point that does not lie before both cameras is dropped by name, and its detections with it.
+    Args:
+        rig: the calibrated pair; its ``sigma_px`` adds to the detections' covariance.
+        body: names the points.
+        seen: the correspondences of both cameras, gated.
+
+    Returns:
+        The points with their covariance; a point that does not lie before both cameras is dropped by name, and its
+        detections with it.
     """
     rows = np.flatnonzero(seen.paired)
     cov_uv = seen.cov_uv[rows] + max(rig.sigma_px, 1e-6) ** 2 * np.eye(2)

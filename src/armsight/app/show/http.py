@@ -1,8 +1,7 @@
 """A few pages over HTTP, read only, in threads of their own: for health checks, metrics, and people on this computer.
 
-Another computer needs the token of :attr:`Pages.address`. A name that is not this server's gets no answer: a foreign
-page in
-the same browser could bring one (DNS rebinding).
+Another computer needs the address with the token that :attr:`Pages.address` has. A name that is not this server's gets
+no answer: a foreign page in the same browser could bring one (DNS rebinding).
 """
 
 from __future__ import annotations
@@ -34,7 +33,16 @@ _HEADERS = {
 
 
 def host_and_port(address: str, what: str, *, least: int = 0) -> tuple[str, int]:
-    """Return the two parts of HOST:PORT, an IPv6 host without its brackets."""
+    """Return the two parts of HOST:PORT, an IPv6 host without its brackets.
+
+    Args:
+        address: HOST:PORT.
+        what: names the option or key it is given by.
+        least: lowest port; 0 is any that is free.
+
+    Raises:
+        InputError: it is no address.
+    """
     host, _, port = address.rpartition(":")
     if not host or not port.isdecimal() or not least <= int(port) <= 65535:
         raise InputError(f"{what} is {address!r}: expected HOST:PORT, such as 127.0.0.1:9110; PORT is {least} to 65535")
@@ -42,7 +50,17 @@ def host_and_port(address: str, what: str, *, least: int = 0) -> tuple[str, int]
 
 
 class Pages:
-    """Serves pages until it is closed."""
+    """Serves pages until it is closed.
+
+    Args:
+        address: ``HOST:PORT``; port 0 is any that is free.
+        routes: what is answered.
+        what: names the option or key of the address, for messages.
+        open_to: whether other computers may read without a token.
+
+    Raises:
+        InputError: it is no address, or something listens there already.
+    """
 
     def __init__(self, address: str, routes: Routes, what: str, *, open_to: bool = False) -> None:
         host, port = host_and_port(address, what)

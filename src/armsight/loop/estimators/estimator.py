@@ -162,7 +162,17 @@ class Track(Record):
 
 @dataclass(frozen=True, eq=False)
 class ArmEstimate(Record):
-    """The pose of the tool at one time, with its covariances; shapes and units are those of :class:`Track`'s rows."""
+    """The pose of the tool at one time.
+
+    Attributes:
+        t_s: when, s.
+        T_base_tool: (4, 4) pose of the tool, m.
+        cov: (6, 6) its covariance, everything included.
+        cov_own: (6, 6) the same without what all measurements share (``PoseMeasurement.cov_common``).
+        q: (6,) potentiometers, smoothed, rad.
+        qd: (6,) their speeds, rad/s.
+        vision_age_s: time since the newest measurement used, s; infinite before the first.
+    """
 
     t_s: float
     T_base_tool: Array

@@ -331,7 +331,12 @@ def _tcp(robot: PoseTable, arm: Arm | None) -> list[str]:
 def links_of(robot: PoseTable, arm: Arm | None, at: Array) -> Callable[[Array], Array] | None:
     """Return what gives T_link_flange (M, L, 4, 4) of all links between rows of a table; None without a model or joints.
 
-    ``at``: (N,) what is called with, of each row: its number, or its time.
+    The joints are taken to give the table's very poses: such as scatter against them would be explained by errors of links.
+
+    Args:
+        robot: the table, N rows.
+        arm: the model.
+        at: (N,) by what the returned function knows each row: its number, or its time.
     """
     if arm is None or robot.q is None:
         return None

@@ -237,9 +237,21 @@ def identify(
     priors: Mapping[str, float] | None = None,
     progress: Callable[[str], None] = lambda line: None,
 ) -> Identified:
-    """Fit an arm to all poses.
+    """Identify an arm from poses.
 
-    Args, errors: as ``armsight.identify``, which also evaluates it.
+    Args:
+        arm: the nominal arm; where base and tool are is found from the data.
+        measured: joint angles, and where the tool was measured, as ``read_poses`` returns them.
+        priors: sigma by name of a parameter or a kind, instead of ``fit.SIGMA``; 0 keeps one at its nominal value.
+        progress: called with the name of each step as it begins.
+
+    Returns:
+        Every number with its sigma: ``columns()`` is a table for pandas, ``validate`` says how far off it is on other
+        poses, ``Corrected.of`` makes an arm of it that computes and is saved.
+
+    Raises:
+        InputError: too few poses, or data that cannot be of this arm; the message says what would make them fit.
+        CalibrationError: poses so alike that not even base and tool are observable.
     """
     model, x, prior, seen = _begun(arm, measured, priors, progress)
     progress("base and tool")

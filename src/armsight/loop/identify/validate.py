@@ -46,7 +46,12 @@ def errors(model: Model, x: Array, measured: Measured) -> Errors:
 def validate(found: Identified, measured: Measured | Read) -> Validation:
     """Evaluate an identified arm on poses that it was not fitted to.
 
-    ``measured``: other poses, as ``read_poses`` returns them; points or full poses as it was identified with (InputError).
+    Args:
+        found: the identified arm.
+        measured: other poses, as ``read_poses`` returns them; points or full poses as it was identified with.
+
+    Raises:
+        InputError: another number of points, or points instead of poses.
     """
     call = "validate(found, measured)"
     require(call, "found", found, isinstance(found, Identified), "what identify(arm, measured) returns")

@@ -150,7 +150,8 @@ _LEAST_WAIT_S = 0.001  # for the board, even when the loop is late: a lost board
 class Loop:
     """Runs controllers on a board, with cameras.
 
-    The constructor receives nothing; :meth:`open` returns a loop that has its first reading.
+    The constructor receives nothing; :meth:`open` returns a loop that has its first reading. It takes a setup, what
+    measures the body, the log to append to, and what estimates the pose of the tool.
     """
 
     def __init__(self, setup: Setup, follower: Follower, log: Log, estimator: KalmanEstimator) -> None:
@@ -203,7 +204,11 @@ class Loop:
     def open(
         cls, setup: Setup, follower: Follower, log: Log, estimator: KalmanEstimator, publisher: Publisher | None = None
     ) -> Loop:
-        """Return a loop that has received the first joint reading; arguments as for the class, and a publisher."""
+        """Return a loop that has received the first joint reading; arguments as for the class, and a publisher.
+
+        Raises:
+            DeviceError: the board sends none.
+        """
         loop = cls(setup, follower, log, estimator)
         loop.publisher = publisher or Fanout()
         while not log.joints:

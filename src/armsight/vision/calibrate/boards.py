@@ -303,7 +303,13 @@ LEAST_PAIRS = 3
 
 @dataclass(frozen=True, eq=False)
 class Pair(Record):
-    """One pair of images after detection, by its name."""
+    """One pair of images after detection.
+
+    Attributes:
+        name: what the pair is called.
+        left: detections in the left image.
+        right: detections in the right image.
+    """
 
     name: str
     left: Detections

@@ -67,7 +67,25 @@ CAUSES: dict[str, CauseKind] = {
 
 @dataclass(frozen=True, eq=False)
 class Conditions(Record):
-    """What is not known when a body is measured; zero where nothing is given."""
+    """What is not known when a body is measured; zero where nothing is given.
+
+    Attributes:
+        noise_px: cause -> standard deviation that it adds to a marker's position, px: pixel noise, defocus, exposure blur.
+        cov_calibration: (P, P) covariance of the rig's parameters by its calibration, or (0, 0).
+        board_scale: standard deviation of the board's size, as a share.
+        body_sigma_m: of each point of the body from its file, along its face and out of it, m.
+        body_scale: of the body's size, as a share.
+        mount_m: of the right camera's position along each axis since the calibration, m.
+        lens_share: of each focal length since the calibration, as a share.
+        skew_s: by how much the right exposures are later, uncorrected, s.
+        start_s: standard deviation of what differs from shot to shot, s.
+        readout_s: from the first row to the last, uncorrected, s.
+        stamp_s: standard deviation of a time stamp, s.
+        speed_m_s: of the body, in any direction.
+        rotation_rad_s: its rate of rotation, about any axis.
+        handeye: standard deviations of position along each axis, m, and of rotation about each, rad.
+        arm: the same of how near the arm comes to where it is sent.
+    """
 
     #: cause -> standard deviation that it adds to a marker's position, px: pixel noise, defocus, exposure blur.
     noise_px: Mapping[str, float] = field(default_factory=dict)
@@ -96,7 +114,14 @@ class Conditions(Record):
 
 @dataclass(frozen=True, eq=False)
 class Budget(Record):
-    """The error of a body's pose, [translation m; rotation rad] along the left camera's axes, at G points of a volume."""
+    """The error of a body's pose, [translation m; rotation rad] along the left camera's axes, at G points of a volume.
+
+    Attributes:
+        p_left: (G, 3) the points, m, left camera's frame.
+        forward: (3,) direction of depth.
+        factors: cause -> (G, 6, K) what its K sources of variance one do to the pose.
+        shared: causes that multiply the same sources, which add before they are squared.
+    """
 
     p_left: Array  #: (G, 3) the points, m, left camera's frame.
     forward: Array  #: (3,) direction of depth.
@@ -106,10 +131,14 @@ class Budget(Record):
     shared: tuple[str, ...] = ("skew", "readout")
 
     def cov(self, *, moving: bool = True, loop: bool = False, of: str = "", scaled: str = "", by: float = 1.0) -> Array:
-        """Return covariances (G, 6, 6), with what motion costs, and for ``loop`` hand-eye and arm.
+        """Return covariances (G, 6, 6).
 
-        ``of``: one cause alone, or "precision" or "trueness"; ``scaled``: a cause whose standard deviation is
-        multiplied ``by``.
+        Args:
+            moving: with what motion costs.
+            loop: with hand-eye and arm.
+            of: one cause alone; or "precision" or "trueness".
+            scaled: a cause whose standard deviation is multiplied ``by`` so much.
+            by: how much.
         """
         total, together = np.zeros((len(self.p_left), 6, 6)), np.zeros((len(self.p_left), 6, 6))
         for name, F in self.factors.items():
@@ -175,10 +204,17 @@ def volume_views(
 
 
 def pose_budget(rig: StereoRig, points: Array, normals: Array, views: list[PredictedView], given: Conditions) -> Budget:
-    """Return what each cause costs a body's pose, points and normals (M, 3), at views of the volume.
+    """Return what each cause costs a body's pose.
 
-    The rig's own covariance is not used, ``given.cov_calibration`` is. InputError: at none of the positions do both
-    cameras see enough of the body.
+    Args:
+        rig: the cameras; their own covariance is not used, ``given.cov_calibration`` is.
+        points: (M, 3) points of the body, m.
+        normals: (M, 3) out of their faces; NaN where unknown.
+        views: where the body is.
+        given: what is not known.
+
+    Raises:
+        InputError: at none of the positions do both cameras see enough of the body.
     """
     found: list[dict[str, Array]] = []
     at, lost, forward = [], list[float](), np.zeros(3)
@@ -330,8 +366,12 @@ def calibration_covariance(
 ) -> Array:
     """Return the covariance (P, P) of a calibration before it is made: the inverse of the bundle's own information.
 
-    ``board`` (M, 3), m, is shown at Ts_left_board, all of it in both images; ``bent_m``: of its corners from the
-    drawing along each axis, m, smoothly; it is estimated, too.
+    Args:
+        rig: the cameras.
+        board: (M, 3) corners of the board, m.
+        Ts_left_board: (S, 4, 4) where it is to be shown, all of it in both images.
+        sigma_px: standard deviation of a corner, px.
+        bent_m: of a corner of the board from its drawing along each axis, m, smoothly; it is estimated, too.
     """
     model, (S, M) = rigid_board(board), (len(Ts_left_board), len(board))
     if bent_m > 0:

@@ -26,11 +26,16 @@ class RejectedPair:
 
 @dataclass(frozen=True, eq=False)
 class PairErrors(Record):
-    """Errors of S pairs that a rig was not fitted on, each over ``weight`` matched points.
+    """Errors of pairs that a rig was not fitted on.
 
-    ``epipolar_px``: RMS distance from the epipolar lines, both images, undistorted; ``rigid_m``: RMS of the
-    triangulated board from the perfect one after a rigid fit; ``scale``: how many times larger it is; ``normalised``:
-    RMS of the rigid residual over its predicted sigma; ``over_noise``: over that of the corners' noise alone.
+    Attributes:
+        pair: (S,) rows of the pairs.
+        epipolar_px: (S,) RMS distance from the epipolar lines, both images, undistorted px.
+        rigid_m: (S,) RMS distance of the triangulated board from the perfect one after a rigid fit.
+        scale: (S,) how many times larger than the perfect board the triangulated one is.
+        weight: (S,) matched points of the pair.
+        normalised: (S,) RMS of the rigid residual over its predicted sigma.
+        over_noise: (S,) RMS of the rigid residual over the sigma that the corners' noise alone gives it.
     """
 
     pair: Array
@@ -122,7 +127,11 @@ class Calibration(Record):
         )
 
     def plot(self) -> Any:  # noqa: ANN401 - matplotlib is no dependency
-        """Draw the errors of every pair when it was left out of the fit, mm and px; return matplotlib's figure."""
+        """Draw the errors of every pair when it was left out of the fit, mm and px; return matplotlib's figure.
+
+        Raises:
+            InputError: matplotlib is not installed.
+        """
         figure, axes = new_figure(2, 1, sharex=True)
         axes[0].bar(self.errors.pair, 1e3 * self.errors.rigid_m)
         axes[1].bar(self.errors.pair, self.errors.epipolar_px)

@@ -22,7 +22,12 @@ NOTHING, MEASURED, OCCLUDED, FILLED = range(4)
 
 @dataclass(frozen=True)
 class Search:
-    """The range of disparities that are tried: ``count`` from ``first`` on, px, one apart."""
+    """The range of disparities that are tried.
+
+    Attributes:
+        first: the least, px.
+        count: how many, one pixel apart.
+    """
 
     first: int
     count: int

@@ -94,7 +94,10 @@ def read_layout(path: str | Path) -> Composite:
 
 
 def open_target(spec: str | Path) -> Target:
-    """Make a target that can be found in images: of a board's spec, a TOML body file, or a board file of ``calibrate``.
+    """Make a target that can be found in images.
+
+    Args:
+        spec: a board such as ``chessboard:9x6:25mm``, a TOML body file, or a TOML board file of ``calibrate``.
 
     Raises:
         InputError: neither, malformed, or a CSV body, which has points but no description of its markers.
@@ -171,7 +174,11 @@ def _distances(points: Array) -> Array:
 
 
 def open_body(spec: str | Path) -> Body:
-    """Return the body that a board's spec, a TOML body file or a CSV of points describes; else InputError."""
+    """Return the body that a board's spec, a TOML body file or a CSV of points describes.
+
+    Raises:
+        InputError: none of these, or malformed.
+    """
     return load_body_csv(spec) if _kind(str(spec)) == ".csv" else open_target(spec).body
 
 

@@ -148,10 +148,16 @@ _SUSPECT, _TRIPLES, _TRIED = 4.0, 60, 3
 
 
 def locate(rig: StereoRig, body: Body, points: Points) -> PoseEstimate | Missed:
-    """Estimate the pose of a body, left camera's frame, from the triangulated points of one shot, or why there is none.
+    """Estimate the pose of a body in one shot.
 
-    There is none of fewer than three points, points on one line, without a pose that most detections agree with, or
-    where the detections do not look like the body.
+    Args:
+        rig: the calibrated pair.
+        body: the body's points, m.
+        points: the shot's triangulated points, with the correspondences they came from.
+
+    Returns:
+        The pose of the body in the left camera's frame, or why there is none: fewer than three points, points on one
+        line, no pose that most detections agree with, or detections that do not look like the body.
     """
     reason = _unlocatable(body, points)
     if reason is not None:

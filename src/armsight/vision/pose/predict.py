@@ -36,9 +36,12 @@ def plain_rig(focal_px: float = 900.0, baseline_m: float = 0.2) -> StereoRig:
 
 @dataclass(frozen=True, eq=False)
 class PredictedView(Record):
-    """A body before two cameras, ``forward`` (3,) of the left one; normals out of its faces are NaN where unknown.
+    """A body before two cameras.
 
-    ``seen`` (M, 2): whether a camera sees a point, in its image, its face not rotated away; (M, 1): one camera alone.
+    Attributes:
+        T_left_body: (4, 4) its pose.
+        forward: (3,) unit vector from the cameras to it, left camera's frame.
+        seen: (M, 2) whether a camera sees a point: in its image, and its face not rotated away; (M, 1): one camera alone.
     """
 
     T_left_body: Array
@@ -52,10 +55,15 @@ class PredictedView(Record):
 
 
 def look_direction(points: Array, normals: Array) -> Array:
-    """Return the unit vector (3,), body frame, to the viewer from which most of a body's faces are seen.
+    """Return the unit vector (3,), body frame, from which most of a body's faces are seen.
 
-    ``normals`` (M, 3) are NaN where unknown; where none is known, perpendicular to the flattest plane through the
-    points, on the side of -z.
+    Args:
+        points: (M, 3) points, m.
+        normals: (M, 3) out of their faces; NaN where unknown.
+
+    Returns:
+        The direction from the body to who looks at it; where no normal is known, perpendicular to the flattest plane
+        through the points, on the side of -z.
     """
     known = normals[np.isfinite(normals).all(axis=1)]
     if not len(known):
@@ -76,10 +84,16 @@ def view(
     aside_m: tuple[float, float] = (0.0, 0.0),
     roll: float = 0.0,
 ) -> PredictedView:
-    """Set a body, points and normals (M, 3), before the cameras, its faces towards them, its middle between their axes.
+    """Set a body before the cameras, its faces towards them and its middle between their axes.
 
-    ``rotation``: about the horizontal and the vertical axis of the image, rad; ``aside_m``: right and down, of the
-    point between the axes; ``roll``: about the direction of view, rad.
+    Args:
+        rig: the cameras.
+        points: (M, 3) points, m.
+        normals: (M, 3) out of their faces; NaN where unknown.
+        distance_m: from the cameras to the body's middle.
+        rotation: about the horizontal and the vertical axis of the image, rad.
+        aside_m: right and down, of the point between the cameras' axes.
+        roll: of the body about the direction of view, rad.
     """
     towards = look_direction(points, normals)
     ahead = np.array([0.0, 0.0, distance_m, 1.0])
@@ -138,11 +152,18 @@ def _facing(rig: StereoRig, T_left_body: Array, points: Array, normals: Array) -
 
 @dataclass(frozen=True, eq=False)
 class PoseDerivatives(Record):
-    """How the measured pose of a body follows from its N pixel positions uv, weighted alike; side 0 is left.
+    """How the measured pose of a body follows from its N pixel positions, weighted alike.
 
-    Tangents are [translation m; rotation rad], perturbation on the right. ``by_uv`` (6, N, 2), ``by_rig`` (6, P): what
-    the pose is off by where the pixels or the rig's parameters are; ``by_point`` (6, M, 3): the true positions of the
-    body's points, its file unchanged; ``uv_by_pose`` (N, 2, 6).
+    Tangents are [translation m; rotation rad], perturbation on the right.
+
+    Attributes:
+        side: (N,) 0 left, 1 right.
+        point: (N,) row of the body's points.
+        uv: (N, 2) the projections, raw pixels.
+        by_uv: (6, N, 2) derivative of the pose by the pixels.
+        by_rig: (6, P) by the rig's parameters: what the pose is off by where they are.
+        by_point: (6, M, 3) by the true positions of the body's points, the body's file unchanged.
+        uv_by_pose: (N, 2, 6) derivative of the pixels by the pose.
     """
 
     side: Ids
@@ -164,7 +185,13 @@ class PoseDerivatives(Record):
 
 
 def pose_derivatives(rig: StereoRig, points: Array, seen: PredictedView) -> PoseDerivatives | None:
-    """Differentiate the pose that two cameras measure; None where the visible points do not determine one."""
+    """Differentiate the pose that two cameras measure; None where the visible points do not determine one.
+
+    Args:
+        rig: the cameras.
+        points: (M, 3) points, m.
+        seen: the body's pose and which points are visible.
+    """
     rows, sides = np.nonzero(seen.seen)
     if len(seen.paired) < 3:
         return None
@@ -187,8 +214,14 @@ def pose_derivatives(rig: StereoRig, points: Array, seen: PredictedView) -> Pose
 def pose_covariance(rig: StereoRig, points: Array, seen: PredictedView, sigma_px: float) -> Array | None:
     """Predict the covariance (6, 6) of a body's pose, [translation m; rotation rad], perturbation on the right.
 
-    ``sigma_px``: of a measured pixel position; the share of the rig's calibration is included where its covariance is
-    known. None where the visible points do not determine a pose.
+    Args:
+        rig: the cameras; the share of their calibration is included where the rig's covariance is known.
+        points: (M, 3) points, m.
+        seen: the body's pose and which points are visible.
+        sigma_px: standard deviation of a measured pixel position, px.
+
+    Returns:
+        The covariance, or None where the visible points do not determine a pose.
     """
     found = pose_derivatives(rig, points, seen)
     return None if found is None else found.noise(sigma_px) + found.by_rig @ rig.cov @ found.by_rig.T
@@ -205,10 +238,18 @@ def separation(
 ) -> float:
     """Return the least separation of a wrong naming of the discs from the true one, sigmas, over five rotations.
 
-    The root of the weighted sum of squares of the wrong naming's residuals; infinity where its discs would always be
-    seen from behind, NaN without a rotation at which the discs in view are visible and no others. ``symmetry``: which
-    discs are taken for which; ``sigma_px``: of a disc's measured centre; ``hidden``: a disc that something hides, none
-    below zero.
+    Args:
+        rig: the cameras.
+        points: (M, 3) positions of the discs, m.
+        normals: (M, 3) out of their faces; NaN where unknown.
+        symmetry: the wrong naming: which discs are taken for which.
+        distance_m: of the body.
+        sigma_px: standard deviation of a disc's measured centre, px.
+        hidden: a disc that something hides; none where below zero.
+
+    Returns:
+        The root of the weighted sum of squares of the wrong naming's residuals; infinity where its discs would always
+        be seen from behind, NaN where there is no rotation at which the discs in view are visible and no others.
     """
     seen, taken = symmetry.seen, symmetry.taken_for
     others = np.setdiff1d(np.arange(len(points)), [*seen, hidden])

@@ -274,7 +274,11 @@ class ShotPoses:
         }
 
     def write_csv(self, path: str | Path) -> None:
-        """Write the file that ``armsight measure -o`` writes, or nothing where it cannot be written (InputError)."""
+        """Write the file that ``armsight measure -o`` writes.
+
+        Raises:
+            InputError: it cannot be written; then nothing is.
+        """
         write_text(Path(path), csv_text(self.poses))
 
     def __arrow_c_stream__(self, requested_schema: object | None = None) -> object:
@@ -284,7 +288,14 @@ class ShotPoses:
         return pyarrow.table(self.columns()).__arrow_c_stream__(requested_schema)
 
     def to_pandas(self, lengths: str = "m") -> Any:  # noqa: ANN401 - pandas is no dependency
-        """Return pandas' DataFrame of the :meth:`columns`; InputError where pandas is not installed."""
+        """Return pandas' DataFrame of the columns.
+
+        Args:
+            lengths: "m" or "mm", as :meth:`columns` takes it.
+
+        Raises:
+            InputError: pandas is not installed, or another unit.
+        """
         try:
             return importlib.import_module("pandas").DataFrame(self.columns(lengths))
         except ImportError:
@@ -293,7 +304,8 @@ class ShotPoses:
     def plot(self) -> Any:  # noqa: ANN401 - matplotlib is no dependency
         """Draw position, mm, and angles, degrees, over time or shots, with two sigmas; return matplotlib's figure.
 
-        InputError: matplotlib is not installed, or no shot was measured.
+        Raises:
+            InputError: matplotlib is not installed, or no shot was measured.
         """
         figure, axes = new_figure(3, 2, sharex=True)
         good = [each for each in self.poses if each.ok]

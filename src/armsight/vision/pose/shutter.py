@@ -53,10 +53,13 @@ _NOISE_MOST = 0.3
 
 @dataclass(frozen=True, eq=False)
 class TimedShot(Record):
-    """What both cameras saw of a body in one shot; t_s is the time of the left exposure's middle row, s.
+    """What both cameras saw of a body in one shot, and when.
 
-    ``seen`` as detected, pairs that a wrong skew takes off their epipolar lines included; T_left_body (4, 4) to begin
-    with; ``apart_s``: by how much the right stamp is later than the left.
+    Attributes:
+        t_s: time of the left exposure's middle row, s.
+        seen: the correspondences as detected; pairs that a wrong skew takes off their epipolar lines included.
+        T_left_body: (4, 4) pose to begin with, m.
+        apart_s: by how much the right stamp is later than the left, s.
     """
 
     t_s: float
@@ -575,11 +578,21 @@ def at_one_time(
 def measure_moving(
     rig: StereoRig, body: Body, shots: Sequence[TimedShot], shutters: Shutters
 ) -> list[tuple[PoseEstimate | Missed, bool]]:
-    """Measure a moving body with every observation of shots in time moved to its shot's time.
+    """Measure a moving body with every observation moved to its shot's time.
 
-    Of each shot the pose at its own time, or why there is none, and whether its observations were moved: not where too
-    few neighbours show the motion. The covariance holds that of the shutters, common to all shots, and of the motion.
-    InputError: the times do not rise.
+    Args:
+        rig: the calibrated pair.
+        body: what moves.
+        shots: in the order of their time.
+        shutters: when the cameras expose.
+
+    Returns:
+        Of each shot the pose at its own time, or why there is none, and whether its observations were moved: not where
+        too few neighbours show the motion. The covariance holds that of the shutters, common to all shots, and of the
+        motion.
+
+    Raises:
+        InputError: the times do not rise.
     """
     return [
         (_measured(rig, body, shot.seen, alignment, shutters), alignment.motion is not None)

@@ -43,10 +43,13 @@ _FARTHEST = 1e9
 
 @dataclass(frozen=True)
 class ImportOptions:
-    """Values that a user may have to add to a foreign file; None where file or format say it.
+    """Values that a user may have to add to a foreign file.
 
-    ``unit_m``: of the file's translation; ``sigma_px``: of a detection; ``pair``: names of the left and the right
-    camera, of a file that has more than two; None takes the first two.
+    Attributes:
+        unit_m: length of the file's unit of translation, m; None where the file or the format says it.
+        image_size_px: (width, height); None where the file says it.
+        sigma_px: standard deviation of a detection, px.
+        pair: names of the left and the right camera, of a file that has more than two; None takes the first two.
     """
 
     unit_m: float | None = None
@@ -71,11 +74,19 @@ class RigFormat(Protocol):
         ...
 
     def read(self, documents: Sequence[Document], paths: Sequence[Path], options: ImportOptions) -> StereoRig:
-        """Read a rig; its provenance says what was assumed and what was left behind. InputError names the file."""
+        """Read a rig; its provenance says what was assumed and what was left behind.
+
+        Raises:
+            InputError: a file is damaged, misses a key, or holds what armsight cannot; the message names the file.
+        """
         ...
 
     def write(self, rig: StereoRig, paths: Sequence[Path]) -> tuple[str, ...]:
-        """Write a rig and return what the format cannot hold, a line each; InputError if it does not fit."""
+        """Write a rig and return what the format cannot hold, a line each.
+
+        Raises:
+            InputError: the rig does not fit the format, or a file cannot be written; no file is left half-written.
+        """
         ...
 
 
@@ -93,8 +104,14 @@ def posed_rig(
 ) -> StereoRig:
     """Return the rig of two of several cameras whose poses in a third frame are known.
 
-    ``pose_of`` returns (4, 4) T_camera_reference of a camera, in the file's unit, and notes; ``options.pair`` chooses
-    the two.
+    Args:
+        entries: each camera's entry by its name, in the order of the file.
+        pose_of: returns (4, 4) T_camera_reference of a camera, in the file's unit, and notes.
+        options: what the user added; ``pair`` chooses the two.
+        paths: the files.
+
+    Raises:
+        InputError: fewer than two, an unknown name in ``pair``, or a camera that cannot be read.
     """
     names = list(entries)
     if len(names) < 2:
@@ -184,8 +201,16 @@ def imported(
 ) -> StereoRig:
     """Assemble an imported rig, its uncertainty unknown, with a provenance that says so.
 
-    ``T_left_right`` is in the file's unit, unit_m where the user gave none; ``notes``: what was assumed and left
-    behind. InputError: both cameras at one position, or a baseline that cannot be.
+    Args:
+        cameras: left and right.
+        T_left_right: (4, 4), its translation in the file's unit.
+        options: what the user added.
+        paths: the files.
+        notes: what was assumed and left behind.
+        unit_m: of the file, where the user gave none, m.
+
+    Raises:
+        InputError: both cameras at one position, or a baseline that cannot be.
     """
     left, right = cameras
     notes = [*notes]
