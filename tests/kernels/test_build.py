@@ -123,6 +123,8 @@ def test_a_module_that_was_edited_since_is_rejected_with_the_command_to_run():
     for module in (chain, matrix, structure):
         with pytest.raises(ArmsightError, match=rf"{module.__name__.split('.')[-1]}\.py has changed .*kernels\.build"):
             decorator._check_not_stale((sources | {module.__name__: "0:0"}).items())
+        with pytest.raises(ArmsightError, match="has changed"):  # as a build of before has it
+            decorator._check_not_stale([(module.__name__, "0" * 8)])
     _, code = sources[chain.__name__].split(":")
     decorator._check_not_stale([(chain.__name__, f"0:{code}")])  # only comments or docstrings differ
 

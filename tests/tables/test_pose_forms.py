@@ -524,6 +524,20 @@ JOINTS = {
 }
 
 
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("p.py", 'for i, x in enumerate(a):\n    print(f"{i}: {x}")\narm.set_position(300, 20, 400, 170, 5, 6)\n'),
+        ("p.py", "if m in {1, 2}: go()\narm.set_position(300, 20, 400, 170, 5, 6)\n"),
+        ("p.prg", "If A + X(3) Then\nGo XY(300, 20, 400, 170, 5, 6)\n"),
+        ("p.py", "x" * 30000 + "\narm.set_position(300, 20, 400, 170, 5, 6)\n"),
+    ],
+)
+def test_code_beside_points_composes_none(tmp_path, name, text):
+    (tmp_path / name).write_text(text)
+    assert len(read_pose_table(tmp_path / name).Ts) == 1
+
+
 @pytest.mark.parametrize("form", JOINTS)
 def test_each_program_gives_the_same_joints(tmp_path, form):
     name, text, options = JOINTS[form]

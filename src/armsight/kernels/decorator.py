@@ -74,7 +74,7 @@ def _check_not_stale(sources: Iterable[tuple[str, str]]) -> None:
     """
     for module, digest in sources:
         path = _PACKAGE.parent.joinpath(*module.split(".")).with_suffix(".py")
-        text, code = digest.split(":")
+        text, _, code = digest.partition(":")
         if not path.exists() or (text_digest(path) != text and code_digest(path) != code):
             raise ArmsightError(f"{path} has changed since kernels were compiled; {_AGAIN}")
 

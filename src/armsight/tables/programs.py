@@ -162,13 +162,16 @@ _RELATIVE = re.compile(
     r"\bMove(?:LinRel[TW]rf|JointsRel)\s*\(|\b\w+_REL\s*\{|\bDR_MV_MOD_REL\b|\brelative\s*=\s*True\b|"
     rf"\bpose_(?:trans|add|sub)\s*\({_ARGUMENTS}?\bp\[|\b(?:trans|addto)\s*\({_ARGUMENTS}?\bpos[xj]\s*\(|"
     rf"\ba?move[a-z]{{1,2}}\s*\({_ARGUMENTS}?,\s*(?:mod\s*=\s*1|ref\s*=\s*(?:1|DR_TOOL))\b|"
-    r"\b(?:RelTool|Offs)\s*\(\s*\[\s*\[|\bP\[\d+.*\bINC\b|\bset_tool_position\s*\(|"
-    # operators between poses: KUKA's P1:{X 5,..}, Kawasaki's p1+TRANS(..), Epson's P1 +X(5), Mitsubishi's P1*P2
-    r"\w+[ \t]*:[ \t]*\{\s*(?:\w+\s*:\s*)?[XYZABC]\s+[-+.\d]|\}[ \t]*:[ \t]*[\w{]|[+*]\s*TRANS\s*\(|"
-    r"\bTRANS\s*\([^()]*\)\s*[+*]|\b[A-Z]MOVE\s+\w+\s*\+|[\w)][ \t]*[+-][ \t]*(?:XY|[XYZUVW])\s*\(\s*[-+.\d]|"
-    r"\bP\d+\s*\*\s*P\d+\b",
+    r"\b(?:RelTool|Offs)\s*\(\s*\[\s*\[|\bP\[\d+.*\bINC\b|\bset_tool_position\s*\(",
     re.IGNORECASE,
 )
+#: Operators between poses, by maker: P1:{X 5,..}; p1+TRANS(..); P1 +X(5); P1*P2.
+_COMPOSED = {
+    "KUKA": r"\b\w{1,32}[ \t]*:[ \t]*\{[ \t]*(?:\w+[ \t]*:[ \t]*)?[XYZABC][ \t]+[-+.\d]|\}[ \t]*:[ \t]*[\w{]",
+    "Kawasaki": r"[+*][ \t]*TRANS\s*\(|\bTRANS\s*\([^()]*\)[ \t]*[+*]|\b[A-Z]MOVE[ \t]+\w+[ \t]*\+",
+    "Epson": r"\b(?:P\d+|Here)[ \t]*[+-][ \t]*(?:XY|[XYZUVW])\s*\(|\b(?:Go|Move|Jump)\b[^'\n]*?[+-][ \t]*[XYZUVW]\s*\(",
+    "Mitsubishi": r"\bP\d+[ \t]*\*[ \t]*P\d+\b",
+}
 
 
 class ProgramPoints(NamedTuple):
@@ -189,7 +192,7 @@ def program_rows(path: Path, text: str) -> ProgramPoints | None:
     if _SEMICOLON.search(code):
         code = re.sub(";.*", "", code)
     kept = _BESIDE.sub(lambda beside: "\n" * beside[0].count("\n"), code)
-    if (relative := _RELATIVE.search(kept)) and _is_program(kept):
+    if relative := _relative(kept):
         raise InputError(
             f"{path}: line {_line(kept, relative)}: {' '.join(relative[0].split())!r} is a motion or pose relative to "
             "another one, not to the base: write the pose it ends at, or delete the line if no image was taken there"
@@ -199,10 +202,17 @@ def program_rows(path: Path, text: str) -> ProgramPoints | None:
     return found if found is None or kept == code else found._replace(notes=(*passed, *found.notes))
 
 
-def _is_program(text: str) -> bool:
-    """Return whether a text has what shows a robot's program."""
-    marks = (_UR.pattern, *(program.mark for program in PROGRAMS))
-    return bool(_points_in(text)) or any(re.search(mark, text, re.MULTILINE) for mark in marks)
+def _relative(text: str) -> re.Match[str] | None:
+    """Return the first relative motion or composed pose of a robot's program; None where there is none."""
+    makers = [program.maker for program in PROGRAMS if re.search(program.mark, text, re.MULTILINE)]
+    if _points_in(text):
+        makers = ["KUKA"]
+    elif _UR.search(text):
+        makers = ["Universal Robots"]
+    for pattern in (_RELATIVE.pattern, *(_COMPOSED[maker] for maker in makers if maker in _COMPOSED)):
+        if makers and (found := re.search(pattern, text, re.IGNORECASE)):
+            return found
+    return None
 
 
 def _program_points(path: Path, text: str) -> ProgramPoints | None:

@@ -131,7 +131,8 @@ def with_angles(path, measured, rotation):
     if rotation == "rotvec":
         angles = np.degrees(R.as_rotvec())
     else:
-        angles = R.as_euler(rotation, degrees=True)[:, np.argsort([*rotation.lower()])]
+        angles = R.as_euler(rotation, degrees=True)
+        angles = angles if rotation == "ZYZ" else angles[:, np.argsort([*rotation.lower()])]
     names = [f"q{i}_rad" for i in range(1, 7)] + [f"p1_{a}_mm" for a in "xyz"] + [f"r{a}_deg" for a in "xyz"]
     rows = np.column_stack([measured.q, 1e3 * measured.p_rig[:, 0], angles])
     path.write_text("\n".join([",".join(names), *(",".join(f"{v:.6f}" for v in row) for row in rows)]) + "\n")
@@ -139,7 +140,7 @@ def with_angles(path, measured, rotation):
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-@pytest.mark.parametrize("rotation", ["rotvec", "xyz", "yzx", "XYZ"])
+@pytest.mark.parametrize("rotation", ["rotvec", "xyz", "yzx", "XYZ", "ZYZ"])
 def test_another_convention_of_angles_is_rejected_and_the_right_one_named(tmp_path, seed, rotation):
     w, measured = made("six_r", seed)
     path = with_angles(tmp_path / "poses.csv", measured, rotation)
@@ -150,6 +151,13 @@ def test_another_convention_of_angles_is_rejected_and_the_right_one_named(tmp_pa
         assert text.endswith(f"give --columns rotation={right[0]}")
     for given in right:
         check_plausible(arm, read_poses(path, rotation=given).measured)
+
+
+def test_doosans_angles_read_as_kukas_are_named(tmp_path):
+    w, measured = made("six_r", 1)
+    path = with_angles(tmp_path / "poses.csv", measured, "ZYZ")
+    path.write_text(path.read_text().replace("rx_deg,ry_deg,rz_deg", "rz_deg,ry_deg,rx_deg"))
+    assert said(w, read_poses(path, rotation="xyz").measured).endswith("give --columns rotation=ZYZ")
 
 
 def names_of(rotation):

@@ -121,6 +121,10 @@ def test_too_few_or_flat_attitudes_are_rejected():
     flat = [Reading(float(k), 0, sensor.expected(ToolMotion(T), 0).z, np.eye(3)) for k, T in enumerate(Ts)]
     with pytest.raises(InputError, match="about one axis alone"):
         Magnetometer.of("m").begun(flat, lambda t: ToolMotion(Ts[int(t)]))
+    stuck = [Reading(float(k), 0, z, np.eye(3)) for k, z in enumerate(3e-5 + rng.normal(0, NOISE_T, (30, 3)))]
+    attitudes = [pose(exp_so3(rng.normal(0, 1.0, 3)), np.zeros(3)) for _ in stuck]
+    with pytest.raises(InputError, match="do not follow the tool's attitude"):
+        Magnetometer.of("m").begun(stuck, lambda t: ToolMotion(attitudes[int(t)]))
     steep = Magnetometer(**{**vars(sensor), "field_t": np.array([1e-7, 0, -45e-6])})
     with pytest.raises(InputError, match="horizontal part"):
         heading_off(steep, readings, motion)

@@ -419,6 +419,21 @@ def test_ros_baseline_is_in_the_projection_matrix(tmp_path):
     assert halved.baseline_m == pytest.approx(rig.baseline_m / 2, rel=1e-14)
 
 
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        ({"roi": 5}, "roi must be a mapping"),
+        ({"roi": {"x_offset": "a"}}, "binning and roi must be numbers"),
+        ({"roi": {"x_offset": float("nan")}}, "binning and roi contains NaN"),
+        ({"binning_x": 2.7}, "must be whole numbers from 0 on"),
+        ({"binning_y": -1}, "must be whole numbers from 0 on"),
+    ],
+)
+def test_ros_windows_that_are_none_are_rejected(tmp_path, more, said):
+    with pytest.raises(InputError, match=said):
+        import_rig("ros", camera_infos(tmp_path, left=more))
+
+
 def test_ros_few_digits_are_mended_and_remarked(tmp_path):
     rig = import_rig("ros", camera_infos(tmp_path, digits=6))
     assert np.abs(rig.T_left_right[:3, :3] @ rig.T_left_right[:3, :3].T - np.eye(3)).max() < 1e-14

@@ -767,6 +767,8 @@ def _check_rotations(arm: Arm, measured: Measured, rows: Rows) -> None:
     if measured.angles_deg is not None:
         angles = measured.angles_deg[rows]
         offs = {name: _rotations_off(arm, q, rotations_by(angles, name, Path())) for name in ROTATIONS}
+        reversed_off = _rotations_off(arm, q, rotations_by(angles[:, ::-1], "ZYZ", Path()))
+        offs["ZYZ"] = min(offs["ZYZ"], reversed_off)  # Doosan's A, B, C read as KUKA's
         best = min(offs, key=lambda name: offs[name])
         if max(offs[best], ALIKE_RAD) <= min(off / CLEAR, BAD_RAD):
             same = [name for name in ROTATIONS if abs(offs[name] - offs[best]) < 1e-9]  # xyz and ZYX are one

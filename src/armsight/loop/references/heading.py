@@ -22,6 +22,8 @@ from armsight.loop.references.reference import ExpectedReading, Reading, Referen
 
 #: The Earth's field, T, is 22e-6 to 67e-6 (IGRF); half, double: the soft iron is as much too small, no heading differs.
 EARTH_T = 45e-6
+#: A field that rotates with the tool by less, T, is none; half: dead sensors pass, double: weak fields are rejected.
+LEAST_T = 5e-6
 #: One sigma before a calibration: soft iron, relative; hard iron and field, T; half, double: nothing.
 _SOFT, _HARD_T, _FIELD_T = 0.3, 200e-6, 30e-6
 #: Attitudes for 10 unknowns a row at least; singular value, last over first, below which they do not span the space.
@@ -113,6 +115,10 @@ class Magnetometer(Reference):
             raise InputError(f"{self.name}: the tool rotates about one axis alone: give it attitudes about two axes")
         found = np.linalg.lstsq(np.column_stack([by, np.ones(len(z))]), z, rcond=None)[0]
         U, s, Vt = np.linalg.svd(found[:9].T.reshape(9, 3))
+        if s[0] < LEAST_T or s[0] < 3.0 * s[1]:
+            raise InputError(
+                f"{self.name}: its readings do not follow the tool's attitude: is it a magnetometer, in T?"
+            )
         A, m = U[:, 0].reshape(3, 3), s[0] * Vt[0]
         sign = np.sign(np.linalg.det(A))
         size = np.linalg.norm(m) / EARTH_T

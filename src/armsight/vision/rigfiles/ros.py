@@ -155,15 +155,20 @@ def _windowed(camera: Camera, document: Document) -> tuple[Camera, list[str]]:
     first, then the principal point is divided by the binning, as image_geometry does. R and the pose stay.
     """
     roi = found(document, ("roi",)) or {}
+    if not isinstance(roi, dict):
+        raise InputError(f"roi must be a mapping of x_offset, y_offset, width, height, got {roi!r}")
     keys, (width, height) = ("x_offset", "y_offset", "width", "height"), camera.image_size_px
     numbers = [found(document, ("binningx",)), found(document, ("binningy",)), *(roi.get(key) for key in keys)]
-    whole = [int(number or 0) for number in numbers]
-    binning, offset, size = np.maximum(whole[:2], 1), np.array(whole[2:4]), np.array(whole[4:])
+    given = checked([0 if number is None else number for number in numbers], (6,), "binning and roi")
+    whole = given.astype(int)
+    if (whole != given).any() or whole.min() < 0:
+        raise InputError(f"binning and roi must be whole numbers from 0 on, got {given.tolist()}")
+    binning, offset, size = np.maximum(whole[:2], 1), whole[2:4], whole[4:]
     size = np.where(size > 0, size, camera.image_size_px)
     if (binning == 1).all() and not offset.any() and (size == (width, height)).all():
         return camera, []
-    if min(whole) < 0 or (offset + size > (width, height)).any():
-        raise InputError(f"roi {roi} is no window of its {width} x {height} px, or binning is negative")
+    if (offset + size > (width, height)).any():
+        raise InputError(f"roi {roi} is no window of its {width} x {height} px")
     fxy, centre = camera.intrinsics[:2] / binning, (camera.intrinsics[2:] - offset) / binning
     width_px, height_px = (int(number) for number in size // binning)
     note = (
