@@ -105,7 +105,11 @@ def read_bytes(path: str | Path, most_mb: float = DOCUMENT_MB) -> bytes:
 
 
 def read_text(path: str | Path, most_mb: float = DOCUMENT_MB) -> str:
-    """Read a text file: UTF-8, UTF-16 with its byte-order mark, or XML in the encoding that it declares."""
+    """Read a text file: UTF-8, UTF-16 with its byte-order mark, or XML in the encoding that it declares.
+
+    Raises:
+        InputError: as :func:`opened`, or not text.
+    """
     data = read_bytes(path, most_mb)
     try:
         return io.TextIOWrapper(io.BytesIO(data), _encoding(path, data)).read()
@@ -168,7 +172,11 @@ def _integer(digits: str) -> int | float:
 
 
 def read_toml(path: str | Path) -> dict[str, Any]:
-    """Read a TOML file."""
+    """Read a TOML file.
+
+    Raises:
+        InputError: as :func:`read_text`, or not TOML; the message names the line.
+    """
     import tomllib
 
     text = read_text(path)
@@ -205,6 +213,12 @@ def read_table(path: str | Path) -> list[list[str]]:
 
     Cells may also be separated by semicolons or tabs, as spreadsheets write them where the comma is the decimal mark;
     numbers with a decimal comma are then returned with a point.
+
+    Args:
+        path: the file.
+
+    Raises:
+        InputError: missing, unreadable, not text or not a table, or decimal commas and points in one table.
     """
     lines = _lines(path)
     first = next(lines, "").removeprefix("\ufeff")
@@ -436,7 +450,11 @@ class RowFile:
         self.rows += 1
 
     def close(self) -> None:
-        """Close the file; it outlives a crash of the computer from then on."""
+        """Close the file; it outlives a crash of the computer from then on.
+
+        Raises:
+            InputError: the disk does not take it.
+        """
         with self._named():
             try:
                 os.fsync(self._file)
@@ -445,7 +463,11 @@ class RowFile:
 
 
 def try_writing(folder: Path) -> None:
-    """Write a file in a folder and remove it."""
+    """Write a file in a folder and remove it.
+
+    Raises:
+        OSError: it cannot be written.
+    """
     import tempfile  # not above: who prints a pose writes none
 
     with tempfile.TemporaryFile(dir=folder):
@@ -490,13 +512,30 @@ def unused(path: Path) -> Path:
 
 
 def check_suffix(path: str | Path, suffix: str, what: str) -> None:
-    """Check that a file to be is named as what it will hold."""
+    """Check that a file to be is named as what it will hold.
+
+    Args:
+        path: the file to be.
+        suffix: that it must have, in small or capital letters.
+        what: is written, as the message names it: "a figure of the arm".
+
+    Raises:
+        InputError: another suffix, or none.
+    """
     if Path(path).suffix.lower() != suffix:
         raise InputError(f"{path}: {what} is written as {suffix}; give it a name that ends so")
 
 
 def check_outputs(outputs: Iterable[str | Path | None], inputs: Iterable[str | Path | None] = ()) -> None:
-    """Find out before long work whether all files of a command can be written, each apart from others and inputs."""
+    """Find out before long work whether all files of a command can be written, each apart from the others and the inputs.
+
+    Args:
+        outputs: the files to be; None is no file.
+        inputs: the files that are read; None is no file.
+
+    Raises:
+        InputError: as :func:`check_writable`, for the first that cannot be written.
+    """
     taken = list(inputs)
     for path in outputs:
         if path is not None:
@@ -506,7 +545,11 @@ def check_outputs(outputs: Iterable[str | Path | None], inputs: Iterable[str | P
 
 @contextlib.contextmanager
 def alone_in(folder: Path, command: str) -> Iterator[None]:
-    """Keep a folder, which is made, to one process of any command; one that was made and stays empty is removed again."""
+    """Keep a folder, which is made, to one process of any command; one that was made and stays empty is removed again.
+
+    Raises:
+        InputError: another one uses it.
+    """
     import fcntl  # POSIX
 
     path, used = folder / "in_use.lock", "uses it: give this one another folder, -o FOLDER"
@@ -550,7 +593,18 @@ def check_folder(
     problem: str = "nothing can be written here",
     advice: str = "",
 ) -> Path:
-    """Return a folder, ``~`` expanded, if files can be written to it, before long work; a missing one is not made."""
+    """Return a folder, ``~`` expanded, if files can be written to it, before long work; a missing one is not made.
+
+    Args:
+        path: the folder to be.
+        holding: names of files that will be written to it.
+        apart_from: files that must not be written over.
+        problem: what does not work, as the message has it: "no report can be written here".
+        advice: what to do, at the end of the message.
+
+    Raises:
+        InputError: it cannot be made or written to, or it or one of its files is one of ``apart_from``.
+    """
     _check_name(path)
     folder = Path(path).expanduser()
     if folder.suffix.lower() in _FILES and not os.path.lexists(folder):

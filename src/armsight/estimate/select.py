@@ -64,10 +64,15 @@ class Folds(NamedTuple):
         return np.asarray((np.maximum(self.c[:, None] + by_slope + by_bend, least) / self.numbers[:, None]).T)
 
     def fits(self, free: Mask, beyond: Mask | None = None) -> tuple[Array, Array, Array]:
-        """Fit the S parameters ``free`` to all but each of F folds; the others are nominal.
+        """Fit ``free`` to all but each fold.
 
-        Return the vectors (F, P), from the linearisation; the inverses (F, S, S) of the information about ``free``; and
-        (F, S, R) by how much the fit of each free parameter falls with one unit of each of those ``beyond``.
+        Args:
+            free: (P,) the S parameters to fit; the others are nominal.
+            beyond: (P,) R others; None: none.
+
+        Returns:
+            The vectors (F, P), from the linearisation; the inverses (F, S, S) of the information about ``free``; and (F,
+            S, R) by how much the fit of each free parameter falls with one unit of each of the others.
         """
         rows = np.flatnonzero(free)
         others = np.flatnonzero(beyond) if beyond is not None else rows[:0]

@@ -63,7 +63,15 @@ def most_probable(
 
 
 def restricted(linear: Linear, start: Array, low: float, high: float, steps: int = 40) -> Array:
-    """Return the variances (K,) of the greatest restricted likelihood, sigmas between low and high, without a prior."""
+    """Return the variances (K,) of the greatest restricted likelihood, without a prior.
+
+    Args:
+        linear: residuals.
+        start: (K,) variances to begin at.
+        low: the least sigma.
+        high: the greatest sigma.
+        steps: iterations at most.
+    """
     from scipy.optimize import minimize
 
     numbers = [linear.e.size] * len(linear.own) + [F.shape[2] for F in linear.shared.values()]

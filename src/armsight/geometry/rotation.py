@@ -110,8 +110,12 @@ def euler_zyx(R: Array) -> tuple[Array, bool]:
 def euler_zyx_sigmas(R: Array, cov: Array) -> Array:
     """Return (3,) one sigma of the angles of :func:`euler_zyx`, rad; NaN at the singularity.
 
-    A rotation by the vector w along the outer axes, covariance (3, 3), rad^2, changes the angles by J^-1 w; the columns
-    of J are the axes of rotation of the three angles.
+    A rotation by the vector w along the outer axes changes the angles by J^-1 w; the columns of J are the axes of rotation
+    of the three angles.
+
+    Args:
+        R: (3, 3) the rotation.
+        cov: (3, 3) covariance of w along the outer axes, rad^2.
     """
     angles, singular = euler_zyx(R)
     if singular:

@@ -54,8 +54,16 @@ def estimate_delay(
 ) -> Delay:
     """Find how late the camera's stamps are, and how far they scatter.
 
-    ``measurements``: of the tool's pose meanwhile, in order of time; 20 or more, while the joints moved to and fro.
-    ``sync_s``: standard deviation of the time between a shot's two exposures, s.
+    Args:
+        arm: the arm, as its table says it is.
+        states: readings from before the first measurement to after the last.
+        measurements: of the tool's pose meanwhile, in order of time; 20 or more, while the joints moved to and fro.
+        prior: how far the arm may be off.
+        sync_s: standard deviation of the time between a shot's two exposures, s.
+
+    Raises:
+        InputError: too few measurements, or readings that do not cover them.
+        CalibrationError: the motion does not determine the delay.
     """
     t, q = checked(states.t_s, (None,), "states.t_s"), checked(states.q, (len(states.t_s), None), "states.q")
     stamps = np.array([pose_measurement.t_s for pose_measurement in measurements])

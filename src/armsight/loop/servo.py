@@ -443,6 +443,9 @@ def whole_steps(J: Array, requested: Array, steps: Array, gaps: Array | None = N
         requested: (n,) angles by which the joints would have to move the tool, rad.
         steps: (n,) the joints' steps, rad; 0 has no step.
         gaps: (2, n) backlash that each joint is taken through first, upwards and downwards, rad; None for none.
+
+    Returns:
+        (n,) changes of the joints, rad.
     """
     n = len(steps)
     gaps = np.zeros((2, n)) if gaps is None else gaps

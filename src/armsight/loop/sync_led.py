@@ -82,7 +82,13 @@ def _on_time(t_bits: Array) -> Array:
 
 
 def light(t_s: Array, exposure_s: float | Array, bit_s: float) -> Array:
-    """Return the share of the LED's light that exposures about times t_s gather, 0 to 1."""
+    """Return the share of the LED's light that exposures about times t_s gather, 0 to 1.
+
+    Args:
+        t_s: middle of each exposure, board's clock, s.
+        exposure_s: how long they are, s.
+        bit_s: how long each bit of the code lasts, s.
+    """
     half = np.asarray(exposure_s) / 2
     return np.asarray((_on_time((t_s + half) / bit_s) - _on_time((t_s - half) / bit_s)) * bit_s / (2 * half))
 
@@ -92,7 +98,9 @@ class Brightness(Record):
     """An LED in the images of one camera.
 
     Attributes:
+        stamp_s: (N,) stamps of the images, board's clock, s, rising.
         led: (N,) brightness of the LED, grey levels.
+        around: (N,) brightness around it.
     """
 
     stamp_s: Array

@@ -231,10 +231,13 @@ def tool_moved(path: str | Path, given: dict[str, Any]) -> tuple[float, float]:
 
 
 def undetermined(moved_m: float, sigma_m: float) -> str:
-    """Return that poses do not determine an arm all over its joint limits, or "" where they do, or it is not known.
+    """Return that poses do not determine an arm all over its joint limits, or "" where they do, or where it is not known.
 
-    ``moved_m``, RMS over the limits, is how far the identified tool is from the nominal one's, sigma_m its sigma. The
-    nominal arm is off by moved^2 - sigma^2 on the mean, the corrected one by sigma^2: from here on it is no better.
+    The nominal arm is off by moved^2 - sigma^2 on the mean, the corrected one by sigma^2: from here on it is no better.
+
+    Args:
+        moved_m: how far the identified arm puts its tool from the nominal one's, RMS over the joint limits, m.
+        sigma_m: sigma of that, m.
     """
     if not 2 * sigma_m**2 > moved_m**2:
         return ""

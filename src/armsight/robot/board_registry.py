@@ -135,7 +135,11 @@ def emulator_name(name: str) -> str:
 
 
 def configured(link: EmulatedLink, config: Configuration | None = None) -> Board:
-    """Store a configuration (the lab's without) on a fresh emulated board, restart it, and return it."""
+    """Store a configuration (the lab's without) on a fresh emulated board, restart it, and return it.
+
+    Raises:
+        InputError: a value of the configuration is outside its range.
+    """
     board = Board.connect(link, name="the emulated board")
     try:
         board.store(lab_configuration() if config is None else config)

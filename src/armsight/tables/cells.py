@@ -49,7 +49,12 @@ class Said(NamedTuple):
 def said_columns(text: str | None, known: Collection[str] = ("units", "rotation", "frames")) -> Said:
     """Split the option ``--columns``: units=mm, units=detect, rotation=xyz and frames=BASE:FLANGE may stand among names.
 
-    ``text``: its value; None where it is not given. ``known``: what of these the command takes.
+    Args:
+        text: its value; None where it is not given.
+        known: what of these the command takes.
+
+    Raises:
+        InputError: another unit, or something said twice.
     """
     names, said = list[str](), dict[str, str]()
     for part in text.split(",") if text is not None else ():
@@ -70,7 +75,15 @@ def said_columns(text: str | None, known: Collection[str] = ("units", "rotation"
 def read_columns(text: str | None, known: Collection[str]) -> Mapping[str, str] | list[str]:
     """Read the option ``--columns``: NAME=THEIRS,... or the names of all columns in order, _ for one that is not used.
 
-    ``known``: the names that the command looks for.
+    Args:
+        text: its value; None where it is not given.
+        known: the names that the command looks for.
+
+    Returns:
+        Name that the command looks for -> name in the file; or the names in order.
+
+    Raises:
+        InputError: no such form, an unknown name, or one given twice.
     """
     columns: dict[str, str] = {}
     parts = [] if text is None else [part.strip() for part in text.split(",")]
@@ -97,9 +110,13 @@ def read_columns(text: str | None, known: Collection[str]) -> Mapping[str, str] 
 def read_cells(path: Path, columns: Mapping[str, str] | Sequence[str] = (), side: str = "robot") -> Cells:
     """Read a file.
 
-    ``path``: the file, or a glob of files of one pose each. ``columns``: names for the file's own, or for its columns
-    in their order, as :func:`read_columns` returns them. ``side``: "robot" or "seen": whose poses are read where a file
-    holds both.
+    Args:
+        path: the file, or a glob of files of one pose each.
+        columns: names for the file's own, or for its columns in their order, as :func:`read_columns` returns them.
+        side: "robot" or "seen": whose poses are read where a file holds both.
+
+    Raises:
+        InputError: no such form; the message says what was found and what would do.
     """
     whose = columns.get("pose") if isinstance(columns, Mapping) else None
     names = {k: v for k, v in columns.items() if k != "pose"} if isinstance(columns, Mapping) else columns
@@ -272,7 +289,11 @@ def _has_decimal_commas(cells: list[str]) -> bool:
 
 
 def renamed(path: Path, head: list[str], columns: Mapping[str, str] | Sequence[str], line: int = 1) -> list[str]:
-    """Return the names that the caller looks for in place of the file's own, as :func:`read_columns` returns them."""
+    """Return the names that the caller looks for in place of the file's own, as :func:`read_columns` returns them.
+
+    Raises:
+        InputError: a name of a column that is not there, or not as many as there are.
+    """
     if not isinstance(columns, Mapping):
         if columns and len(columns) != len(head):
             raise InputError(

@@ -63,7 +63,19 @@ _MOST_NUMBERS = 50_000_000
 def understood(
     path: Path, head: list[str], joint_names: Sequence[str], unit: str | None, rotation: str | None
 ) -> tuple[list[str], str | None, tuple[str, ...]]:
-    """Return our names for those of ROS, makers and spreadsheets, the rotation's convention or None, and notes."""
+    """Return our names for those of ROS, of robots' makers and of spreadsheets.
+
+    Args:
+        path: the file.
+        head: its names.
+        joint_names: of the arm whose joints it may name.
+        unit: of lengths whose columns name none; None: ROS's, m, and the makers', mm.
+        rotation: its convention where it is given.
+
+    Returns:
+        The names; the convention, the usual one where none is given, None where there is none either; and a note where
+        something was taken for granted.
+    """
     bare = [name.strip().strip('"').strip().lower().replace("°", "deg") for name in head]
     bare = [re.sub(r"\s*[\[(](mm|m|deg|rad|s)[\])]$", r"_\1", name) for name in bare]
     ours = zip(_of_ros(bare, joint_names, unit or "m"), head, strict=True)
@@ -211,7 +223,15 @@ class Columns:
 
     @classmethod
     def of_csv(cls, path: Path, columns: Mapping[str, str] | Sequence[str] = ()) -> Columns:
-        """Return the columns of a CSV as they are named there, blank lines left out; a line may end early."""
+        """Return the columns of a CSV as they are named there, blank lines left out; a line may end early.
+
+        Args:
+            path: the file.
+            columns: names for the file's own, as :func:`read_columns` returns them.
+
+        Raises:
+            InputError: no table, a column named twice, or one that is not there.
+        """
         rows: Rows
         if is_long(path):
             rows = _StoredRows(path)
@@ -272,7 +292,15 @@ class Columns:
                 )
 
     def joint_names(self, joint_count: int | None = None, arm: str = "") -> list[str]:
-        """Return the names of the columns of joint angles, from the first joint on; [] where there are none."""
+        """Return the names of the columns of joint angles, from the first joint on; [] where there are none.
+
+        Args:
+            joint_count: how many joints there are to be; None: as many as there are columns.
+            arm: whose they are, for messages.
+
+        Raises:
+            InputError: another number of joints, or not numbered from 1 on in one unit.
+        """
         there = [name for name in self.at if _JOINT.fullmatch(name)]
         names = sorted(there, key=lambda name: (int(name[1:-4]), name))
         if joint_count is not None and names and len(names) != joint_count:

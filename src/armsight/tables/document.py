@@ -62,7 +62,11 @@ _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 def read_document(path: str | Path) -> dict[str, Foreign]:
-    """Read a file of names and values."""
+    """Read a file of names and values.
+
+    Raises:
+        InputError: missing, damaged, or of a kind that is not read; the message names it and the way out.
+    """
     document = _only(documents_in(read_bytes(path), path), path)
     if not isinstance(document, Mapping):
         kind = "nothing" if document is None else f"a {'list' if isinstance(document, list) else 'single value'}"
@@ -99,7 +103,11 @@ def documents_in(data: bytes, path: str | Path) -> list[Foreign]:
 
 
 def matrix_of(name: str, value: Mapping[str, Foreign]) -> np.ndarray[Any, np.dtype[np.float64]] | None:
-    """Return a mapping of rows, cols and data (OpenCV, ViSP, ROS) as an array; None where it is none."""
+    """Return a mapping of rows, cols and data (OpenCV, ViSP, ROS) as an array; None where it is none.
+
+    Raises:
+        InputError: no numbers, or not as many as it says.
+    """
     sized = {"sizes", "data", "dt"} <= set(value)  # OpenCV 5's vectors, and matrices of three dimensions
     if not sized and not {"rows", "cols", "data"} <= set(value):
         return None
@@ -213,7 +221,11 @@ def _json(text: str, path: str | Path) -> list[Foreign]:
 
 
 def read_yaml(path: str | Path) -> Mapping[str, Foreign]:
-    """Read a YAML file of one document that is a mapping."""
+    """Read a YAML file of one document that is a mapping.
+
+    Raises:
+        InputError: missing, not YAML, another number of documents, or no mapping; the message names file and line.
+    """
     document = _only(parse_yaml(read_text(path), path), path)
     if not isinstance(document, dict):
         raise InputError(f"{path}: expected a YAML mapping of names to values, such as width: 640")
@@ -221,7 +233,15 @@ def read_yaml(path: str | Path) -> Mapping[str, Foreign]:
 
 
 def parse_yaml(text: str, path: str | Path) -> list[Foreign]:
-    """Return the documents of a YAML text, one at least; an empty one at its end (a trailing ---) is left out."""
+    """Return the documents of a YAML text, one at least; an empty one at its end (a trailing ---) is left out.
+
+    Args:
+        text: the text.
+        path: where it comes from, for messages.
+
+    Raises:
+        InputError: not YAML; the message names the line.
+    """
     text = text.removeprefix("\ufeff")
     if text.startswith("%YAML"):  # OpenCV's header is no directive of YAML; the line stays, for messages
         text = text[text.index("\n") :] if "\n" in text else ""

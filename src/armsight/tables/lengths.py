@@ -46,8 +46,14 @@ def fitting_unit(length_m: float, unit_m: float, usual: Usual) -> str | None:
 def check_length(length_m: float, unit_m: float, usual: Usual, advice: str = "--unit-m {unit_m:g}") -> None:
     """Reject a length that cannot be one.
 
-    ``unit_m``: the unit that it was read in, m. ``advice``: the option that names the right unit; ``{unit_m}`` stands
-    for it, m, ``{unit}`` for its name.
+    Args:
+        length_m: as it was read, m.
+        unit_m: the unit that it was read in, m.
+        usual: what it is of.
+        advice: the option that names the right unit; ``{unit_m}`` stands for it, m, ``{unit}`` for its name.
+
+    Raises:
+        InputError: what was found, what is expected, and the option that would do.
     """
     if usual.least_m <= length_m <= usual.most_m:
         return

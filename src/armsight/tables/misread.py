@@ -26,7 +26,14 @@ class Misread(NamedTuple):
 
 
 def misreadings(table: PoseTable, rows: NDArray[np.int64], Ts: Array, option: str) -> Iterator[Misread]:
-    """Yield other readings of rows of a table."""
+    """Yield other readings of rows of a table.
+
+    Args:
+        table: the table.
+        rows: (N,) which of its rows.
+        Ts: (N, 4, 4) their poses as they were read, m.
+        option: what stands before what --columns says of this table: "" or "seen:".
+    """
     R, p, width, given = Ts[:, :3, :3], Ts[:, :3, 3], table.numbers.shape[1], table.convention
     numbers = table.numbers[rows] if width else table.numbers
     rotated: list[tuple[str, Array, str, str]] = [

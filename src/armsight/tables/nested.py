@@ -72,8 +72,14 @@ def is_packed(path: Path) -> bool:
 def document_rows(path: Path, text: str, side: str, whose: str | None) -> tuple[list[str], list[Record]]:
     """Return the names of columns and the records of a document.
 
-    ``side``: "robot" or "seen": which poses are requested where records have both. ``whose``: the name of the poses
-    that are requested; None: the names say whose they are.
+    Args:
+        path: the file.
+        text: what it holds, "" where that is no text.
+        side: "robot" or "seen": which poses are requested where records have both.
+        whose: the name of the poses that are requested; None: the names say whose they are.
+
+    Raises:
+        InputError: no document, no poses in it, or poses of several and no name says whose.
     """
     if echoed := _ECHO.findall(text):
         names = ("t_s", "x", "y", "z", "qx", "qy", "qz", "qw")

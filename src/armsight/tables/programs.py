@@ -184,7 +184,11 @@ class ProgramPoints(NamedTuple):
 
 
 def program_rows(path: Path, text: str) -> ProgramPoints | None:
-    """Return the poses or joints of a robot's program; None where the text is none."""
+    """Return the poses or joints of a robot's program; None where the text is none.
+
+    Raises:
+        InputError: a point that lacks a number, poses and joints in one file, or pulses.
+    """
     code = _COMMENT.sub("", text)
     if not _UR.search(code):
         code = _COMMENT.sub(lambda found: found[0] if _NOTED.match(found[0]) else "", text)

@@ -103,7 +103,11 @@ def detections_text(shots: Iterable[tuple[str, float | None, Correspondences]], 
 
 
 def detection_times(path: str | Path) -> dict[str, float]:
-    """Return the shots' times, s, by name, of a file of detections that has a column ``t_s``; else nothing."""
+    """Return the times of the shots of a file of detections that has the column ``t_s``, by their names; else nothing.
+
+    Raises:
+        InputError: a time is no number.
+    """
     rows = read_table(path)
     header = [name.strip() for name in rows[0]] if rows else []
     if "t_s" not in header or "shot" not in header:

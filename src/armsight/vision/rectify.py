@@ -57,7 +57,11 @@ class Rectification(Record):
     map_right: NDArray[np.float32]
 
     def images(self, left: Image, right: Image) -> tuple[Image, Image]:
-        """Rectify a pair of raw images of the calibrated sizes; where a camera sees nothing they are black."""
+        """Rectify a pair of raw images; where a camera sees nothing they are black.
+
+        Raises:
+            InputError: an image is not of the size its camera was calibrated at.
+        """
         out = []
         for side, camera, image in (("left", self.rig.left, left), ("right", self.rig.right, right)):
             if (image.shape[1], image.shape[0]) != tuple(camera.image_size_px):

@@ -205,10 +205,20 @@ def float_on(
 ) -> None:
     """Step links inside their backlash from row to row of readings.
 
-    ``memory``: (N, 4, n) to be written: position and speed in half gaps, how far the links have come in that, and lever
-    of the torque of inertia, m. ``points``: what stands for its links (K, 5). ``beside``: what each joint has beside
-    them (3, n). ``still``: an arm none of whose joints is faster stands, rad/s: its links stand as well, and what is
-    loose stays where it is while its shaft creeps. ``gap``: (n,) the backlash, rad.
+    Args:
+        t: (N,) times of the readings, s.
+        q: (N, n) readings, rad.
+        memory: (N, 4, n) to be written: position and speed in half gaps, how far the links have come in that, and lever
+            of the torque of inertia, m.
+        first: first row there is.
+        begin: first row to be written.
+        end: the row after the last.
+        table: of the arm.
+        points: what stands for its links (K, 5).
+        beside: what each joint has beside them (3, n).
+        still: an arm none of whose joints is faster stands, rad/s: its links stand as well, and what is loose stays where
+            it is while its shaft creeps.
+        gap: (n,) the backlash, rad.
     """
     joints = gap.shape[0]
     motion, position, speed, half = np.empty((3, joints)), np.empty(joints), np.empty(joints), 0.5 * gap

@@ -46,6 +46,11 @@ _EXCESS_S = 4.0
 class ClockFollower:
     """Follows offset and rate of the camera's clock.
 
+    Args:
+        size: of the filter's state.
+        delay: row of the delay in it.
+        sigma_s: standard deviation of the delay at the beginning, s.
+
     Attributes:
         since_s: time of the measurement from which on stamps are corrected, s; None while they are not.
     """

@@ -208,7 +208,16 @@ class ErrorModel:
     def carried(
         self, time_s: Array, travel: Array, flips: Array, was: Array, joints: Smoothed, *, learning: float = 1.0
     ) -> Propagation:
-        """Return the same for times (N,), and how far joints (N, n) and sides (N, 2, n) have come."""
+        """Return the same for times (N,), and how far joints (N, n) and sides (N, 2, n) have come.
+
+        Args:
+            time_s: (N,) since a state, s.
+            travel: (N, n) of the joints meanwhile, rad.
+            flips: (N, 2, n) of the sides.
+            was: (N, n) what was left of a reading's variance at the state, or (1, n) at one state for all.
+            joints: at the times.
+            learning: as above.
+        """
         shape = len(time_s), self.layout.size
         kept, added = np.empty(shape), np.empty(shape)
         noise = joints.variance, joints.lasts_s, was
@@ -244,7 +253,14 @@ class ErrorModel:
     def innovation(
         self, x: Array, joints: Smoothed, pose_measurement: PoseMeasurement, jitter_s: float
     ) -> tuple[Array, Array]:
-        """Return the innovation (6,) of a measurement, and the model's derivative (6, size) by x."""
+        """Return the innovation (6,) of a measurement, and the model's derivative (6, size) by x.
+
+        Args:
+            x: the state.
+            joints: at the measurement.
+            pose_measurement: the measurement.
+            jitter_s: standard deviation of its time, s.
+        """
         z, H = np.empty(6), np.empty((6, self.layout.size))
         seen = pose_measurement.T_base_tool, pose_measurement.cov_noise, jitter_s
         _innovation(self._table, x, joints.q[0], joints.qd[0], joints.unseen[0], *seen, z, H, np.empty((6, 6)))
@@ -265,7 +281,15 @@ class ErrorModel:
     ) -> tuple[Array, Array, Array]:
         """Use a measurement: overwrite ``at.x`` and ``at.P`` by state and covariance after it, and ``at.HP``.
 
-        ``learns_delay``: whether the delay is corrected; if not, it stays as it is, and so does its variance.
+        Return the gain (size, 6), innovation (6,) and derivative (6, size) of the last linearization; ``at.HP`` is of it,
+        too. The iterated update (Bell and Cathey, 1993). Other arguments as for :meth:`innovation`.
+
+        Args:
+            at: the state before.
+            joints: at the measurement.
+            pose_measurement: the measurement.
+            jitter_s: standard deviation of its time, s.
+            learns_delay: whether the delay is corrected; if not, it stays as it is, and so does its variance.
         """
         K, z, H = np.empty((self.layout.size, 6)), at.z.copy(), at.H.copy()
         now = joints.q[0], joints.qd[0], joints.unseen[0]

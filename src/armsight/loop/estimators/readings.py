@@ -333,7 +333,11 @@ class Readings:
 
     @property
     def span_s(self) -> tuple[float, float]:
-        """The oldest and the newest time kept, s."""
+        """The oldest and the newest time kept, s.
+
+        Raises:
+            InputError: no reading has come yet.
+        """
         if not self._count:
             raise InputError("the estimator has no potentiometer readings yet; give it joints() first")
         return float(self._t[self._first]), float(self._t[self._first + self._count - 1])
@@ -383,7 +387,11 @@ class Readings:
             self._gone_s, self._settled = self._t[end - 1], settled
 
     def at(self, t_s: Array) -> Smoothed:
-        """Return the joints at (N,) times within those kept."""
+        """Return the joints at (N,) times within those kept.
+
+        Raises:
+            InputError: not within them.
+        """
         oldest, newest = self.span_s
         at, n, j = np.array(t_s, dtype=float), len(t_s), self._joints
         one, sides, unseen, empty = (n, j), (n, 2, j), (n, 3, j), np.empty

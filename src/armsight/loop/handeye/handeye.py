@@ -566,7 +566,11 @@ def rotations_of(poses: Poses, e: Array) -> tuple[Array, Array, float, float]:
 
 
 def require_rotations(poses: Poses, e: Array) -> None:
-    """Reject motions whose rotations are about one axis only, as far as the noise in the residuals e (N, 6) shows."""
+    """Reject motions whose rotations are about one axis only, as far as the noise in the residuals e (N, 6) shows.
+
+    Raises:
+        CalibrationError: the open direction, by name.
+    """
     spread, axes, noise, least = rotations_of(poses, e)
     held = "flange-rig" if poses.in_hand else "flange-body"
     if noise > CONTRADICTS and spread[0] > LEAST_ROTATION:
@@ -604,7 +608,11 @@ def known_where_seen(found: HandEye, Ts_rig_body: Array) -> dict[str, tuple[Arra
 
 
 def require_known(found: HandEye, Ts_rig_body: Array, most_m: float, most_rad: float) -> None:
-    """Reject a result one of whose directions is known worse, where the body was seen, than by these sigmas, m and rad."""
+    """Reject a result one of whose directions is known worse, where the body was seen, than by these sigmas, m and rad.
+
+    Raises:
+        CalibrationError: the open direction, by name.
+    """
     for name, (T, block) in known_where_seen(found, Ts_rig_body).items():
         for kind, part, most, unit, times in (
             ("translation", block[:3, :3], most_m, "mm", 1e3),

@@ -89,7 +89,13 @@ LEVER_M = 0.3
 
 
 def starts(A: Array, B: Array, seed: int = 0) -> list[tuple[Array, Array]]:
-    """Return candidates for X and Z of ``A_i X = Z B_i``, smallest median residual first."""
+    """Return candidates for X and Z of ``A_i X = Z B_i``, smallest median residual first.
+
+    Args:
+        A: (N, 4, 4) poses, N >= 3.
+        B: (N, 4, 4) poses.
+        seed: of the choice of parts.
+    """
     rng = np.random.default_rng(seed)
     found = [kronecker(A, B)]
     if len(A) > PART:
@@ -187,7 +193,11 @@ class HeldOut(Record):
 
 
 def checked_poses(A: ArrayLike, B: ArrayLike, covs: ArrayLike | None, eye: Eye, centre: ArrayLike) -> Poses:
-    """Return poses as given, checked."""
+    """Return poses as given, checked.
+
+    Raises:
+        InputError: wrong shapes, NaN, no rigid motions, an unknown eye.
+    """
     if eye not in ("to_hand", "in_hand"):
         raise InputError(f"eye is {eye!r}; known are to_hand, in_hand")
     Ts_base_flange = checked(A, (None, 4, 4), "Ts_base_flange")

@@ -82,7 +82,13 @@ def recording_of(robot: Path) -> Path | None:
 def robot_in_recording(path: Path, frames: str | None, arm: Arm | None) -> PoseTable:
     """Read the poses of the flange that a recording holds, a row for each of its messages.
 
-    ``frames``: BASE:FLANGE, of its transforms; None: the poses are those of the joints.
+    Args:
+        path: a ROS 1 or ROS 2 bag, or MCAP.
+        frames: BASE:FLANGE, of its transforms; None: the poses are those of the joints.
+        arm: the model whose joints are read, by their names.
+
+    Raises:
+        InputError: no such recording, frames that it does not have, or joints of other names.
     """
     bag = Bag(path)
     joints = None if arm is None else read_joints(bag, arm.joint_names)
@@ -125,7 +131,11 @@ def robot_in_recording(path: Path, frames: str | None, arm: Arm | None) -> PoseT
 
 
 def at_shots(robot: PoseTable, seen: Seen) -> PoseTable:
-    """Return the poses of a recording at the times of the shots, interpolated; no row beside it or in a gap."""
+    """Return the poses of a recording at the times of the shots, interpolated; shots beside it, or in a gap, get no row.
+
+    Raises:
+        InputError: the shots have no times, or none is within the recording.
+    """
     assert robot.t_s is not None
     if seen.t_s is None:
         raise InputError(f"{robot.path}: pairs by time, and the images have none: --source bag:FILE reads its own")
@@ -166,7 +176,11 @@ def at_shots(robot: PoseTable, seen: Seen) -> PoseTable:
 
 
 def paired(robot: PoseTable, seen: Seen, in_hand: bool, arm: Arm | None) -> PairedPoses:
-    """Bring the rows together: by name where the robot's table has names that were seen, else by order."""
+    """Bring the rows together: by name where the robot's table has names that were seen, else by order.
+
+    Raises:
+        InputError: rows and images do not pair up, or hardly one shows the target.
+    """
     rows, matched = matched_rows(robot, seen.names)
     notes = [*robot.notes, *seen.notes, *_alone(robot, seen, rows, matched)]
     rows, matched = _once(robot, seen, rows, matched, notes)
@@ -253,7 +267,15 @@ def _alike(Ts: Array) -> Rows:
 
 
 def matched_rows(robot: PoseTable, seen: Sequence[str]) -> tuple[Rows, Rows]:
-    """Return the rows of both sides that belong together: by name where the robot's table has names, else by order."""
+    """Return the rows of both sides that belong together: by name where the robot's table has names, else by order.
+
+    Args:
+        robot: the robot's table.
+        seen: names of what was seen, one a row.
+
+    Raises:
+        InputError: no name is among those seen, or other numbers of rows.
+    """
     if robot.names is not None:
         there = {name: k for k, name in enumerate(seen)} | {Path(name).stem: k for k, name in enumerate(seen)}
         keys = [

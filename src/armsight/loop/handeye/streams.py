@@ -40,7 +40,11 @@ class PoseStream(Record):
 
     @staticmethod
     def of(t_s: ArrayLike, Ts: ArrayLike, name: str) -> PoseStream:
-        """Return a stream in the order of time; of poses at one time the first is kept."""
+        """Return a stream in the order of time; of poses at one time the first is kept.
+
+        Raises:
+            InputError: shapes, NaN, or fewer than 20 poses.
+        """
         times = checked(t_s, (None,), f"{name}: t_s")
         poses = checked(Ts, (len(times), 4, 4), f"{name}: Ts")
         times, rows = np.unique(times, return_index=True)
@@ -85,8 +89,15 @@ def calibrate_streams(
 ) -> HandEyeStreams:
     """Find the mounting and the time offset of two streams.
 
-    ``eye_stream``: T_rig_body over time, on another clock. ``links_at``: times (N,), s, on the hand's clock ->
-    T_link_flange (N, L, 4, 4) of every link, where the joints and a model are known.
+    Args:
+        hand: T_base_flange over time.
+        eye_stream: T_rig_body over time, on another clock.
+        eye: as in :func:`~armsight.loop.handeye.handeye.calibrate_handeye`.
+        centre: (3,) the middle of the body's points, body frame, m.
+        scale: whether the size of the target may be wrong.
+        links_at: times (N,), s, on the hand's clock -> T_link_flange (N, L, 4, 4) of every link, where the joints and a
+            model are known.
+        progress: called with the name of each step as it begins.
 
     Raises:
         CalibrationError: the streams do not overlap, nothing rotates, or the motions leave a direction open.
@@ -124,6 +135,9 @@ def coarse_offset(hand: PoseStream, eye: PoseStream) -> float:
 
     Speeds are taken over intervals of several lengths, short ones for quick motions and long ones against noise; the length
     counts under which agreement stands out most. Faster than the slower stream ever rotates is a blunder of the other.
+
+    Raises:
+        CalibrationError: nothing rotates.
     """
     step = float(np.clip(np.median(np.diff(eye.t_s)), 0.005, 0.05))
     if max(float(np.quantile(_speeds(stream, step, OVER[0])[1], 0.9)) for stream in (hand, eye)) < MIN_SPEED_RAD_S:

@@ -76,7 +76,13 @@ class Measurements:
 
 
 class Moved(NamedTuple):
-    """A motion of the rig: what was measured is exp(xi) times the true pose of the tool, in the base's frame."""
+    """A motion of the rig: what was measured is exp(xi) times the true pose of the tool, in the base's frame.
+
+    Attributes:
+        xi: (6,) tangent [m; rad].
+        cov: (6, 6) its covariance.
+        Ts_base_tool: poses (4, 4) of the tool that the arm visited, the newest last.
+    """
 
     xi: Array
     cov: Array
@@ -95,7 +101,14 @@ class Moved(NamedTuple):
 
 
 class BaseMotion:
-    """Estimates a motion of the rig from ``begin_s`` on, which goes on where it is ``slow``; ``known``: from before it."""
+    """Estimates a motion of the rig.
+
+    Args:
+        estimator: of the arm.
+        known: what it knew before the motion, and when, s.
+        begin_s: when the motion began, s.
+        slow: whether it goes on, else it was a jump.
+    """
 
     def __init__(
         self, estimator: KalmanEstimator, known: tuple[float, Remembered], begin_s: float, *, slow: bool

@@ -299,6 +299,11 @@ def along_axis(motion: Array, cov: Array, axis: Array) -> bool:
 
     Both focal lengths that are longer by the same share displace all points along the optical axis, in proportion to their
     depth, and rotate nothing: at one depth that is such a motion of the cameras.
+
+    Args:
+        motion: (6,) tangent [m; rad].
+        cov: (6, 6) its covariance.
+        axis: (3,) unit vector in the same frame.
     """
     across = np.zeros((5, 6))
     across[:2, :3], across[2:, 3:] = np.linalg.svd(axis[None])[2][1:], np.eye(3)

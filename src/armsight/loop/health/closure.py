@@ -130,10 +130,16 @@ class _RunningSums:
 class ClosureWatch:
     """Watches a whole run for changes.
 
+    Args:
+        sigmas: (K,) standard deviations of the filter's state before anything was measured.
+        joints: how many the arm has.
+        seen: who sees the tool; None where that is not known.
+
     Attributes:
         changes: the hypotheses that explain best what was found, the best first; empty while all is well.
         explained: the same by the newest test, also where it is smaller than is reported: what another test reports.
         certain: of these what is as certain as what is reported at first: poses are widened by it.
+        strongest: of all tests the largest chi-square over its limit.
     """
 
     def __init__(self, sigmas: Array, joints: int, seen: ToolView | None = None) -> None:

@@ -266,8 +266,11 @@ class Unrest:
     def take(self, t_s: Array, values: Array, covs: Array, excess: float = 1.0) -> None:
         """Take a window.
 
-        ``values``: (N, D) of its shots. ``covs``: (N, D, D) covariances of their noise. ``excess``: by how much the
-        variance of the noise is larger than they say.
+        Args:
+            t_s: (N,) times, s.
+            values: (N, D) of its shots.
+            covs: (N, D, D) covariances of their noise.
+            excess: by how much the variance of the noise is larger than they say.
         """
         if len(t_s) < _LEAST or not np.ptp(t_s) > 0.0:
             return

@@ -160,7 +160,11 @@ class RigFollower:
     ) -> Callable[[], RigCorrection | None] | None:
         """Return what computes a correction, or why there is none; None where nothing is found to have moved.
 
-        ``poses``: returns time, s, and pose of the newest shots, measured with the rig as it is, in order of time.
+        Args:
+            monitor: what was found.
+            poses: returns time, s, and pose of the newest shots, measured with the rig as it is, in order of time.
+            T_base_rig: (4, 4) the rig in the base as it is taken to be, m.
+            at_s: the time, s.
         """
         again = monitor.changes or monitor.rig_moved() is not None or monitor.cameras_moved() is not None
         if self._put_right is not None and again:
@@ -220,9 +224,12 @@ class RigFollower:
     ) -> RigCorrection | None:
         """Return the cameras put right; None where the poses do not suffice, as ``rejected`` says.
 
-        ``poses``: time, s, and pose of shots measured with the rig as it is, in order of time. ``settle_s``: so long
-        after ``since_s`` shots may still be from before, s. ``mounted``: whether hand-eye stands on the poses before:
-        then only the change may be estimated, which needs them.
+        Args:
+            since_s: since when the cameras are found to have moved, s.
+            poses: time, s, and pose of shots measured with the rig as it is, in order of time.
+            at_s: the time, s.
+            settle_s: so long after ``since_s`` shots may still be from before, s.
+            mounted: whether hand-eye stands on the poses before: then only the change may be estimated, which needs them.
         """
         used = _differing([pose for t_s, pose in poses if t_s >= since_s + settle_s])
         before = _differing([pose for t_s, pose in poses if t_s < since_s - settle_s])
@@ -258,8 +265,11 @@ class RigFollower:
     ) -> RigCorrection | None:
         """Return the rig put right by what fixed bodies show; None where that does not suffice, as ``rejected`` says.
 
-        ``motion``: (6,) of the cameras, right tangent in the left one's frame, [m; rad], and its covariance.
-        ``p_left``: (3,) where the body on the tool is, in the left camera's frame, m.
+        Args:
+            since_s: since when the cameras are found to have moved, s.
+            motion: (6,) of the cameras, right tangent in the left one's frame, [m; rad], and its covariance.
+            at_s: the time, s.
+            p_left: (3,) where the body on the tool is, in the left camera's frame, m.
         """
         at_body = np.hstack([np.eye(3), -skew(p_left)])
         sigma_m = float(np.sqrt(np.linalg.eigvalsh(at_body @ motion[1] @ at_body.T)[-1]))
@@ -307,7 +317,14 @@ class RigFollower:
     def refined(
         self, right: RigCorrection, T_base_rig: Array, at_s: float, moved: Moved | None
     ) -> RigCorrection | None:
-        """Return a correction by the arm's poses that replaces an earlier one; None where they hardly say more of it."""
+        """Return a correction by the arm's poses that replaces an earlier one; None where they hardly say more of it.
+
+        Args:
+            right: the earlier one.
+            T_base_rig: (4, 4) the rig as it was put right, m.
+            at_s: the time, s.
+            moved: what is left of the motion.
+        """
         assert right.tool_m is not None
         if moved is None:
             return None

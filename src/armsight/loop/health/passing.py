@@ -123,6 +123,10 @@ def apart(shots: Sequence[tuple[Array, Array, float]]) -> Apart:
 def nodding(shots: Sequence[tuple[Array, Array, float]], known: Array | None) -> tuple[Array, float, float]:
     """Return the covariance (4, 4) of what is anew in each shot, a camera's rotation or focal length, that explains most.
 
+    Args:
+        shots: residuals (n,), their derivatives by these (n, 4), and weights.
+        known: the one that tests before have shown: a camera that nods goes on; None without.
+
     Returns:
         It; what it explains of the sum of squares, and twice the logarithm of what chance explains with it.
     """

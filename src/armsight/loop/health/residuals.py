@@ -162,6 +162,11 @@ class ShotResiduals(NamedTuple):
 class ShotReader:
     """Reads what single shots say of the parameters of a rig, a body and their times.
 
+    Args:
+        rig: the calibrated pair.
+        body: the body that is measured.
+        sync_s: standard deviation of the time between the two exposures of a shot, s.
+
     Attributes:
         points: (M,) rows of the body's points that are used.
         size: K, count of the parameters: the rig's, size and points of the body, readout and skew.
@@ -262,7 +267,13 @@ class ShotReader:
 
 
 class ResidualSums:
-    """What whitened residuals say of K parameters: sums over their rows, degrees of freedom, and when they began."""
+    """What whitened residuals say of K parameters: sums over their rows, degrees of freedom, and when they began.
+
+    Attributes:
+        M: (1 + K, 1 + K) sum of the outer products of rows [residual; derivatives].
+        freedom: degrees of freedom.
+        begin_s: when the first shot was, s.
+    """
 
     def __init__(self, size: int, begin_s: float) -> None:
         self.M, self.freedom, self.begin_s = np.zeros((1 + size, 1 + size)), 0.0, begin_s
@@ -358,7 +369,12 @@ def total(tests: Sequence[ResidualSums], size: int) -> ResidualSums:
 
 
 class Onset(NamedTuple):
-    """A change that grew from nothing to what it is."""
+    """A change that grew from nothing to what it is.
+
+    Attributes:
+        begin_s: when it began, s.
+        end_s: when it ended, s: of a step when it began, infinite of what goes on.
+    """
 
     begin_s: float
     end_s: float = np.inf

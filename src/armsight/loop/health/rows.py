@@ -81,7 +81,11 @@ def differentiated(
 
 @kernel("f8[:, ::1], f8[:, ::1], i8, f8, f8[:, ::1]")
 def eliminate_pose(A: Array, rows: Array, skew: int, sync_s: float, response: Array) -> None:
-    """Eliminate the pose, of derivatives A (n, 6), and the shot's own skew from rows (n, K); fill its response (6, K)."""
+    """Eliminate the pose, of derivatives A (n, 6), and the shot's own skew from rows (n, K); fill its response (6, K).
+
+    The skew, of column ``skew`` and standard deviation ``sync_s``, s, is eliminated by a symmetric factor of what Sherman
+    and Morrison give: (1 - g u u^T)^2 = 1 - u u^T / (1 / sync_s^2 + u^T u).
+    """
     gain = solved(product(A.T, A), product(A.T, rows))
     for i in range(len(rows)):
         for j in range(6):

@@ -227,8 +227,13 @@ class ShapeWatch:
     def take(self, t_s: float, rows: Array, T: Array, response: Array, cov: Array, moved: bool) -> None:
         """Take a shot.
 
-        ``rows``: (n, 1 + K) its residuals and their derivatives, all points included, its pose eliminated.
-        ``response``: (6, K) of a pose measured with all points to the parameters.
+        Args:
+            t_s: its time, s.
+            rows: (n, 1 + K) its residuals and their derivatives, all points included, its pose eliminated.
+            T: (4, 4) pose T_left_body.
+            response: (6, K) of a pose measured with all points to the parameters.
+            cov: (6, 6) covariance of the pose.
+            moved: whether its pose differs from the one before; single shots are asked only then.
         """
         self._effects.append((response, cov))
         if not moved:

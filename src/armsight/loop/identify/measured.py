@@ -127,7 +127,11 @@ class Read(NamedTuple):
 
 
 def measured_of(call: str, poses: Measured | Read, name: str = "measured") -> Measured:
-    """Return the poses of what was read."""
+    """Return the poses of what was read.
+
+    Raises:
+        InputError: it is neither.
+    """
     poses = poses.measured if isinstance(poses, Read) else poses
     require(call, name, poses, isinstance(poses, Measured), 'read_poses("poses.csv")')
     return poses

@@ -69,9 +69,15 @@ def require_plausible(
 ) -> PairedPoses:
     """Reject rows that fit far better read in another way.
 
-    ``arm``: the model, where the robot's poses come from joints. ``detect_units``: whether lengths in another unit are
-    converted, with a note, in place of an error. ``scale``: whether the target's size is fitted, and may be anything.
-    ``streams``: whether the rows are of streams whose clocks agree roughly only: they are not shifted then.
+    Args:
+        recording: the rows.
+        arm: the model, where the robot's poses come from joints.
+        detect_units: whether lengths in another unit are converted, with a note, in place of an error.
+        scale: whether the target's size is fitted, and may be anything.
+        streams: whether the rows are of streams whose clocks agree roughly only: they are not shifted then.
+
+    Raises:
+        InputError: what is likely wrong, and what to do.
     """
     p, path = recording.poses, recording.robot.path
     given = misfit(p, scale=scale)
@@ -110,7 +116,11 @@ def require_plausible(
 
 
 def require_mounting(p: Poses) -> None:
-    """Reject poses that fit far better with the other mounting of the eye, as Python's callers give them."""
+    """Reject poses that fit far better with the other mounting of the eye, as Python's callers give them.
+
+    Raises:
+        InputError: they do; or one of both lists holds inverse transforms.
+    """
     given, (was, other) = misfit(p), ("in_hand", "to_hand") if p.in_hand else ("to_hand", "in_hand")
     if len(p.A) < COMMON or (given[0] < FITS_M and given[1] < PLAUSIBLE_M):
         return
@@ -404,7 +414,16 @@ _LEAST_M = 0.002  # lengths that differ by less are not exchanged, m
 
 
 def require_fitting(arm: Arm, q: Array, Ts_rig_body: Array) -> None:
-    """Reject a table with which no loop may be closed."""
+    """Reject a table with which no loop may be closed.
+
+    Args:
+        arm: as its table says it is.
+        q: (N, n) joint angles of the poses, rad.
+        Ts_rig_body: (N, 4, 4) measured poses of the body, m.
+
+    Raises:
+        CalibrationError: the poses contradict the table by far more than a cheap arm's errors.
+    """
 
     def off_by(arm: Arm, X: Array, Z: Array) -> tuple[float, float]:
         e = log_se3(inverse(Z @ Ts_rig_body) @ arm.forward(q) @ X)

@@ -61,8 +61,12 @@ def nominal_table(arm: Arm) -> Array:
 def motion(table: Array, theta: Array, modified: bool, R_rig_0: Array, o_rig_0: Array) -> TableMotion:
     """Move frame 0, R_rig_0 (3, 3) and o_rig_0 (3,), along the chain, and note the axis of every number of the table.
 
-    ``table``: (n, 5) by COLUMNS, m and rad. ``modified``: whether the table follows the modified convention.
-    ``o_rig_0``: its origin, m.
+    Args:
+        table: (n, 5) by COLUMNS, m and rad.
+        theta: (N, n) rotation of each joint without its offset, rad.
+        modified: whether the table follows the modified convention.
+        R_rig_0: rotation of frame 0.
+        o_rig_0: its origin, m.
     """
     n = len(theta)
     R, o = np.broadcast_to(R_rig_0, (n, 3, 3)).copy(), np.broadcast_to(o_rig_0, (n, 3)).copy()

@@ -89,8 +89,14 @@ def exchanged(
 ) -> tuple[Array, Array]:
     """Return poses (n, J) and sides (n, J) that together lower the error more than those given.
 
-    ``approach``: (n, J) sides. ``information``: of poses, and which are allowed. ``rng``: sets the levels, and the
-    order of the joints.
+    Args:
+        q: (n, J) joint angles to start from, rad.
+        approach: (n, J) sides.
+        information: of poses, and which are allowed.
+        P: (F, F) covariance before.
+        requested: (3 K, F) derivative of K positions, whose error is to be low.
+        limits: (J,) and (J,) least and greatest angles, rad.
+        rng: sets the levels, and the order of the joints.
     """
     q, approach, W = q.copy(), approach.copy(), requested.T @ requested
     J, _ = information(q, approach)

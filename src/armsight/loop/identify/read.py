@@ -68,9 +68,16 @@ def read_measured(
 ) -> Read:
     """Read measured poses with their joint angles, of one file or of two.
 
-    ``data``: the poses; with their joint angles if ``joints`` is None. ``joints``: a table of joint angles, joined to
-    the poses by the names of their rows (``image``, ``name``, ``shot``), by order where there are none, or by time
-    (``t_s``) where the tables have other numbers of rows.
+    Args:
+        data: the poses; with their joint angles if ``joints`` is None.
+        arm: whose joints they are.
+        joints: a table of joint angles, joined to the poses by the names of their rows (``image``, ``name``, ``shot``), by
+            order where there are none, or by time (``t_s``) where the tables have other numbers of rows.
+        rotation: as in :func:`read_poses`.
+        columns: as in :func:`read_poses`; joints, times and names may be those of ``joints``.
+
+    Raises:
+        InputError: either file, or they do not fit together.
     """
     if joints is None:
         return read_poses(data, rotation=rotation, columns=columns, arm=arm)

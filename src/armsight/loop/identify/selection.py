@@ -127,8 +127,14 @@ def forward_selection(
 ) -> Selection:
     """Select error sources, starting from base and tool alone.
 
-    ``start``: a fit to linearise at, with the poses used and the noise. ``together``: (P,) harmonics and loads that may
-    also be added as a whole.
+    Args:
+        model: the arm with every error source.
+        start: a fit to linearise at, with the poses used and the noise.
+        measured: the poses.
+        free: (P,) the candidates.
+        prior: (P,) prior sigmas.
+        together: (P,) harmonics and loads that may also be added as a whole.
+        progress: called with a line of text after each step.
     """
     part = measured.rows(start.used)
     phi = model.feature_values(part.q, part.approach)

@@ -79,7 +79,11 @@ def path_metrics(attained: Array, command: Array, cov: Array, common: Array | No
 
 
 def square_to(command: Array) -> Array:
-    """Return projections (S, 3, 3) onto the planes square to a path at its points (S, 3); no two in a row are equal."""
+    """Return projections (S, 3, 3) onto the planes square to a path at its points (S, 3).
+
+    Raises:
+        InputError: two points of the path in a row are equal.
+    """
     along = np.gradient(command, axis=0)
     length = np.linalg.norm(along, axis=1)
     if not length.all():

@@ -56,10 +56,16 @@ def plan_check(
 ) -> CheckPlan:
     """Choose the poses of a test in the largest cube that the arm reaches, clear of its limits and of singularities.
 
-    ``centre``: (3,) of the cube in the base, m; None: on the side where the tool is at home, where the cube is largest.
-    ``wide``: a hundred poses all over the cube, rotated too, instead of the standard's five. ``allowed``: returns which
-    poses (N, 4, 4) may be used, such as those that the cameras see. ``feasible``: returns whether a plan can be carried
-    out; if not, the next cube is tried.
+    Args:
+        arm: the arm.
+        centre: (3,) of the cube in the base, m; None: on the side where the tool is at home, where the cube is largest.
+        wide: a hundred poses all over the cube, rotated too, instead of the standard's five.
+        seed: of the hundred.
+        allowed: returns which poses (N, 4, 4) may be used, such as those that the cameras see.
+        feasible: returns whether a plan can be carried out; if not, the next cube is tried.
+
+    Raises:
+        InputError: not even the smallest cube will do.
     """
     if centre is not None and not np.isfinite(centre).all():
         raise InputError("the cube's centre must be three finite numbers")

@@ -90,7 +90,13 @@ def pose_metrics(
 
 
 def repeatability(p: Array, cov: Array, way: NDArray[np.int64] | None = None) -> Metric:
-    """Return RP of positions (7.2.2): mean distance from the barycentre plus three standard deviations of them."""
+    """Return RP of positions (7.2.2): mean distance from the barycentre plus three standard deviations of the distances.
+
+    Args:
+        p: (n, 3) positions attained, m.
+        cov: (n, 3, 3) their covariance by the instrument, m^2.
+        way: (n,) see :func:`pose_metrics`.
+    """
     off, freedom = _within(p, way)
     distance = np.linalg.norm(off, axis=1)
     raw = float(distance.mean() + 3 * np.sqrt(((distance - distance.mean()) ** 2).sum() / freedom))
@@ -139,7 +145,14 @@ def anywhere(off: Array, cov: Array, common: Array) -> tuple[Metric, Metric]:
 
 
 def multi_directional(attained: list[Array]) -> Metric:
-    """Return vAP (7.2.3): the largest distance of barycentres (n, 3) of one pose come to from several directions."""
+    """Return vAP (7.2.3): the largest distance between the barycentres of one pose come to from several directions.
+
+    Args:
+        attained: (n, 3) positions for every direction.
+
+    Raises:
+        InputError: fewer than two directions.
+    """
     if len(attained) < 2:
         raise InputError("a pose was come to from one direction only; two and more are needed")
     i, j = np.triu_indices(len(attained), 1)
@@ -172,6 +185,11 @@ def distance_metrics(from_m: Array, to_m: Array, commanded_m: float, cov: Array)
 
 def drift(t_s: Array, p: Array, groups: int = 5) -> tuple[Array, Array, Metric]:
     """Return the drift of one pose's position (7.5).
+
+    Args:
+        t_s: (n,) times, s.
+        p: (n, 3) positions attained, m.
+        groups: parts of equal count in order of time.
 
     Returns:
         (groups,) middle times, s; (groups,) distances of each group's barycentre from the first one's, m; the largest.

@@ -125,8 +125,14 @@ def follow_ranges(
 ) -> RangePath:
     """Follow a point by ranges.
 
-    ``start``: (3,) about where it begins, m. ``noise``: of the sensor and the body; None: ultra-wideband on something
-    that drives. ``upright``: acceleration along z over that in the plane; 1 for what flies.
+    Args:
+        anchors: where they are, with offset and scale.
+        t_s: (N,) times, s, rising.
+        channel: (N,) the anchor of each range.
+        z: (N,) ranges, m.
+        start: (3,) about where it begins, m.
+        noise: of the sensor and the body; None: ultra-wideband on something that drives.
+        upright: acceleration along z over that in the plane; 1 for what flies.
     """
     smoother = _Smoother(anchors, t_s, channel, z, start, upright)
     path, noise = None, noise or RangeNoise()

@@ -68,7 +68,11 @@ class Entry(Record):
 
 
 def read_references(path: Path) -> list[Entry]:
-    """Read ``references.toml``."""
+    """Read ``references.toml``.
+
+    Raises:
+        InputError: the table, what was found and what is expected.
+    """
     tables = read_toml(path)
     if not tables or not all(isinstance(table, dict) for table in tables.values()):
         raise InputError(f"{path}: expected a table a reference, such as [imu] with kind and source")
@@ -138,7 +142,11 @@ def written(entry: Entry, folder: Path) -> str:
 
 
 def read_recording(path: Path, kind: str = IMU) -> tuple[Array, Array]:
-    """Return times (N,), s, and values of a recording: of an IMU (N, 6), rad/s and m/s2, of a FIELD (N, 3), T."""
+    """Return times (N,), s, and values (N, 6) of an inertial unit: rad/s, then m/s2.
+
+    Raises:
+        InputError: the file, the line and what was expected.
+    """
     if path.is_dir() or path.suffix.lower() in SUFFIXES:
         return _of_bag(Bag(path), kind)
     names = _MESSAGES[kind][0]
@@ -157,7 +165,11 @@ def _of_bag(bag: Bag, kind: str) -> tuple[Array, Array]:
 
 
 def reading_of(message: BagMessage, kind: str = IMU) -> tuple[float, Array]:
-    """Return the time, s, and the reading of a message: (6,), rad/s and m/s2, or of a field (3,), T."""
+    """Return the time, s, and the reading (6,), rad/s and m/s2, of a message of ``sensor_msgs/Imu``.
+
+    Raises:
+        InputError: it is too short.
+    """
     _, size, rows = _MESSAGES[kind]
     stamp = message.stamp_ns() or message.arrival_ns
     if len(message.data) < size:

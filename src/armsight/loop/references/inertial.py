@@ -91,8 +91,13 @@ class Inertial(Reference):
     def of(name: str, kind: str = "mpu-6050", T_tool_sensor: Array | None = None) -> Inertial:
         """Return one of a class, nothing of it calibrated.
 
-        ``kind``: of :data:`INERTIAL_CLASSES`. ``T_tool_sensor``: (4, 4) its mounting, roughly; None: unknown, the
-        identity.
+        Args:
+            name: what people call it.
+            kind: of :data:`INERTIAL_CLASSES`.
+            T_tool_sensor: (4, 4) its mounting, roughly; None: unknown, the identity.
+
+        Raises:
+            InputError: no such class.
         """
         if kind not in INERTIAL_CLASSES:
             raise InputError(f"{name}: no class of inertial units {kind!r}; there are {', '.join(INERTIAL_CLASSES)}")

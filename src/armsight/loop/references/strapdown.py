@@ -468,7 +468,12 @@ class Strapdown:
     def started(self, before: Navigated | None, t_s: float, T: Array, twist: Array, rows: int) -> Navigated:
         """Return velocity and parameters where a window begins and the velocity is known by the joints alone.
 
-        ``T``: (4, 4) pose of the tool. ``rows``: of the arm's state, K.
+        Args:
+            before: what was known; None: nothing.
+            t_s: when, s.
+            T: (4, 4) pose of the tool.
+            twist: (6,) its motion by the joints, tool axes.
+            rows: of the arm's state, K.
         """
         size = _PARAMETERS + len(self.sensor.cov)
         y, C, Y = np.zeros(size), np.zeros((rows, size)), np.zeros((size, size))

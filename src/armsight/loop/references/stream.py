@@ -93,7 +93,16 @@ class Settling(NamedTuple):
 
 
 def check_stream(t_s: Array, z: Array, source: str) -> StreamCheck:
-    """Return what a stream is like."""
+    """Return what a stream is like.
+
+    Args:
+        t_s: (N,) times, s.
+        z: (N, k) values.
+        source: its file, for messages.
+
+    Raises:
+        InputError: too short, no numbers, or times that run backwards.
+    """
     if len(t_s) < 20:
         raise InputError(f"{source}: {len(t_s)} readings; 20 at least are needed")
     if not (np.isfinite(t_s).all() and np.isfinite(z).all()):

@@ -42,6 +42,9 @@ def handeye_poses(arm: Arm, around: Array, count: int, seed: int) -> Array:
     """Sample joint angles (count, n), rad, that show the body from many sides, near given ones (M, n) that have it in view.
 
     They are in the order of a short way: from the first of ``around`` always on to the nearest.
+
+    Raises:
+        InputError: the arm reaches too few such poses.
     """
     rng = np.random.default_rng([seed, 20])
     found: list[Array] = []
@@ -108,7 +111,12 @@ class VisitedPose(Record):
 
 
 def find_mounting(loop: Loop, q_start: Array, targets: Array, progress: Progress) -> HandEyeRun:
-    """Visit joint angles (N, n), rad, from where the arm stands (n,), measure the body at rest, calibrate hand and eye."""
+    """Visit joint angles (N, n), rad, from where the arm stands (n,), measure the body at rest, calibrate hand and eye.
+
+    Raises:
+        CalibrationError: too few poses were seen.
+        DeviceError: the board or a camera failed.
+    """
     visited: list[VisitedPose] = []
     missed: list[str] = []
     rows: list[slice] = []
@@ -141,7 +149,11 @@ def _again(visited: VisitedPose, shots: Sequence[Seen]) -> VisitedPose:
 
 
 def visit(loop: Loop, q_from: Array, q_to: Array, name: str) -> VisitedPose | Missed:
-    """Move from joint angles (n,), rad, to others, and measure the body at rest; ``name`` is the pose's in the log."""
+    """Move from joint angles (n,), rad, to others, and measure the body at rest; ``name`` is the pose's in the log.
+
+    Raises:
+        DeviceError: the board or a camera failed.
+    """
     way, log, setup = point_to_point(loop.setup.arm, q_from, q_to), loop.log, loop.setup
     settle_s = SETTLE_S + 2.0 * setup.board.abilities.latency_s
     loop.go(way, settle_s, RunSegment("calibration", name, "joints"), watch=False)
@@ -157,7 +169,11 @@ def visit(loop: Loop, q_from: Array, q_to: Array, name: str) -> VisitedPose | Mi
 
 
 def handeye_of(arm: Arm, visited: Sequence[VisitedPose], missed: tuple[str, ...], quick: bool = False) -> HandEyeRun:
-    """Calibrate hand and eye of a nominal arm from four poses at least; ``missed``: where the body was not, and why."""
+    """Calibrate hand and eye of a nominal arm from four poses at least; ``missed``: where the body was not, and why.
+
+    Raises:
+        CalibrationError: the motions leave a direction open, or the arm's table is grossly wrong.
+    """
     q = np.array([each.q for each in visited])
     Ts_left_body, cov = np.array([each.T_left_body for each in visited]), np.array([each.cov for each in visited])
     require_fitting(arm, q, Ts_left_body)
@@ -167,7 +183,14 @@ def handeye_of(arm: Arm, visited: Sequence[VisitedPose], missed: tuple[str, ...]
 
 
 def find_delay(loop: Loop, q_start: Array, q_middle: Array) -> Delay:
-    """Sweep the joints about a pose (n,), rad, where the arm then stands; estimate the images' delay and the shutters."""
+    """Sweep the joints about a pose (n,), rad, where the arm then stands; estimate the images' delay and the shutters.
+
+    The loop's mounting is known; its shutters and its delay are set.
+
+    Raises:
+        CalibrationError: the sweep does not determine the delay.
+        DeviceError: the board or a camera failed.
+    """
     arm, log = loop.setup.arm, loop.log
     way = point_to_point(arm, q_start, q_middle)
     loop.go(way, DELAY_REST_S, RunSegment("calibration", "sweep's start", "joints"), watch=False)

@@ -77,6 +77,12 @@ class Sweep:
 
     Only joints with a gravity load move: the load keeps their backlash on one side. A joint without load lags by its
     backlash after every reversal, which looks like a delay: 0.1 degree at 30 degrees a second are 3 ms.
+
+    Args:
+        arm: the nominal arm, its base upright.
+        q_middle: (n,) joint angles about which they move, rad; the trajectory begins and ends there.
+        reach_rad: amplitude, rad.
+        duration_s: duration, s.
     """
 
     def __init__(self, arm: Arm, q_middle: Array, reach_rad: float = 0.12, *, duration_s: float) -> None:

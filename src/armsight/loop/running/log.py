@@ -107,6 +107,10 @@ class Skew:
 
     Between the two exposures of a shot the body moves by v dt along the baseline. Triangulation takes that for disparity:
     the depth Z is wrong by Z / B v dt along the line of sight, with B the baseline.
+
+    Args:
+        rig: the calibrated pair.
+        sync_s: standard deviation of the time between the two exposures of a shot, s.
     """
 
     def __init__(self, rig: StereoRig, sync_s: float) -> None:

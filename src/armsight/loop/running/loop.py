@@ -414,7 +414,18 @@ class Loop:
         return shot
 
     def run(self, controller: Controller, duration_s: float, segment: RunSegment, *, watch: bool = True) -> None:
-        """Let a controller command the joints for some time, s; the segment is logged with its times."""
+        """Let a controller command the joints for some time, s; the segment is logged with its times.
+
+        Args:
+            controller: computes the commands.
+            duration_s: how long, s.
+            segment: the entry of the log.
+            watch: whether shots are measured.
+
+        Raises:
+            DeviceError: the board left the enabled state (the message has its faults), the cameras stalled, or a device
+                was disconnected.
+        """
         begin_s = self.t_s
         self._iterate(controller, lambda: self.t_s - begin_s >= duration_s - 1e-9, segment, watch=watch)
 
@@ -589,7 +600,11 @@ class Loop:
             self._led_work = self._fixed_pool.submit(work)
 
     def find_led(self) -> None:
-        """Hold the arm until the sync LED was found by both cameras, where there is to be one."""
+        """Hold the arm until the sync LED was found by both cameras, where there is to be one.
+
+        Raises:
+            ArmsightError: it was not found; the message says why.
+        """
         led, begin_s = self.led, self.t_s
         if led is None:
             return

@@ -90,7 +90,11 @@ class HostClock:
         return float(np.clip(rate + _SCATTER_S / (t_s[-1] - t_s[0]), -DRIFT, DRIFT))
 
     def on_board(self, shot: Shot) -> Shot:
-        """Return a shot with its time on the board's clock; a reading must have been heard before."""
+        """Return a shot with its time on the board's clock; a reading must have been heard before.
+
+        Raises:
+            DeviceError: no live camera stamped it, by this computer's clock.
+        """
         if shot.t_s is None and shot.problem is not None:
             return shot
         t_s = shot.t_s if shot.t_s is not None and math.isfinite(shot.t_s) else None
@@ -259,7 +263,11 @@ class Fused:
 
 
 def recorded(entry: Entry) -> Fused:
-    """Return a unit whose readings are those of its recording."""
+    """Return a unit whose readings are those of its recording.
+
+    Raises:
+        InputError: it is not calibrated, or its recording cannot be read.
+    """
     if not entry.calibrated or entry.source is None:
         lacks = "source" if entry.calibrated else "parameters"
         raise InputError(
@@ -278,7 +286,11 @@ def recorded(entry: Entry) -> Fused:
 
 
 def the_one(entries: list[Entry], where: object) -> Entry:
-    """Return the one reference that is fused."""
+    """Return the one reference that is fused.
+
+    Raises:
+        InputError: there are several.
+    """
     first, *others = entries
     if others:
         raise InputError(
@@ -365,7 +377,11 @@ class LiveShots:
         return None, False
 
     def poll(self) -> Shot | None:
-        """Return the newest shot not returned yet, or None."""
+        """Return the newest shot not returned yet, or None.
+
+        Raises:
+            DeviceError: a camera was disconnected, or the source has ended.
+        """
         with self._lock:
             shot, self._newest = self._newest, None
         if shot is None and self._failure is not None:

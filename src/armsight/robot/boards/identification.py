@@ -106,7 +106,11 @@ def _evenly(t_s: Array, *recorded: Array) -> tuple[float, Array, list[Array]]:
 def fit_spring(t_s: Array, voltage_v: Array, current_a: Array, angle_rad: Array) -> tuple[JointFit, Elasticity] | None:
     """Identify a joint that is read behind a spring, from a swing with duties at :data:`DITHER_HZ`; None if it is rigid.
 
-    Times rise for 1.5 s and more; all (n,) as in :func:`fit_swing`, the current with its sign.
+    Args:
+        t_s: (n,) times of the readings, rising, s; 1.5 s and more.
+        voltage_v: (n,) duty times supply, V, as in :func:`fit_swing`.
+        current_a: (n,) current of the motor, A, with its sign.
+        angle_rad: (n,) angles of the joint.
     """
     if (
         len(t_s) < _LEAST_READINGS
@@ -160,7 +164,13 @@ def fit_drum(
 ) -> tuple[float, float] | None:
     """Return amplitude, rad, and periods a revolution by which a joint leads its motor, as by an eccentric drum; or None.
 
-    Readings (n,) of a travel to and fro as in :func:`fit_spring`; the motor's constant is fitted once more.
+    Args:
+        t_s: (n,) times of the readings of a travel to and fro, rising, s.
+        voltage_v: (n,) duty times supply, V.
+        current_a: (n,) current of the motor, A, with its sign.
+        angle_rad: (n,) angles of the joint.
+        motor: its motor; the constant is fitted once more.
+        twist_rad_per_a: of its transmission.
     """
     if len(t_s) < _LEAST_READINGS or np.ptp(angle_rad) < _LEAST_SWING_RAD:
         return None

@@ -112,10 +112,17 @@ def elastic_gains(motor: MotorFigures, supply_v: float, elastic: Elasticity, noi
 
     Without the spring there would be three poles, ``(s^2 + 2 z w s + w^2) (s + r w)``; w is the greatest with which the
     loop gain, at the motor's duty and with the spring, stays away from -1 and every pole decays. Damping by its speed
-    takes energy from the resonance at any frequency; by the speed read behind the spring it feeds it from there on
-    (Spong, Hutchinson and Vidyasagar, "Robot Modeling and Control", 2006, section 6.5).
-    The motor's inertia is that of motor and joint together, ``noise_rad`` the sigma of a reading. (8,) as
-    :func:`tuned_gains`; None where the joint is too soft: no bandwidth from 5 rad/s on is stable.
+    takes energy from the resonance at any frequency; by the speed read behind the spring it feeds it from there on (Spong,
+    Hutchinson and Vidyasagar, "Robot Modeling and Control", 2006, section 6.5).
+
+    Args:
+        motor: its motor; the inertia is that of motor and joint together.
+        supply_v: nominal supply, V.
+        elastic: its spring.
+        noise_rad: standard deviation of a reading.
+
+    Returns:
+        (8,) as those of :func:`tuned_gains`; None where the joint is too soft: no bandwidth from 5 rad/s on is stable.
     """
     best: Array | None = None
     for third in _THIRD_POLES:

@@ -265,11 +265,19 @@ def _one_shoulder(
 
 @kernel(nogil=True, fastmath={"contract", "nsz"})
 def closed_form(table: Array, M: Frame, near: Array, clamp: bool, y: Array, x: Array, tags: Array) -> tuple[int, int]:
-    """Write the thetas of all solutions of a PARALLEL or SPHERICAL table into a batch, one after the other.
+    """Write the thetas of all solutions into a batch, one after the other.
 
-    M is the requested frame just after joint 6's rotation, in frame 0 of the table; ``clamp``: write the closest that a
-    step can come where a pose is out of reach. Written are sines y (48,), cosines x (48,) and tags (32,): shoulder,
-    elbow, wrist (+-1) and state. Return how many slots were filled, and bits of what kept solutions out of reach.
+    Args:
+        table: (102,) a packed table whose KIND is PARALLEL or SPHERICAL.
+        M: the requested frame just after joint 6's rotation, in frame 0 of the table.
+        near: (6,) joint angles, rad: what an undetermined joint is given.
+        clamp: write the closest that a step can come where a pose is out of reach.
+        y: (48,) batch of the angles' sines.
+        x: (48,) batch of their cosines.
+        tags: (32,) batch of shoulder, elbow, wrist (+-1) and state.
+
+    Returns:
+        how many slots were filled, and bits of what kept solutions out of reach.
     """
     offset, wx, wy = table[ACROSS], M[9], M[10]
     r = math.sqrt(wx * wx + wy * wy)

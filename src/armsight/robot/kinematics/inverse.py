@@ -156,9 +156,19 @@ def _normal(J: Array, e: Array, q: Array, low: Array, high: Array, A: Array, g: 
 
 @kernel(nogil=True, fastmath={"contract", "nsz"})
 def descend(table: Array, G: Frame, q: Array, low: Array, high: Array, most: int, work: Array) -> float:
-    """Move joint angles q (6,) in-place towards a requested frame, within bounds (6,), rad, in ``most`` steps at most.
+    """Move joint angles (6,) in-place towards a requested frame, within bounds.
 
-    Return the squared length of the error that is left.
+    Args:
+        table: (102,) packed table.
+        G: the requested frame of the tool.
+        q: (6,) where to start, within the bounds; where it ends.
+        low: (6,) lower bounds, rad.
+        high: (6,) upper bounds, rad.
+        most: how many steps at most.
+        work: (20, 6) workspace.
+
+    Returns:
+        the squared length of the error that is left.
     """
     J, A, e, g, root, trial = work[0:6], work[6:12], work[12], work[13], work[14], work[15]
     cost = np.inf
@@ -394,13 +404,22 @@ def inverse(
     scratch: Array,
     n: int,
 ) -> tuple[int, int, int]:
-    """Write all joint angles that bring the tool to a pose into rows (16, 13): angles, errors, configuration, state, key.
+    """Write all joint angles that bring the tool to a pose.
 
-    ``closed``: the table that the closed form works on, KIND 0 where there is none; the KIND of ``table`` is not 0
-    where both are the same arm exactly. ``near``: what an undetermined joint is given, and which of several revolutions
-    is taken; ``ordered``: by their distance from it; rows outside the limits (2, 6) come last anyway. n is 8. Return
-    how many rows were written, or the validity of T; bits of what kept solutions out of reach; and those of all rows'
-    states together, OUTSIDE only where every row is.
+    Args:
+        table: (102,) packed table; its KIND is not 0 where ``closed`` is the same arm exactly.
+        closed: (102,) the table that the closed form works on, KIND 0 where there is none.
+        limits: (2, 6) lower and upper limits of the joints, rad.
+        T: (4, 4) T_base_tool, m.
+        near: (6,) joint angles, rad: what an undetermined joint is given, and which of several revolutions is taken.
+        ordered: whether the rows are sorted by their distance from ``near``; those outside the limits come last anyway.
+        rows: (16, 13) is written: joint angles, errors, configuration, state and key.
+        scratch: (SCRATCH,) workspace of finite numbers.
+        n: 8, the size of the batch.
+
+    Returns:
+        how many rows were written, or the validity of T; bits of what kept solutions out of reach; and those of all rows'
+        states together, OUTSIDE only where every row is.
     """
     validity, F = rigid(T)
     if validity != 0:

@@ -377,10 +377,19 @@ def _start(k: int, limits: Array, goal: Array, q: Array) -> None:
     fastmath={"contract", "nsz"},
 )
 def inverse(table: Array, limits: Array, T: Array, goal: Array, q: Array, off: Array, scratch: Array) -> int:
-    """Write joint angles q (n,) within the limits (2, n) that bring the tool to a pose, or as near as descent finds.
+    """Write joint angles within the limits that bring the tool to a pose, or as near as descent finds.
 
-    ``goal`` (n,): angles to start from and, with seven joints, to stay near to. off (3,) receives what is left of the
-    error: position, m, rotation, rad, direction of the z axis, rad. Return the validity of T.
+    Args:
+        table: (102,) packed table of four, five or seven joints.
+        limits: (2, n) lower and upper limits of the joints, rad.
+        T: (4, 4) T_base_tool, m.
+        goal: (n,) angles to start from and, with seven joints, to stay near to, rad.
+        q: (n,) is written, rad.
+        off: (3,) is written: what is left of the error: position, m, rotation, rad, direction of the z axis, rad.
+        scratch: (SCRATCH,) workspace of finite numbers.
+
+    Returns:
+        the validity of T.
     """
     validity, G = rigid(T)
     if validity != 0:

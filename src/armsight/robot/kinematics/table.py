@@ -61,7 +61,21 @@ def packed(
     *,
     modified: bool,
 ) -> Array:
-    """Pack a table, rows (n,) in m and rad, for the kernels: (102,); T_n_tool is the tool in the table's last frame."""
+    """Pack a table for the kernels.
+
+    Args:
+        a: (n,) link lengths, m.
+        d: (n,) link offsets, m.
+        alpha: (n,) twists, rad.
+        offset: (n,) added to the joint angles, rad.
+        direction: (n,) +1 or -1, by which the joint angles are multiplied.
+        T_base_0: (4, 4) frame 0 of the table in the base.
+        T_n_tool: (4, 4) the tool in the last frame of the table.
+        modified: whether the table follows the modified convention.
+
+    Returns:
+        (102,) the packed table.
+    """
     cos, sin = exact_cos_sin(alpha)
     if modified:
         T_base_0 = T_base_0 @ link(a[0], 0.0, cos[0], sin[0])

@@ -119,7 +119,14 @@ def fit_law(arm: Arm, guide: Walk) -> SingleLaw:
 def moving_laws(arm: Arm, guide: Walk, start: Joints, duration_s: float | None) -> Iterator[SingleLaw]:
     """Yield shares over time from a moving start that keep the limits by the walk's derivatives, the shortest first.
 
-    ``start`` (1,): the share, its speed and acceleration. InputError: none of those tried does.
+    Args:
+        arm: the arm, for its limits.
+        guide: the joints along the way.
+        start: (1,) the share to start from, its speed and acceleration.
+        duration_s: how long it is to take, s; None for as short as possible.
+
+    Raises:
+        InputError: none of those tried does.
     """
     rest = Joints(start.q, np.zeros(1), np.zeros(1))
     found = []
@@ -267,9 +274,16 @@ class _Plan(NamedTuple):
 
 
 def fit_chain(arm: Arm, guide: Walk, start: Joints, cruises: Array) -> Law:
-    """Return the share over time that just keeps the limits by the walk's derivatives, bends between shares (C, 2).
+    """Return the share over time that just keeps the limits by the walk's derivatives.
 
-    InputError: a moving start cannot reach the pace of the first bend.
+    Args:
+        arm: the arm, for its limits.
+        guide: the joints along the way.
+        start: (1,) the share to start from, its speed and acceleration.
+        cruises: (C, 2) shares between which the bends lie.
+
+    Raises:
+        InputError: a moving start cannot reach the pace of the first bend.
     """
     moving = bool(start.qd.any() or start.qdd.any())
     within = 1 - (MARGIN if moving else CLOSE / 2)

@@ -138,9 +138,16 @@ def singular_values(arm: Arm, q: Array) -> tuple[Array, Array]:
 
 
 def walk(arm: Arm, path: Path, q_start: Array, bends: Array) -> tuple[Walk, Obstacle | None]:
-    """Walk along a path as far as it can be travelled, with smaller steps between shares ``bends`` (C, 2).
+    """Walk along a path as far as it can be travelled.
 
-    Return the walk up to the first obstacle, and that; None where there is none.
+    Args:
+        arm: the arm.
+        path: the path.
+        q_start: (n,) joint angles at its start, rad.
+        bends: (C, 2) shares between which steps are to be smaller.
+
+    Returns:
+        The walk up to the first obstacle, and that; None where there is none.
     """
     if arm.joints < 6:
         raise InputError(

@@ -75,7 +75,14 @@ def pair_errors(
 
 
 def middles(rig: StereoRig, body: Array, seen: Correspondences, disc_radius_m: float) -> Correspondences:
-    """Convert centres of the ellipses of a board's discs to images of their middles, at the pose that both cameras show."""
+    """Convert centres of the ellipses of a board's discs to images of their middles, at the pose that both cameras show.
+
+    Args:
+        rig: the calibrated pair.
+        body: (M, 3) the discs' middles, m.
+        seen: correspondences that both cameras have.
+        disc_radius_m: radius of the discs, m.
+    """
     centres = seen
     for _ in range(_BIAS_ROUNDS):
         p, _, _ = optimal_points(rig, centres.uv, centres.cov_uv + max(rig.sigma_px, LEAST_SIGMA_PX) ** 2 * np.eye(2))
@@ -182,10 +189,18 @@ def cross_validate(
     folds: int,
     disc_radius_m: float = 0.0,
 ) -> PairErrors:
-    """Fit on all folds but one and measure that one, for every fold: the held-out errors of every shot.
+    """Fit on all folds but one and measure that one, for every fold.
 
-    ``fit``: rows of the shots to use -> the rig they give, the body as they show it (M, 3), m, and how far it moved
-    between the exposures. ``observations`` are all, bad ones included: a measurement meets them too.
+    Args:
+        fit: rows of the shots to use -> the rig they give, the body as they show it (M, 3), m, and how far it moved
+            between the exposures.
+        drawing: (M, 3) points of the perfect body, m.
+        observations: all detections, bad ones included: a measurement meets them too.
+        folds: number of folds, at most the number of shots.
+        disc_radius_m: as in :func:`pair_errors`.
+
+    Returns:
+        The held-out errors of every shot.
     """
     parts = []
     for held in folds_of(observations.shot_count, folds):

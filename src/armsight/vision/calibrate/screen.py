@@ -78,9 +78,18 @@ def screen(
     sigma_px: float = 1.0,
     known: Mapping[int, str] | None = None,
 ) -> Screened:
-    """Adjust robustly from a start and reject gross corners and bad pairs until no more are found.
+    """Adjust robustly and reject gross corners and bad pairs until no more are found.
 
-    ``sigma_px``: of a detection to begin with; ``known``: pairs that are known to be bad, and why.
+    Args:
+        model: the board.
+        start: a start for all pairs.
+        observations: all detections.
+        names: (S,) names of the pairs.
+        sigma_px: standard deviation of a detection to begin with, px.
+        known: pairs that are known to be bad, and why.
+
+    Returns:
+        The detections that remain.
     """
     rejected = [RejectedPair(names[j], reason) for j, reason in (known or {}).items()]
     kept = np.setdiff1d(np.arange(observations.shot_count), list(known or ()))

@@ -135,9 +135,18 @@ def agreed_symmetries(
 ) -> dict[int, Ids]:
     """Find pairs whose right image names the points in another order than the left one, even in most pairs.
 
-    A camera that is mounted upside down sees the other end of a symmetric board as its first. One order of each pair
-    gives the relative pose that the others give, too; wrong ones give another one wherever the board is. Return shot ->
-    the permutation (M,) that sorts its right detections into the left's order.
+    A camera that is mounted upside down sees the other end of a symmetric board as its first. One order of each pair gives
+    the relative pose that the others give, too; wrong ones give another one wherever the board is.
+
+    Args:
+        points: (M, 3) points of the board, m.
+        sizes: image size of the left and of the right camera, px.
+        observations: the detections of all shots.
+        symmetries: permutations (M,) under which the board looks the same.
+        model: distortion model of the cameras.
+
+    Returns:
+        Shot -> the permutation that sorts its right detections into the left's order.
     """
     candidates: list[list[list[list[Array]]]] = []  # by camera, order and shot
     for side, orders in enumerate(((), symmetries)):
@@ -172,9 +181,19 @@ def agreed_symmetries(
 def start_board(
     points: Array, sizes: tuple[tuple[int, int], tuple[int, int]], observations: Observations, model: str
 ) -> BundleSolution:
-    """Calibrate two cameras from nothing, roughly, under a noise of one pixel: the start for every later adjustment.
+    """Calibrate two cameras from nothing, roughly: the start for every later adjustment.
 
-    Every shot has four or more detections in both cameras. CalibrationError: no start leads anywhere.
+    Args:
+        points: (M, 3) points of the board, m.
+        sizes: image size of the left and of the right camera, px.
+        observations: the detections of all shots; every shot has four or more in both cameras.
+        model: distortion model of the adjustment.
+
+    Returns:
+        The best minimum found, under a noise of one pixel.
+
+    Raises:
+        CalibrationError: no start leads anywhere.
     """
     focals = [_focal_candidates(points, sizes[side], observations, side, model) for side in (0, 1)]
     plain = BundleModel(points, np.zeros((0, len(points), 3)), 1.0, True)

@@ -97,10 +97,15 @@ def _bits_set(x: np.uint8) -> np.uint8:
 class StripBuffers(NamedTuple):
     """The buffers of a strip.
 
-    ``raw``: one row's costs at one disparity, with the windows' reach to either side; ``threes``: sums of three of
-    them; ``along`` (T,): along the row; ``kept``: of as many rows as a window is high, each (count, T), the oldest
-    replaced; ``total`` (count, T): over windows; ``least`` and ``where``: least total of each left pixel and its
-    disparity from the first on; ``right`` (T + pad,): of each right pixel, u at u + pad.
+    Attributes:
+        raw: one row's costs at one disparity, with the windows' reach to either side.
+        threes: sums of three of them, from each on: windows are made of these.
+        along: (T,) sums along the row.
+        kept: sums along rows: as many rows as a window is high, each (count, T), the oldest replaced by the newest.
+        total: (count, T) sums over windows.
+        least: (T,) least total of each left pixel so far.
+        where: (T,) and at which disparity, from the search's first on.
+        right: (T + pad,) least total of each right pixel so far; pixel u is at u + pad.
     """
 
     raw: Bytes

@@ -35,9 +35,17 @@ _RAW_MAX = np.uint8(34)
 
 @kernel_types("u1[:, ::1], u1[:, ::1], u1[:, ::1], u4[:, ::1], u1[:, ::1], u1[:, ::1], u1[:, ::1], u4[:, ::1]")
 class CensusPair(NamedTuple):
-    """A pair as the costs need it; planes of the right image (H, W + pad) are mirrored and padded by the search.
+    """A pair as the costs need it; the planes of the right image are mirrored and padded by the search.
 
-    ``low`` and ``high``: the least and the greatest grey level within half a pixel to either side.
+    Attributes:
+        left: (H, W) grey.
+        left_low: (H, W) least grey level within half a pixel to either side.
+        left_high: (H, W) greatest.
+        left_census: (H, W) census words.
+        right: (H, W + pad) grey, mirrored.
+        right_low: (H, W + pad) mirrored.
+        right_high: (H, W + pad) mirrored.
+        right_census: (H, W + pad) mirrored.
     """
 
     left: Bytes

@@ -38,7 +38,13 @@ class Depth(Record):
 
 
 def calibration_share(rectification: Rectification, uv: Array, disparity: Array) -> Array:
-    """Return the relative sigma (N,) of depths, by the rig's covariance, at uv (N, 2) of the rectified left image."""
+    """Return the relative standard deviation (N,) of depths that the rig's covariance causes.
+
+    Args:
+        rectification: of the pair.
+        uv: (N, 2) pixels of the rectified left image.
+        disparity: (N,) px.
+    """
     rig = rectification.rig
     raw = (
         rectification.to_raw(uv, "left"),

@@ -108,9 +108,15 @@ def _mean_of(
 
 
 def aligned_to_edges(disparity: Singles, state: NDArray[np.uint8], image: Image) -> tuple[Singles, NDArray[np.uint8]]:
-    """Align depth breaks and gaps of a filled disparity map (H, W), px, to the edges of the left image, and their states.
+    """Align depth breaks and gaps to the edges of the image.
 
-    A measured pixel that moves to another surface is FILLED.
+    Args:
+        disparity: (H, W) px, filled.
+        state: (H, W) the state of each.
+        image: (H, W) uint8, the left image.
+
+    Returns:
+        The same two, aligned; a measured pixel that moves to another surface is FILLED.
     """
     doubtful, median = _doubtful(disparity, state), np.empty_like(disparity)
     alike = np.exp(-np.arange(256) / _EDGE_ALIKE).astype(np.float32)
@@ -240,9 +246,15 @@ def _columns(
 
 
 def smoothed(disparity: Singles, image: Image) -> tuple[Singles, NDArray[np.float32]]:
-    """Smooth measured disparities (H, W), px, NaN elsewhere, by the left image.
+    """Smooth measured disparities.
 
-    Also return (H, W) the share of each pixel's neighbours, each by its weight, that lie on its surface.
+    Args:
+        disparity: (H, W) px; NaN where nothing was measured.
+        image: (H, W) uint8, the left image.
+
+    Returns:
+        (H, W) px, NaN where it was; and (H, W) the share of each pixel's neighbours, each by its weight, that lie on
+        its surface.
     """
     height = disparity.shape[0]
     share, half, out = np.empty_like(disparity), np.empty_like(disparity), disparity
@@ -331,7 +343,15 @@ def _write_sigmas(
 
 
 def finished(found: Winners, left: Image, search: Search, sigma_model: SigmaModel, *, edges: bool = False) -> Disparity:
-    """Convert the winners of a method to a result; ``edges``: align depth breaks to the edges of the left image."""
+    """Convert the winners of a method to a result.
+
+    Args:
+        found: the winners.
+        left: (H, W) uint8, the left image.
+        search: which disparities were tried.
+        sigma_model: the uncertainty of the method.
+        edges: whether depth breaks are aligned to the edges of the image.
+    """
     sure = without_speckles(found)
     if np.count_nonzero(sure == sure) < _LEAST_SHARE * sure.size:  # NaN is not even itself
         return Disparity.none(

@@ -36,11 +36,16 @@ Starts = NDArray[np.uintp]
 
 
 class PathBuffers(NamedTuple):
-    """The buffers of one strip of rows; the right row is mirrored.
+    """The buffers of one strip of rows.
 
-    ``raw`` (3 * W * size,): costs of three rows; ``arena``: slots of path costs, and a row's costs: two rows of W in
-    three directions each, two pixels of the path along the row, and a start before which there is nothing; ``least`` (6
-    * W,): of each slot of the first two rows; ``total`` (rows * W * size,): over the paths; ``best_right`` (W + pad,).
+    Attributes:
+        raw: (3 * W * size,) raw costs of three rows.
+        mixed: (W * size,) scratch.
+        arena: slots of path costs, and a row's costs. Slots: two rows of W in three directions each, two pixels of the
+            path along the row, and a start before which there is nothing.
+        least: (6 * W,) least cost of each slot of the first two rows.
+        total: (rows * W * size,) sum over the paths.
+        best_right: (W + pad,) least total of each pixel of the right row, mirrored.
     """
 
     raw: Bytes

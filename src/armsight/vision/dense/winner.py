@@ -53,10 +53,13 @@ NOWHERE = np.uint16(65535)
 
 @kernel_types("f4[:, ::1], b1[:, ::1], f4[:, ::1], f4[:, ::1]")
 class Winners(NamedTuple):
-    """The winning disparity, px, of every pixel of the left image (H, W), even where the images do not agree.
+    """The winning disparity of every pixel of the left image.
 
-    ``agreed``: the right image's choice is the same to one disparity; ``curvature``: second difference of the totals, 0
-    at the ends of the search; ``least``: the winner's total.
+    Attributes:
+        disparity: (H, W) px, sub-pixel; the winner even where the images do not agree.
+        agreed: (H, W) whether the right image's choice is the same to one disparity.
+        curvature: (H, W) second difference of the totals at the winner; 0 at the ends of the search.
+        least: (H, W) the winner's total.
     """
 
     disparity: Singles

@@ -71,9 +71,13 @@ def correspondences(view: DiscView, found: Assigned) -> Correspondences:
 
 
 def settle(view: DiscView, T_left_body: Array, cov: Array, rows: Ids) -> Assigned:
-    """Assign detections to discs by an approximate pose, the unambiguous ones first.
+    """Assign detections to discs by a pose, the unambiguous ones first.
 
-    ``rows`` (M, 2): detections already assigned, which the pose includes; -1 elsewhere.
+    Args:
+        view: the discs that both cameras detected.
+        T_left_body: (4, 4) approximate pose.
+        cov: (6, 6) covariance of its tangent.
+        rows: (M, 2) detections already assigned, which the pose includes; -1 elsewhere.
     """
     T, rows = T_left_body, rows.copy()
     while True:

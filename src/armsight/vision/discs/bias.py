@@ -248,7 +248,13 @@ def _each(
 
 
 def project_discs(camera: Camera, p: Array, normals: Array, radii_m: Array) -> tuple[Array, Array, Array, Array]:
-    """Project discs, centres p (N, 3), m, and normals of either sign, camera's frame, to the ellipses that a camera shows.
+    """Project discs to the ellipses that a camera shows, and their centres.
+
+    Args:
+        camera: the camera.
+        p: (N, 3) centres of the discs, m, camera's frame.
+        normals: (N, 3) unit normals of the discs, camera's frame; the sign does not matter.
+        radii_m: (N,) radii, m.
 
     Returns:
         (N, 2) centres of the ellipses, raw px; (N, 3) S11, S12, S22 of the ellipses, px^2; (N, 2, 3) derivative of the
@@ -265,9 +271,16 @@ def project_discs(camera: Camera, p: Array, normals: Array, radii_m: Array) -> t
 
 
 def disc_bias(camera: Camera, T_camera_board: Array, points: Array, radius_m: float) -> Array:
-    """Return by how much, (N, 2) px, centres of ellipses of a board's discs are off the images of their middles.
+    """Return by how much the centres of the ellipses of a board's discs are off the images of their middles.
 
-    ``points`` (N, 3) are the middles, m, board frame, where discs face along z; zero where a disc has no ellipse.
+    Args:
+        camera: the camera.
+        T_camera_board: (4, 4) pose of the board, whose discs face along z.
+        points: (N, 3) the discs' middles, m, board frame.
+        radius_m: their radius, m.
+
+    Returns:
+        (N, 2) px; zero where a disc has no ellipse.
     """
     p = transform(T_camera_board, points)
     normals = np.tile(T_camera_board[:3, 2], (len(p), 1))

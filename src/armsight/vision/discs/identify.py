@@ -38,11 +38,14 @@ _NONE = np.zeros(0, np.int64)
 
 @dataclass(frozen=True, eq=False)
 class Triples(Record):
-    """Triples of pairs that may be three discs, those of the largest bodies first, then those that fit best.
+    """Triples of pairs that may be three discs of the body, those of the largest bodies first, then those that fit best.
 
-    ``ids`` and ``rows`` (T, 3): of the body's discs, of the pairs; Ts (T, 4, 4) the rigid fits; ``most``: how many of
-    the body's discs can be visible at most if a triple is right, ``left_out`` the same for those too many to be listed,
-    0 without.
+    Attributes:
+        ids: (T, 3) rows of the body's discs.
+        rows: (T, 3) rows of the pairs.
+        Ts_left_body: (T, 4, 4) the rigid fits.
+        most: (T,) how many of the body's discs can be visible at most if this triple is right.
+        left_out: the same for the triples that were too many to be listed; 0 where none were.
     """
 
     ids: Ids
@@ -200,11 +203,14 @@ _ALLOWANCE = 1.5
 
 @dataclass(frozen=True, eq=False)
 class IdentifiedDiscs(Record):
-    """The discs of a body, detected and identified, and its pose, the perspective bias of the discs taken into account.
+    """The discs of a body, detected and identified.
 
-    ``cov`` (6, 6) is wide: it includes what neither noise nor calibration explain. ``seen`` are ellipse centres, the
-    bias still in them; ``rows`` (M, 2), of both cameras' discs, -1 where not seen; ``log_odds`` against the next best
-    explanation, natural.
+    Attributes:
+        T_left_body: (4, 4) pose of the body, the perspective bias of the discs taken into account.
+        cov: (6, 6) covariance of its tangent, wide: it includes what neither noise nor calibration explain.
+        seen: ellipse centres by rows of the target's body, the perspective bias still in them.
+        rows: (M, 2) rows of the left and the right camera's discs, -1 where a disc was not seen.
+        log_odds: natural logarithm of the odds against the next best explanation.
     """
 
     T_left_body: Array

@@ -45,10 +45,16 @@ UNMODELLED_PX, UNMODELLED_SHARE = 0.1, 2e-3
 class DiscView(Record):
     """One shot of a body's discs, with the quantities that every test of it needs.
 
-    By camera, (N,): ``cov_uv`` of the centres, of the image, the rig's and the unmodelled, px^2; ``radius_px``, longer
-    half axes, NaN, which matches nothing, where a disc was detected a second time; ``tolerance_px``: how far noise
-    alone may change these. rig_root @ rig_root.T is the rig's covariance, without exact directions; ``made_sigma_m``:
-    of a disc's position on the body.
+    Attributes:
+        rig: the calibrated pair.
+        target: the body's discs.
+        discs: the discs detected in the left and the right image.
+        cov_uv: per camera (N, 2, 2) covariance of the centres: that of the image, the rig's and the unmodelled, px^2.
+        radius_px: per camera (N,) longer half axes; NaN, which matches nothing, where a disc was detected a second
+            time.
+        tolerance_px: per camera (N,) how far noise alone may change a half axis.
+        rig_root: (P, R) with rig_root @ rig_root.T the rig's covariance, without the directions that are exact.
+        made_sigma_m: standard deviation of a disc's position on the body as it was made, m.
     """
 
     rig: StereoRig
@@ -193,10 +199,15 @@ _STEP_PX = 0.5  # to differentiate the angle of an epipolar plane
 
 @dataclass(frozen=True, eq=False)
 class Pairs(Record):
-    """Pairs of discs, rows left and right (K,), that may be one disc of the body at p_left (K, 3), m.
+    """Pairs of discs that may be one disc of the body.
 
-    ``cov`` (K, 3, 3): from the pixel noise, m^2; ``by_rig`` (K, 3, R): change by each of the rig's independent errors
-    of one sigma, m; ``fits`` (K, M): whether it may be a disc of the body, by size and brightness.
+    Attributes:
+        left: (K,) rows of the left camera's discs.
+        right: (K,) rows of the right camera's discs.
+        p_left: (K, 3) position of the disc, m, left frame.
+        cov: (K, 3, 3) its covariance from the pixel noise, m^2.
+        by_rig: (K, 3, R) its change by each of the rig's R independent errors of one standard deviation, m.
+        fits: (K, M) whether it may be a disc of the body, by size and brightness.
     """
 
     left: Ids

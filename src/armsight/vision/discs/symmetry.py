@@ -38,10 +38,17 @@ class Symmetry(Record):
 def symmetries(
     points: Array, alike: NDArray[np.bool_], seen: Ids, tolerance_m: float, *, mirrored: bool = False
 ) -> list[Symmetry]:
-    """Find the ways in which discs in view may be taken for others of the same body, each once, the closest first.
+    """Find the ways in which discs in view may be taken for others of the same body.
 
-    ``alike`` (M, M): whether two discs look alike; ``seen`` (V,): in view, V >= 3, not all on one line; tolerance_m: of
-    two distances that count as equal; ``mirrored``: find reflections instead of rotations.
+    Args:
+        points: (M, 3) positions of all discs, m.
+        alike: (M, M) whether two discs look alike; discs that do not are never taken for each other.
+        seen: (V,) the discs in view, V >= 3, not all on one line.
+        tolerance_m: largest difference of two distances that counts as equal, m.
+        mirrored: find reflections instead of rotations.
+
+    Returns:
+        Each once, without the identity, the closest first.
     """
     p = points * [1.0, 1.0, -1.0] if mirrored else points
     base = _widest(points, seen)

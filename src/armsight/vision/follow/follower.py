@@ -51,11 +51,16 @@ _OLDEST_SHOTS, _OLDEST_STEPS, LEAST_S = 3, 4.0, 1e-6
 
 @dataclass(frozen=True, eq=False)
 class BodyTrack(Record):
-    """The motion of a body between shots: last pose, velocity (6,) in its axes, per second, or per shot without times.
+    """The motion of a body between shots: where it should be next.
 
-    ``t_s``: time of the last pose, or the number of its shot; ``shots``: since then; ``margin_px``: largest error of a
-    prediction; ``step_s``: from the pose before to the last, infinite where the twist is unknown; ``proven``: the
-    motion has predicted a pose before; one far from the prediction is then a jump.
+    Attributes:
+        T_left_body: (4, 4) last pose.
+        twist: (6,) its velocity in the body's axes, per second, or per shot where shots carry no time.
+        t_s: time of the last pose, or the number of its shot.
+        shots: number of shots since then.
+        margin_px: largest error of a prediction, px.
+        step_s: from the pose before to the last; infinite where the twist is unknown.
+        proven: whether the motion has predicted a pose before; a pose far from the prediction is then a jump.
     """
 
     T_left_body: Array

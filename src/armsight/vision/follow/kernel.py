@@ -525,12 +525,25 @@ def follow_pair(
 ) -> tuple[int, float, float]:  # fmt: skip
     """Measure one pair around a predicted pose; discs that do not fit it with the others are left out, half at most.
 
-    T (4, 4) is the last pose, twist (6,) its velocity since then, per second, in the end that between both poses;
-    ``margin``: largest distance of a disc from its prediction, px; ``noise`` of the images and ``least`` contrast of a
-    disc, grey levels; limits (2 M + 1,): by how many ellipses were seen, chi-square above which the residuals are a
-    misfit. ``found`` and cov_noise (6, 6), from the pixel noise alone, are filled. Return the number of ellipses seen,
-    0 where they give no plausible pose; chi-square of the residuals as in :func:`uncertainty`; the largest error of the
-    prediction, px.
+    Args:
+        left: (H, W) grey.
+        right: (H, W) grey.
+        T: (4, 4) last pose.
+        twist: (6,) of the body since then, per second; in the end its velocity between that pose and this.
+        seconds: since the last pose.
+        scene: what is constant.
+        margin: largest distance of a disc from its prediction, px.
+        noise: standard deviation of the images' noise, grey levels.
+        least: least contrast of a disc, grey levels.
+        limits: (2 M + 1,) by how many ellipses were seen, chi-square above which the residuals are a misfit.
+        found: buffers for the result.
+        cov_noise: (6, 6) filled with the covariance from the pixel noise alone.
+        work: buffers for fits.
+        room: buffers for outlines.
+
+    Returns:
+        The number of ellipses seen, 0 where they give no plausible pose; chi-square of the residuals as in
+        :func:`uncertainty`; the largest error of the prediction, px.
     """
     xi = twist * seconds
     moved(T, xi, found.T)

@@ -43,7 +43,16 @@ _TO_M = 5e-4  # m; sides of unknown markers are given to this; half: digits that
 
 @dataclass(frozen=True, eq=False)
 class Charuco(Record, CalibrationBoard):
-    """A chessboard of columns x rows squares with markers of a family, numbered from ``first`` on, in its bright ones."""
+    """A chessboard with markers in its bright squares.
+
+    Attributes:
+        columns: squares along x.
+        rows: squares along y.
+        square_m: side of a square, m.
+        marker_m: side of a marker, m.
+        family: the markers' family.
+        first: number of its first marker; the others follow.
+    """
 
     columns: int
     rows: int

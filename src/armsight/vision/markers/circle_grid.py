@@ -331,6 +331,10 @@ def skips_line(cells: Ids, theta: Array) -> bool:
 
     Three lines left of four fit a projection as well, one numbered wrongly. Steps are measured by the discs they lead to:
     in coordinates in which these are unit circles, one across a line that is missing is twice as long as others.
+
+    Args:
+        cells: (N, 2) the lattice's cells.
+        theta: (N, 10) its discs, as in :class:`~armsight.vision.markers.circle_blobs.Blobs`.
     """
     at = {(x, y): i for i, (x, y) in enumerate(cells.tolist())}
     steps: dict[tuple[int, int], list[float]] = {}

@@ -70,9 +70,16 @@ POLARITIES = {False: "dark", True: "light"}
 
 @dataclass(frozen=True, eq=False)
 class CircleGrid(Record, CalibrationBoard):
-    """A grid of discs, ``pitch_m`` apart; ``disc_radius_m`` and ``light`` (on a dark board) are None if the spec is silent.
+    """A grid of discs.
 
-    ``staggered``: every other row is shifted by a pitch. ``rings``: (column, row) of the discs that have a hole.
+    Attributes:
+        columns: discs in a row.
+        rows: rows.
+        pitch_m: distance of the grid's lines, m.
+        staggered: whether every other row is shifted by a pitch.
+        disc_radius_m: radius of a disc, m; None where the spec does not give it.
+        light: whether the discs are light on a dark board; None where the spec does not say.
+        rings: (column, row) of the discs that have a hole.
     """
 
     columns: int

@@ -68,9 +68,19 @@ def gather(
 ) -> int:
     """Collect the pixels of the window about a corner: those near an edge into w, the others into the moments.
 
-    c (2,) is the corner, from the nearest whole pixel; square (2, 2) the sides there, px; bow (2, 2), 1/px; ``arm`` as
-    in ``refine_corners``; ``most`` the window's extent, px; near (2,) px from an edge. w (WORK,) receives x, y and
-    grey, flat (2, MOMENTS) the moments of plain squares. Return the number of pixels near the edges.
+    Args:
+        image: (H, W) grey image.
+        c: (2,) the corner; pixel positions are relative to the nearest whole pixel.
+        square: (2, 2) the sides of the square at it, px.
+        bow: (2, 2) how the edges bow, 1/px.
+        arm: as in ``refine_corners``.
+        most: how far the window extends along the sides at most, px.
+        near: (2,) distance from each edge below which a pixel counts as near it, px.
+        w: (WORK,) receives x, y and grey of the pixels near the edges.
+        flat: (2, MOMENTS) receives the moments of those of plain squares.
+
+    Returns:
+        The number of pixels near the edges.
     """
     height, width = image.shape
     s1, s2 = np.hypot(square[0, 0], square[0, 1]), np.hypot(square[1, 0], square[1, 1])
@@ -346,10 +356,16 @@ def _pixels(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def crossing_signs(image: NDArray[np.uint8], uv: Array, squares: Array) -> Array:
-    """Find where squares of two colours, sides (N, 2, 2) px, may meet crosswise at uv (N, 2), right to a quarter square.
+    """Find where squares of two colours may meet crosswise, by a quick test.
 
-    Return (N,) 1 where a patch in the square between the first and the second side, and one in the opposite square, are
-    both brighter than those in the other two, -1 where they are darker, 0 elsewhere.
+    Args:
+        image: (H, W) grey image.
+        uv: (N, 2) raw pixels, right to a quarter of a square.
+        squares: (N, 2, 2) the two sides of the square at each position, px.
+
+    Returns:
+        (N,) 1 where a patch in the square between the first and the second side, and one in the opposite square, are
+        both brighter than those in the other two, -1 where they are darker, 0 elsewhere.
     """
     out = np.zeros(len(uv))
     _quick_signs(_pixels(image), uv, squares, out)

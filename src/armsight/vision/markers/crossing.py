@@ -204,10 +204,19 @@ def fit_crossing(
 ) -> bool:  # fmt: skip
     """Minimise from q by Levenberg-Marquardt; the work space and L are left at the solution. False if it does not settle.
 
-    w (WORK,) starts with x, y from x0, y0 and grey of the n pixels near edges; flat (2, MOMENTS) are moments of pixels
-    where M is 1 and -1; sides (2, 2) unit vectors along the edges; bow (2, 2), 1/px; L receives the Cholesky factor of
-    the information. A step is the last when it lowers the cost by less than ``stop`` of one pixel's noise, or moves the
-    edges and their blur by less than ``slight`` of the blur: the next would be that share of it.
+    Args:
+        n: number of pixels near the edges.
+        w: (WORK,) work space; x, y from x0, y0 and grey of those pixels in its first rows.
+        flat: (2, MOMENTS) moments of the pixels of plain squares, those where M is 1 and where it is -1.
+        x0: origin of x, px.
+        y0: origin of y, px.
+        q: (PARAMETERS,) start, and solution.
+        sides: (2, 2) unit vectors along the edges.
+        bow: (2, 2) the bow of each edge, 1/px.
+        L: (PARAMETERS, PARAMETERS) receives the Cholesky factor of the information, from ``normal.factor``.
+        stop: a step is the last when it lowers the cost by less than this share of one pixel's noise,
+        slight: or when it moves the edges and their blur by less than this share of the blur: the next would be that
+            share of it.
     """
     H, T = np.empty((PARAMETERS + 2, PARAMETERS + 2)), np.empty((PARAMETERS + 2, PARAMETERS + 2))
     x, trial = np.empty(PARAMETERS), np.empty(PARAMETERS)
@@ -257,15 +266,23 @@ def rough_noise(n: int, w: Work) -> float:
 def edge_noise(n: int, w: Work, L: Array, middle: Array, cov: Array, noise: Array, gain: Array) -> float:
     """Return the variance of the residuals and fill cov (2, 2), the covariance of the corner; derivatives are overwritten.
 
-    The noise is that of the pixels that determine the corner, as in ``square.py``. Leverage is the squared length of
-    L^-1 times a pixel's derivatives, so its weighted sum needs only the weighted products of the derivatives.
-    An X corner has a point symmetry: what a camera's processing does to both sides alike (the halo of sharpening, a
-    tone curve) is even under reflection in the corner and cannot move it, for the derivatives by its position are odd.
-    The noise that moves it is the odd part of the residuals, (r(d) - r(-d)) / 2, which has half of white noise's
-    variance.
-    middle (2,) is the corner in the window. To noise (3, LAGS + 1, 2 LAGS + 1) are added, at lags (row, column):
-    weighted products of odd residuals, weights, and the products that white noise of unit variance leaves. gain (LAGS +
-    1, 2 LAGS + 1) receives the autocorrelation of the corner's derivatives by grey levels, 1 at lag 0.
+    The noise is that of the pixels that determine the corner, as in ``square.py``. Leverage is the squared
+    length of L^-1 times a pixel's derivatives, so its weighted sum needs only the weighted products of the derivatives.
+
+    An X corner has a point symmetry: what a camera's processing does to both sides alike (the halo of sharpening, a tone
+    curve) is even under reflection in the corner and cannot move it, for the derivatives by its position are odd. The noise
+    that moves it is the odd part of the residuals, (r(d) - r(-d)) / 2, which has half of white noise's variance.
+
+    Args:
+        n: number of pixels near the edges.
+        w: their columns, rows, grey levels, derivatives and residuals.
+        L: (PARAMETERS, PARAMETERS) Cholesky factor of the normal equations.
+        middle: (2,) the corner, as the pixels relative to the window's origin.
+        cov: (2, 2) receives the covariance for white noise of the residuals' variance.
+        noise: (3, LAGS + 1, 2 LAGS + 1) to whose first part the weighted products of odd residuals at lags (row, column)
+            are added, to the second the weights, to the third the products that white noise of unit variance leaves
+            after the fit.
+        gain: (LAGS + 1, 2 LAGS + 1) receives the autocorrelation of the corner's derivatives by grey levels, 1 at lag 0.
     """
     H, inverse = np.empty((PARAMETERS + 2, PARAMETERS + 2)), np.zeros((PARAMETERS, PARAMETERS))
     for j in range(PARAMETERS):

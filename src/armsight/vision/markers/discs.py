@@ -36,9 +36,13 @@ _KEPT = threading.local()
 
 @dataclass(frozen=True, eq=False)
 class DiscTarget(Record):
-    """The discs of a body, whose points are their centres; ``bright`` (M,): brighter than what surrounds them.
+    """The discs of a body.
 
-    ``normals`` (M, 3): unit vectors out of the faces, body frame; NaN where the body file does not give them.
+    Attributes:
+        body: their centres; their names.
+        radii_m: (M,) radii, m.
+        bright: (M,) whether a disc is brighter than what surrounds it.
+        normals: (M, 3) unit vectors out of the discs' faces, body frame; NaN where the body file does not give them.
     """
 
     body: Body

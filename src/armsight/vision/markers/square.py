@@ -478,10 +478,18 @@ def _fit_from(
 
 @kernel("const u1[:, ::1], const f8[:, ::1], const f8[:, ::1], b1, f8[:, ::1], f8[:, :, ::1]")
 def fit_marker(image: NDArray[np.uint8], corners: Array, grid: Array, whole: bool, uv: Array, cov: Array) -> int:
-    """Fit one marker from rough corners (4, 2), px, into uv (4, 2) and cov (4, 2, 2), px^2; an index into PROBLEMS.
+    """Fit one marker.
 
-    grid (N + 4, N + 4): its cells as -1 and 1, and two rings around; ``whole``: whether the colour beyond the corners
-    is known.
+    Args:
+        image: (H, W) grey.
+        corners: (4, 2) rough corners, px.
+        grid: (N + 4, N + 4) its cells as -1 and 1, and two rings around.
+        whole: whether the colour beyond the corners is known.
+        uv: (4, 2) filled with the corners.
+        cov: (4, 2, 2) filled with their covariances, px^2.
+
+    Returns:
+        An index into PROBLEMS.
     """
     px, at, here = np.empty((PIXELS_LAST, 8)), np.empty((PIXELS_LAST, 2), np.int64), corners.copy()
     cell = 0.0

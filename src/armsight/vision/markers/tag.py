@@ -29,9 +29,14 @@ CORNERS = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0,
 
 @dataclass(frozen=True, eq=False)
 class Tag(Record):
-    """One marker on a body at T_body_tag (4, 4), of a family of :mod:`~armsight.vision.markers.aruco`, or AprilTag 3's.
+    """One marker on a body.
 
-    ``size_m``: side of its dark outline, of AprilTag 3's families that of the square where the rings meet.
+    Attributes:
+        name: what its corners are named after.
+        family: a name of :data:`~armsight.vision.markers.aruco.FAMILIES`, or AprilTag 3's.
+        identity: its number in the family.
+        size_m: side of its dark outline, of AprilTag 3's families that of the square where the rings meet, m.
+        T_body_tag: (4, 4) its pose on the body, m.
     """
 
     name: str

@@ -209,11 +209,17 @@ def _robust_excess() -> float:
 
 @dataclass(frozen=True, eq=False)
 class BundleSolution(Record):
-    """A minimum of bundle adjustment, a cost that is robust; ``residuals_px`` (N, 2) are detection minus projection.
+    """A minimum of bundle adjustment.
 
-    ``sigma_px``: of a detection beyond its image covariance; ``cov_shared`` (Q, Q): of all shared parameters, zero rows
-    for what was held fixed, or (0, 0); ``converged``: False where the last step that was allowed still lowered the
-    cost; ``cov_motions`` (S, 6, 6), or (0, 6, 6).
+    Attributes:
+        state: the estimate.
+        residuals_px: (N, 2) detection minus projection.
+        sigma_px: standard deviation of a detection beyond its image covariance, px.
+        cov_shared: (Q, Q) covariance of all shared parameters, zero rows for what was held fixed, or (0, 0).
+        cost: robust cost.
+        steps: iterations used.
+        converged: whether it is a minimum; False where the last step that was allowed still lowered the cost.
+        cov_motions: (S, 6, 6) covariance of the motions, or (0, 6, 6).
     """
 
     state: BundleState

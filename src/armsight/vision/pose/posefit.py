@@ -52,9 +52,14 @@ class PixelObservations(Record):
 
 @dataclass(frozen=True, eq=False)
 class PoseFit(Record):
-    """The minimum of a pose fit, ``cost``: the sum of the squared distances (N,), in sigmas, or their Cauchy loss.
+    """The minimum of a pose fit.
 
-    ``information`` (6, 6): of the tangent [translation m; rotation rad], perturbation on the right.
+    Attributes:
+        T_left_body: (4, 4) the pose.
+        residuals_px: (N, 2) detection minus projection.
+        distance2: (N,) squared distance in standard deviations.
+        information: (6, 6) of the tangent [translation m; rotation rad], perturbation on the right.
+        cost: the minimum: the sum of the squared distances, or their Cauchy loss.
     """
 
     T_left_body: Array
@@ -74,10 +79,20 @@ def fit_pose(
     robust: bool,
     steps: int = _STEPS,
 ) -> PoseFit | None:
-    """Minimise the whitened pixel distance of all observations over the pose of the body, next to T_left_body ``start``.
+    """Minimise the whitened pixel distance of all observations over the pose of the body.
 
-    ``robust``: Cauchy loss as in bundle adjustment, else plain least squares. None where the start puts a point behind
-    its camera or the observations do not determine a pose.
+    Args:
+        cameras: left and right.
+        T_left_right: (4, 4) pose of the right camera in the left one's frame.
+        points: (M, 3) points of the body, m.
+        observations: N detections.
+        start: (4, 4) T_left_body at the start.
+        robust: Cauchy loss as in bundle adjustment, else plain least squares.
+        steps: iterations at the most.
+
+    Returns:
+        The minimum next to the start, or None where the start puts a point behind its camera or the
+        observations do not determine a pose.
     """
     T, p = np.array(start), points[observations.point]
     n = len(p)
@@ -96,10 +111,18 @@ def whitened(
     observations: PixelObservations,
     T_left_body: Array,
 ) -> tuple[Array, Array, Array]:
-    """Differentiate the projections of all observations, in standard deviations of each, at a pose before both cameras.
+    """Differentiate the projections of all observations, in standard deviations of each.
 
-    Return (N, 2, 2) matrices W, W^T W being the inverse of a detection's covariance; (2N, 6) W times the derivative by
-    the pose's tangent (perturbation on the right); (2N, P) W times that by the parameters of the rig.
+    Args:
+        cameras: left and right.
+        T_left_right: (4, 4) pose of the right camera in the left one's frame.
+        points: (M, 3) points of the body, m.
+        observations: N detections.
+        T_left_body: (4, 4) the pose, with every point before its camera.
+
+    Returns:
+        (N, 2, 2) matrices W, W^T W being the inverse of a detection's covariance; (2N, 6) W times the derivative by the
+        pose's tangent (perturbation on the right); (2N, P) W times that by the parameters of the rig.
     """
     n, counts = len(observations.point), np.array([camera.distortion.size for camera in cameras])
     W, by_pose, by_rig = np.zeros((n, 2, 2)), np.empty((2 * n, 6)), np.zeros((2 * n, 8 + counts.sum() + 6))

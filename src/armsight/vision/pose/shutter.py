@@ -72,7 +72,11 @@ class TimedShot(Record):
 class Motion(Record):
     """The motion of a body about the time of a shot: exp(twist t + acceleration t^2 / 2), in its own axes.
 
-    twist (6,), m/s and rad/s, with ``cov``; ``centred``: shots on both sides were there.
+    Attributes:
+        twist: (6,) velocity, m/s and rad/s.
+        acceleration: (6,) m/s^2 and rad/s^2.
+        cov: (6, 6) covariance of the twist.
+        centred: whether shots on both sides were there.
     """
 
     twist: Array
@@ -82,9 +86,12 @@ class Motion(Record):
 
 
 def motions(t_s: Array, Ts: Array, covs: Array) -> list[Motion | None]:
-    """Fit the motion about each of N poses, T_left_body, to those around it; None where there are fewer than three.
+    """Fit the motion about each of N poses to those around it; None where there are fewer than three.
 
-    Times (N,) rise, s; covs (N, 6, 6), perturbation on the right.
+    Args:
+        t_s: (N,) rising times, s.
+        Ts: (N, 4, 4) T_left_body.
+        covs: (N, 6, 6) covariance of each, perturbation on the right.
     """
     found: list[Motion | None] = [None] * len(t_s)
     widest = _GAP * float(np.median(np.diff(t_s))) if len(t_s) > 1 else 0.0
@@ -530,9 +537,13 @@ def _score(
 
 @dataclass(frozen=True, eq=False)
 class Alignment(Record):
-    """How the observations of one shot come to its time: pose then, and motion, None where too few neighbours show it.
+    """How the observations of one shot come to its time.
 
-    ``apart_s``: by how much the right exposure is later than the left, beyond the mean skew; ``variance``: of it, s^2.
+    Attributes:
+        T_left_body: (4, 4) pose at the shot's time.
+        motion: of the body; None where too few neighbours show it.
+        apart_s: by how much the right exposure is later than the left, beyond the mean skew, s.
+        variance: what is not known of it, s^2.
     """
 
     T_left_body: Array

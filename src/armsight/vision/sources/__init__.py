@@ -62,7 +62,11 @@ LIVE = ("usb:", "url:")
 
 
 def check_source(spec: str) -> None:
-    """Reject a text that can never be a source, neither a known kind nor a folder; what it names may come later."""
+    """Reject a text that can never be a source; what it names may come later.
+
+    Raises:
+        InputError: neither a known kind nor a folder.
+    """
     kind, colon, _ = spec.partition(":")
     if not (colon and kind in SOURCES) and not os.path.isdir(os.path.expanduser(spec)):
         known = ", ".join(f"{name}:..." for name in SOURCES)
@@ -96,7 +100,11 @@ def open_source(spec: str | Path) -> Source:
 
 
 def open_rig(spec: str | Path) -> StereoRig:
-    """Read a rig: a rig file, or ``bag:FILE`` for the camera_info of a recording."""
+    """Read a rig: a rig file, or ``bag:FILE`` for the camera_info of a recording.
+
+    Raises:
+        InputError: it is not there, damaged, or the recording holds no stereo pair.
+    """
     text = str(spec)
     if not text.startswith("bag:"):
         return StereoRig.load_trusted(spec)

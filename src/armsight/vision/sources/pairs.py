@@ -125,7 +125,11 @@ class PairsSource(StoredSource):
 
     @staticmethod
     def of(text: str) -> PairsSource:
-        """Open LEFT,RIGHT, as :func:`two_globs` reads it; errors as :meth:`open`."""
+        """Open LEFT,RIGHT, as :func:`two_globs` reads it.
+
+        Raises:
+            InputError: not two globs, no files, or files that do not pair up.
+        """
         return PairsSource.open(*two_globs(text))
 
 

@@ -789,10 +789,18 @@ def minimise(
 
 @kernel
 def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, work: FitBuffers) -> int:
-    """Fit one disc from theta (10,): centre (raw px), M (1/px^2), blur (px), contrast, base, gradient (1/px), replaced.
+    """Fit one disc.
 
-    cov (2, 2), px^2, and ``work.shown`` are filled. ``noise_sigma``, grey levels, as far as it is known beforehand,
-    rejects what is not a disc. Return 0, or the reason why it is not a disc (REASONS).
+    Args:
+        image: (H, W) grey.
+        noise_sigma: the image's noise as far as it is known beforehand, grey levels; used to reject what is not a disc.
+        theta: (10,) start: centre (raw px), M (1/px^2), blur (px), contrast, base, gradient (1/px); replaced by the
+            result.
+        cov: (2, 2) covariance of the centre, px^2; filled.
+        work: what :func:`workspace` returns; ``work.shown`` is filled.
+
+    Returns:
+        0, or the reason why it is not a disc (REASONS).
     """
     sectors = work.sectors
     n, sample = gather(image, theta, work)

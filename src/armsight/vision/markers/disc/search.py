@@ -537,10 +537,12 @@ def find(
 ) -> tuple[int, int, bool]:  # fmt: skip
     """Search an image as :func:`search` does and fit every candidate; or fit further candidates, which are given.
 
-    The first ``good`` of ``starts``, ``codes``, ``signs`` are fitted already, those from ``first`` to ``n`` are not;
-    with ``n`` 0 the image is searched. Discs come first in the end; ``cov`` (N, 2, 2), of centres, and ``shape`` (N,
-    3), ellipses, in px^2. Return the number of discs, and of candidates; whether there may be a disc too large for the
-    search.
+    The first ``good`` of ``starts``, ``codes``, ``signs`` are fitted discs already, those from ``first`` to ``n`` are not;
+    with ``n`` 0 the image is searched for them. In the end the discs come first, then the rejected candidates; ``cov`` (N,
+    2, 2) are the covariances of the discs' centres, px^2, and ``shape`` (N, 3) their ellipses, px^2.
+
+    Returns:
+        The number of discs, and of candidates in all; whether the search found that there may be a disc too large for it.
     """
     noise, large = noise_of(image), False
     if n == 0:
@@ -571,7 +573,16 @@ def find(
 
 @kernel("const u1[:, ::1], i8, f8[:, ::1], f8[:, :, ::1], f8[::1], FitBuffers")
 def correct_all(image: Grey, good: int, starts: Array, cov: Array, shared: Array, work: FitBuffers) -> None:
-    """Find what the ``good`` discs of an image have in common, ``shared`` (SHARED,), and correct starts and cov by it."""
+    """Find what the discs of an image have in common, and correct each one by it.
+
+    Args:
+        image: (H, W) grey.
+        good: how many discs there are.
+        starts: (N, 10) as :func:`find` leaves them; corrected.
+        cov: (N, 2, 2) covariances of their centres, px^2; corrected.
+        shared: (SHARED,) filled with what they have in common, see :func:`~armsight.vision.markers.disc.common.common`.
+        work: buffers for fits, as :func:`find` leaves them.
+    """
     noise = noise_of(image)
     common(image, good, work, shared)
     for i in range(good):

@@ -133,10 +133,15 @@ def _jumps(t: _Times, arrival: _Times) -> tuple[tuple[int, int], ...]:
 
 @dataclass(frozen=True)
 class Pairing:
-    """Which messages are one shot: ``pairs`` (left, right) in the order of time, no further apart than ``allowed_s``.
+    """Which messages are one shot.
 
-    ``alone``: (side, message number) without a partner, 0 left -> why; ``skew_s``: median of right minus left, 0
-    without any; ``due_ns``: (side, message number) -> its time as if no clock had jumped.
+    Attributes:
+        pairs: (left, right) message numbers in the order of time.
+        alone: (side, message number) of those without a partner, 0 left, 1 right -> why.
+        allowed_s: how far apart a pair may be, s.
+        skew_s: median of right minus left over the pairs, s; 0 without any.
+        notes: what was left out.
+        due_ns: (side, message number) -> its time as if no clock had jumped, ns.
     """
 
     pairs: tuple[tuple[int, int], ...]
