@@ -155,7 +155,7 @@ def calibrated(plan: RigPlan, given: Conditions, z: Array, rng: np.random.Genera
     model = replace(model, shape_sigma_m=sigma_m)
     true = model.body(sigma_m * z[1:])
     px = board.square_m * plan.focal_px / float(np.median(Ts[:, 2, 3]))
-    noise = marker_noise(plan.pipeline, "chessboard", min(px, MOST_SQUARE_PX))
+    noise = marker_noise(plan.pipeline, "square", min(px, MOST_SQUARE_PX))
     p = np.einsum("sij,mj->smi", Ts[:, :3, :3], true) + Ts[:, None, :3, 3]
     uv = np.stack([each.reshape(S, M, 2) for each in plan.stereo_rig.project(p.reshape(-1, 3))], axis=1).reshape(-1, 2)
     uv += noise * rng.standard_normal(uv.shape)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from armsight.sim.budget import result
+from armsight.sim.budget.plan import RigPlan
 from armsight.sim.workcell.body import body_target
 from armsight.vision.markers.targets import read_layout
 from armsight.vision.rig import StereoRig
@@ -42,6 +43,23 @@ def test_a_wish_that_is_not_reached_is_exit_code_1(armsight, monkeypatch):
     assert said.code == 1
     assert "0.02 mm requested: not reached" in said.out
     assert armsight("budget", *SMALL, "--want", "5mm").code == 0
+
+
+@pytest.mark.parametrize(("speed", "code"), [("0.3m/s", 0), ("1m/s", 1)])
+def test_what_loses_shots_is_not_reached(armsight, speed, code):
+    """Errors are those of the shots that are not lost: 14 mm at 1 m/s, where the trigger is needed all the same."""
+    given = (*SMALL[:-1], "webcam-720p", "--want", "15mm", "--speed", speed)
+    said = armsight("budget", *given, "--json")
+    found = json.loads(said.out)
+    moving, trigger = found["results"]["moving"], "start both cameras by one trigger"
+    assert moving["level_m"] < 0.015
+    assert said.code == code == (moving["lost_share"] > result.MOST_LOST)
+    assert trigger in [each["change"] for each in found["changes"] if each["lost_share"] <= result.MOST_LOST]
+    plan = RigPlan.read("", volume="0.1x0.1x0.1m", distance="0.7m", camera="webcam-720p", want="15mm", speed=speed)
+    assert (result.loss(plan) > 1) == code
+    words = armsight("budget", *given).out
+    assert ("15 mm requested: reached. " in words) == (not code)
+    assert (f"; {100 * moving['lost_share']:.0f} % of the shots in motion are lost where most are: " in words) == code
 
 
 def test_the_best_of_a_class_with_what_to_build(armsight, tmp_path, monkeypatch):

@@ -57,6 +57,7 @@ def test_between_a_chart_that_is_found_and_one_that_is_not_it_is_that_of_the_siz
         ({"volume": "0x0x0m"}, "each side must be above zero"),
         ({"volume": "0.1x0.1x0.1m", "baseline": "1mm"}, "two cameras cannot stand 1 mm apart"),
         ({"distance": "800"}, "with its unit"),
+        ({"body": "chessboard:9x6:5mm"}, "^a square is "),
         ({"speed": "300m/s"}, "is it in mm/s"),
         ({"want": "0.1"}, "expected 0.1mm or 0.1mm,0.05deg"),
         ({"want": "0mm"}, "no rig measures without error"),
@@ -170,7 +171,7 @@ def test_other_cameras_keep_what_is_named(monkeypatch):
 def test_a_body_of_tags_or_a_board_has_a_budget(tmp_path):
     given = {"volume": "0.05x0.05x0.05m", "distance": "0.6m", "camera": "global-shutter-1mp", "speed": "0m/s"}
     board = RigPlan(**given, body="chessboard:9x6:10mm")
-    assert board.marker(0.6) == ("chessboard", pytest.approx(0.01 * board.focal_px / 0.6))
+    assert board.marker(0.6) == ("square", pytest.approx(0.01 * board.focal_px / 0.6))
     tags = "".join(
         f'[[markers]]\nname = "t{k}"\nposition_mm = [{x}, 0, 0]\neuler_zyx_deg = [0, 0, 0]\n'
         f'tag = {{ family = "tag36h11", id = {k}, size_mm = 30 }}\n'
@@ -191,3 +192,9 @@ def test_the_image_has_the_size_that_is_given():
     assert small.stereo_rig.left.image_size_px == (640, 480)
     with pytest.raises(InputError, match="expected width x height in pixels"):
         RigPlan(volume="0.05x0.05x0.05m", image="640").check()
+
+
+@pytest.mark.parametrize("board", ["chessboard:60x40:2mm", "charuco:40x40:3mm:2mm:DICT_5X5_1000"])
+def test_squares_of_a_board_that_are_too_small_are_squares(board):
+    with pytest.raises(InputError, match=rf"^a square of {board} is \d\.\d px, at least 8 are needed"):
+        planned(RigPlan(volume="0.1x0.1x0.1m", distance="0.7m", camera="webcam-720p", board=board))

@@ -39,12 +39,7 @@ def budget_report(found: RigBudget, alternatives: Sequence[Alternative] = (), ru
         ]
     parts = [f"{name} {1e3 * values[f'{name}_rms_m']:.2g} mm" for name in ("precision", "trueness", "lateral", "depth")]
     said = f"{', '.join(parts)} (RMS over the volume, in motion; lateral: one axis)"
-    beside, lost = [], values["lost_share_in_motion"]
-    gone = [
-        Fact(
-            f"{100 * lost:.0f} % of the shots in motion are lost: their two images differ by more than the search allows"
-        )
-    ]
+    beside = []
     if run:
         from armsight.app.budget.run import against_run  # not above: a plan needs nothing of what reads runs
 
@@ -60,8 +55,8 @@ def budget_report(found: RigBudget, alternatives: Sequence[Alternative] = (), ru
     table = TextTable("causes, RMS over the volume", ("cause", "mm", "deg", "share", "halved: 95 % within"), rows)
     more = TextTable(
         f"what changes it most for least money, in motion (price class: {PRICES})",
-        ("change", "price class", "95 % within"),
-        tuple((text, str(price), f"{1e3 * m:.2g} mm") for text, price, m in found.changes),
+        ("change", "price class", "95 % within", "lost"),
+        tuple((text, str(price), f"{1e3 * m:.2g} mm", f"{100 * lost:.0f} %") for text, price, m, lost in found.changes),
     )
     caption, title = "95 % of the errors in motion are within, mm.", "Error at 95 % over the volume, seen from above"
     sections: dict[str, Section] = {
@@ -69,7 +64,6 @@ def budget_report(found: RigBudget, alternatives: Sequence[Alternative] = (), ru
             "Result",
             [
                 Fact(said),
-                *(gone if lost > _SHOWN else []),
                 Fact(others),
                 table,
                 more,
@@ -124,12 +118,13 @@ def _compared(alternatives: Sequence[Alternative]) -> list[TextTable]:
     for one in alternatives:
         asked = _asked(one.budget.plan)
         name, lens = asked.pop("camera"), f"{asked.pop('focal_widths')} ({asked.pop('focal_mm')} mm)"
-        found = (str(one.price), "ABCDEFGHIJ"[one.group], f"{one.budget.mm:.2g}", f"{one.budget.deg:.2g}")
-        reached.append((name, *found))
+        move, group = one.budget.moving, "ABCDEFGHIJ"[one.group]
+        lost = f"{100 * move.lost_share:.0f} %"
+        reached.append((name, str(one.price), group, f"{move.mm:.2g}", f"{move.deg:.2g}", lost))
         build.append((name, lens, *map(str, asked.values())))
     title = "the best of each class, 95 % in motion; those of one group differ by less than predictions are off"
     return [
-        TextTable(title, ("camera", "price class", "group", "mm", "deg"), tuple(reached)),
+        TextTable(title, ("camera", "price class", "group", "mm", "deg", "lost"), tuple(reached)),
         TextTable("what to build for it", ("camera", "focal_widths", *asked), tuple(build)),
     ]
 
@@ -139,6 +134,9 @@ def _answer(found: RigBudget) -> tuple[Grade, str]:
     move, rest, requested = found.moving, found.at_rest, found.plan.requested
     said = f"95 % within {move.mm:.2g} mm at {found.plan.speed}, {rest.mm:.2g} mm at rest"
     said += f", {move.deg:.2g} and {rest.deg:.2g} deg"
+    if move.lost_share > _SHOWN:
+        lost = f"{100 * move.lost_share:.0f} % of the shots in motion are lost where most are"
+        said += f"; {lost}: their two images differ by more than the search allows"
     if loop := found.states.get("closed_loop_at_rest"):
         said += f"; the loop brings the arm to {loop.mm:.2g} mm at rest"
     first = found.causes[0].cause

@@ -64,7 +64,7 @@ class Chart(NamedTuple):
 
 
 def marker_noise(pipeline: CameraPipeline, kind: str, size_px: float, moved_px: float = 0.0) -> float:
-    """Return the standard deviation of the position of a disc, tag or chessboard corner along one axis, px.
+    """Return the standard deviation of the position of a disc, tag or corner of a square along one axis, px.
 
     ``size_px``: a disc's diameter, side of a tag or square; ``moved_px``: its way during the exposure. InputError: at
     this size, or so blurred, most of such markers are not found.
@@ -182,4 +182,4 @@ def _squares(size_m: float, rng: np.random.Generator) -> Chart:
     return Chart((paper, board), target.body.points[:, :2] + first, lambda i: target.detect(i).uv)
 
 
-_CHARTS = {"disc": _discs, "tag": _tags, "chessboard": _squares}
+_CHARTS = {"disc": _discs, "tag": _tags, "square": _squares}

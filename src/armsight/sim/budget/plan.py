@@ -50,7 +50,7 @@ from armsight.vision.rig import StereoRig
 
 #: A disc's diameter, a tag's and a square's side in the image below which detection is left to luck, px; half: half of them
 #: are lost, double: bodies twice as large are asked for.
-_LEAST_PX = {"disc": 8.0, "tag": 24.0, "chessboard": 8.0}
+_LEAST_PX = {"disc": 8.0, "tag": 24.0, "square": 8.0}
 MOST_SQUARE_PX = 60.0  # px; larger squares' corners are no better; half: their noise is a tenth too large
 _SETS = (
     3  # of poses of the board, whose mean is taken; half: sigma differs by 10 % by chance, double: half a second more
@@ -561,7 +561,7 @@ def _smallest(board: CalibrationBoard) -> tuple[str, float]:
         raise InputError(
             f"{board.body.name}: chessboards, ChArUco boards and aprilgrids have a budget, boards of discs none"
         )
-    return "chessboard", board.square_m
+    return "square", board.square_m
 
 
 @lru_cache(maxsize=64)

@@ -12,10 +12,13 @@ from typing import Any, NamedTuple
 from armsight.data import Array, Record
 from armsight.errors import InputError
 from armsight.sim.budget.plan import RigPlan, catalogue, planned
-from armsight.vision.calibrate.budget import CAUSES, Budget
+from armsight.vision.calibrate.budget import CAUSES, LEVEL, Budget
 
 #: A change that gains less than this share is not worth a line; half: lines that nobody buys, double: cheap gains lack.
 WORTH = 0.1
+#: Share of shots in motion that may be lost at the worst position: beyond it 95 % of the shots are within nothing; half:
+#: longer exposures and skews count as not reached, double: an answer holds for fewer shots than it says.
+MOST_LOST = 1 - LEVEL
 #: What would make it better -> class of its price, 0 for nothing, and what of a plan it changes.
 CHANGES: dict[str, tuple[int, Callable[[RigPlan], dict[str, object]]]] = {
     "start both cameras by one trigger": (2, lambda plan: {"skew_ms": 0.0, "start_ms": 0.05}),
@@ -54,18 +57,29 @@ NOT_MODELLED = (
 
 
 class Accuracy(NamedTuple):
-    """The RMS over the volume, and what 95 % of the errors are within at its worst position; m, rad."""
+    """The RMS over the volume, what 95 % of the errors are within at its worst position, the share lost there; m, rad."""
 
     rms_m: float
     rms_rad: float
     level_m: float
     level_rad: float
+    lost_share: float = 0.0
 
     @staticmethod
-    def of(found: Budget, cov: Array) -> Accuracy:
+    def of(found: Budget, cov: Array, lost: float = 0.0) -> Accuracy:
         """Return that of covariances (G, 6, 6)."""
         far, rotated = found.at_level(cov)
-        return Accuracy(*found.rms(cov), float(far.max()), float(rotated.max()))
+        return Accuracy(*found.rms(cov), float(far.max()), float(rotated.max()), lost)
+
+    @staticmethod
+    def moving(found: Budget) -> Accuracy:
+        """Return that in motion, of the shots that are not lost."""
+        return Accuracy.of(found, found.cov(), float(found.lost.max()))
+
+    def over(self, m: float = 1.0, rad: float = 0.0) -> float:
+        """Return the levels over what is requested; more than 1, and rising, where more shots are lost than may be."""
+        value, lost = max(self.level_m / m, self.level_rad / rad if rad else 0.0), self.lost_share / MOST_LOST
+        return max(value, 1.0) * lost if lost > 1 else value
 
     @property
     def mm(self) -> float:
@@ -96,11 +110,12 @@ class Cause(NamedTuple):
 
 
 class Improvement(NamedTuple):
-    """What would make it better: the class of its price, 0 for nothing, and what 95 % are then within in motion, m."""
+    """What would make it better: the class of its price, 0 for nothing, and the accuracy in motion that it leads to."""
 
     change: str
     price: int
     level_m: float
+    lost_share: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +137,7 @@ class RigBudget(Record):
     @cached_property
     def moving(self) -> Accuracy:
         """In motion."""
-        return Accuracy.of(self.found, self.found.cov())
+        return Accuracy.moving(self.found)
 
     @cached_property
     def at_rest(self) -> Accuracy:
@@ -162,8 +177,7 @@ class RigBudget(Record):
 
     def reached(self, state: Accuracy) -> bool:
         """Return whether a state is within what was requested; true where nothing was."""
-        m, rad = self.plan.requested or (math.inf, 0.0)
-        return state.level_m <= m and (not rad or state.level_rad <= rad)
+        return self.plan.requested is None or state.over(*self.plan.requested) <= 1
 
     def worst_m(self, cause: str) -> float:
         """Return what 95 % would be within at the worst position if a cause were alone."""
@@ -172,7 +186,7 @@ class RigBudget(Record):
     @cached_property
     def changes(self) -> tuple[Improvement, ...]:
         """What would make it better in motion, the best of a price first."""
-        plan, found = self.plan, []
+        plan, found = self.plan, list[tuple[int, float, Improvement]]()
         lens = {"focal_widths": plan.focal_px / plan.image_size_px[0]}  # it stays
         tried = [(text, price, lens | change(plan)) for text, (price, change) in CHANGES.items()]
         for name, each in catalogue().items():
@@ -183,10 +197,10 @@ class RigBudget(Record):
                 after = planned(replace(plan, **change))  # type: ignore[arg-type]
             except InputError:  # such a rig cannot be built
                 continue
-            m = float(after.at_level(after.cov())[0].max())
-            if m < (1 - WORTH) * self.moving.level_m:
-                found.append(Improvement(text, price, m))
-        return tuple(sorted(found, key=lambda one: (one.price, one.level_m)))
+            state = Accuracy.moving(after)
+            if state.over() < (1 - WORTH) * self.moving.over():
+                found.append((price, state.over(), Improvement(text, price, state.level_m, state.lost_share)))
+        return tuple(one for *_, one in sorted(found))
 
     def to_dict(self) -> dict[str, Any]:
         """Return what ``armsight budget --json`` prints, in m and rad."""
@@ -252,13 +266,13 @@ def best(plan: RigPlan, progress: Callable[[str], None] = lambda _: None) -> tup
     if not found:
         plan.check()
         raise InputError("no class of the catalogue can measure this volume with what the plan names")
-    found.sort(key=lambda one: one.mm)
+    found.sort(key=lambda one: one.moving.over())
     groups, first, group = list[Alternative](), found[0], 0
     for one in found:
-        if one.mm > PREDICTED * first.mm:
+        if one.moving.over() > PREDICTED * first.moving.over():
             first, group = one, group + 1
         groups.append(Alternative(one, group, one.plan.cameras.price))
-    return tuple(sorted(groups, key=lambda one: (one.price, one.budget.mm)))
+    return tuple(sorted(groups, key=lambda one: (one.price, one.budget.moving.over())))
 
 
 def _of_camera(plan: RigPlan, name: str) -> dict[str, Any]:
@@ -270,11 +284,9 @@ def _of_camera(plan: RigPlan, name: str) -> dict[str, Any]:
 def loss(plan: RigPlan) -> float:
     """Return what 95 % are within in motion over what was requested, or m; infinity for what cannot be built."""
     try:
-        found = RigBudget(plan, planned(plan)).moving
+        return Accuracy.moving(planned(plan)).over(*plan.requested or ())
     except InputError:
         return math.inf
-    m, rad = plan.requested or (1.0, 0.0)
-    return max(found.level_m / m, found.level_rad / rad if rad else 0.0)
 
 
 def chosen(alternatives: tuple[Alternative, ...]) -> RigBudget:
