@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from armsight import files
-from armsight.errors import InputError
+from armsight.errors import InputError, nearest
 from armsight.files import (
     RowFile,
     alone_in,
@@ -285,7 +285,7 @@ def test_rows_for_a_file_that_was_deleted_are_an_error(tmp_path):
 
 @pytest.mark.parametrize("name", ["table.csv", "Report.HTML"])
 def test_a_folder_of_results_has_no_files_name(tmp_path, name):
-    with pytest.raises(InputError, match="several files come of it; give a folder, such as"):
+    with pytest.raises(InputError, match=r"^/.*: several files come of it; give a folder, such as"):
         check_folder(tmp_path / name)
     (tmp_path / name).mkdir()
     assert check_folder(tmp_path / name) == tmp_path / name
@@ -385,3 +385,8 @@ def test_a_folder_that_another_process_is_just_removing_is_in_use(tmp_path, monk
     monkeypatch.setattr(type(tmp_path), method, gone)
     with pytest.raises(InputError, match="another run uses it"):
         alone_in(tmp_path / "x", "run").__enter__()
+
+
+def test_the_nearest_of_many_names_also_where_one_is_a_number():
+    assert nearest("3", [f"n{k}" for k in range(99)] + ["3"]).startswith("3, ")
+    assert nearest(3, [f"n{k}" for k in range(99)] + ["3"]).startswith("3, ")

@@ -36,10 +36,10 @@ def require(call: str, name: str, value: object, fits: bool, expected: str) -> N
         raise InputError(f"{call}: {name} is a {type(value).__name__}; expected {expected}")
 
 
-def nearest(name: str, known: Iterable[str]) -> str:
+def nearest(name: object, known: Iterable[str]) -> str:
     """Return the known names as text; of many those nearest to an unknown one, and how many more there are."""
     names = list(known)
     if len(names) <= _LISTED:
         return ", ".join(names) or "none"
-    near = get_close_matches(name, names, _LISTED // 2, 0.0)
+    near = get_close_matches(str(name), names, _LISTED // 2, 0.0)
     return f"{', '.join(near)} and {len(names) - len(near)} more"

@@ -608,7 +608,7 @@ def check_folder(
     _check_name(path)
     folder = Path(path).expanduser()
     if folder.suffix.lower() in _FILES and not os.path.lexists(folder):
-        raise InputError(f"-o {path}: {problem}: several files come of it; give a folder, such as {folder.stem}")
+        raise InputError(f"{path}: {problem}: several files come of it; give a folder, such as {folder.stem}")
     try:
         whole = Path(os.path.abspath(folder))  # a/../b is b, also where there is no a yet
         there = next(p for p in (whole, *whole.parents) if os.path.lexists(p))
@@ -631,7 +631,7 @@ def _check_name(path: str | Path) -> None:
     """Reject what is no name of a file: - stands for the standard output elsewhere."""
     if str(path) in ("-", ""):
         raise InputError(
-            f"-o {str(path) or repr('')}: give the name of a file or folder; --json prints to standard output"
+            f"{str(path) or repr('')}: give the name of a file or folder; --json prints to standard output"
         )
 
 

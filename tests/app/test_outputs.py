@@ -97,7 +97,7 @@ def test_a_file_that_cannot_be_written_is_reported_at_once(here, armsight, name)
         (f"/proc/out{end}", [f"/proc/out{end}", "cannot be written"]),
         (f"{'x' * 250}{end}", ["cannot be written", "File name too long"]),
         *([] if end else [(".", ["it is a folder"])]),
-        *([] if end else [("-", ["-o -: give the name of a file"])]),
+        *([] if end else [("-", ["-: give the name of a file"])]),
     ):
         assert_rejected(call(armsight, name, FILE_WRITERS[name], output), *words)
     assert sorted(os.listdir(here)) == before
@@ -111,7 +111,7 @@ def test_a_folder_that_cannot_be_written_is_reported_at_once(here, armsight, nam
         ("rig.json/deeper", ["rig.json/deeper: no", "here"]),
         ("/proc/out", ["/proc/out: no", " here: No such file"]),
         ("x" * 256, ["File name too long"]),
-        ("-", ["-o -: give the name of a file or folder"]),
+        ("-", ["-: give the name of a file or folder"]),
     ):
         assert_rejected(call(armsight, name, FOLDER_WRITERS[name], output), *words)
     assert sorted(os.listdir(here)) == before

@@ -71,7 +71,8 @@ def fetched(hub, path):
         return answer.read()
 
 
-def test_a_cell_that_began_before_its_hub_arrives_with_all_its_events(hub_at, cell_at, port, wait):
+def test_a_cell_that_began_before_its_hub_arrives_with_all_its_events(hub_at, cell_at, port, wait, monkeypatch):
+    monkeypatch.setattr("armsight.app.stream.cell._SHOT_S", 60.0)
     cell = cell_at(f"table-1@127.0.0.1:{port}", temperatures_c=lambda: np.array([30.0, 41.2]))
     cell.put(NoteDatum(1.0, "rig: a camera moved", "warning", ("rig: a camera moved",)))
     hub = hub_at(port)
@@ -87,7 +88,7 @@ def test_a_cell_that_began_before_its_hub_arrives_with_all_its_events(hub_at, ce
     assert json.loads(fetched(hub, "shots?site=site&cell=table-1")) == []  # none is kept before somebody asks
     for number in range(30):
         cell.put(ShotDatum(Shot(str(number), GREY, GREY), Missed("hidden")))
-    (one,) = wait(lambda: json.loads(fetched(hub, "shots?site=site&cell=table-1")))  # of 30 within 0.2 s
+    (one,) = wait(lambda: json.loads(fetched(hub, "shots?site=site&cell=table-1")))  # of 30 within a minute
     assert (one["status"], one["reason"]) == ("missed", "hidden")
     assert "day" not in json.loads(fetched(hub, "state"))["cells"][0]
     assert json.loads(fetched(hub, "state?day=1"))["cells"][0]["day"] == []
@@ -97,6 +98,14 @@ def test_a_cell_that_began_before_its_hub_arrives_with_all_its_events(hub_at, ce
     cell.close()
     wait(lambda: shown(hub)["table-1"]["level"] == -1)
     assert [each["kind"] for each in json.loads(fetched(hub, "events"))] == ["ended", "health", "health", "began"]
+
+
+def test_of_long_shots_as_many_are_sent_as_a_hub_reads(hub_at, cell_at, port, wait):
+    hub, cell = hub_at(port), cell_at(f"a@127.0.0.1:{port}")
+    wait(lambda: shown(hub).get("a", {}).get("about"))
+    for bytes_each, numbers in ((13_967, "1234"), (13_106, "1234"), (13_105, "01234"), (70_000, "")):
+        cell._kept.extend((time.monotonic(), json.dumps(f"{k}".ljust(bytes_each - 2)).encode()) for k in range(5))
+        assert [each.strip() for each in json.loads(fetched(hub, "shots?site=site&cell=a"))] == list(numbers)
 
 
 def test_a_storm_of_findings_is_thinned_counted_and_said(hub_at, cell_at, port, wait):

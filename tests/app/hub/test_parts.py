@@ -5,6 +5,7 @@ import json
 import math
 import time
 from datetime import UTC, datetime, timedelta
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -124,8 +125,13 @@ def test_keys_are_made_once_and_renewed_before_their_end(tmp_path, monkeypatch):
     assert read_cell(str(toml)).holds  # what its owner changed stays
     monkeypatch.setattr(Later, "now", classmethod(lambda cls, tz=None: datetime.now(UTC) + timedelta(days=900)))
     for read in (lambda: site_of(keys), lambda: read_cell(str(toml))):
-        with pytest.raises(InputError, match=r"\.pem: valid from 2027-.* and this computer's date is 2029-"):
+        with pytest.raises(
+            InputError, match=r"\.pem: valid from 2027-.* and this computer's date is 2029-.*run `armsight"
+        ):
             read()
+    monkeypatch.setattr(Later, "now", classmethod(lambda cls, tz=None: datetime.now(UTC) + timedelta(days=4000)))
+    with pytest.raises(InputError, match=r"ca\.pem: valid from .*, or make the keys in a new folder"):
+        make_keys(keys, "lab", ["a"], "hub.local", 7447)
 
 
 def slopes(rng, per_h, blocks=30):
@@ -283,6 +289,19 @@ def test_a_push_goes_on_where_it_was(tmp_path):
     again = push(cell, folder, str(store), 100.0, lambda sent: None)
     assert (again.runs, again.files, again.complete_before) == (1, 1, 1)
     assert (there / "run.mcap").read_bytes() == b"one" * 1000
+
+
+@pytest.mark.parametrize(("link_s", "took_s"), [(0.0, 11.0), (0.5, 11.5), (1.0, 12.0), (2.0, 24.0)])
+def test_a_push_keeps_its_rate_however_fast_the_link_is(tmp_path, monkeypatch, link_s, took_s):
+    """12 pieces of a second each: a link that is as fast as the rate is used wholly."""
+    now = [0.0]
+    clock = SimpleNamespace(monotonic=lambda: now[0], sleep=lambda s: now.append(now.pop() + s))
+    monkeypatch.setattr("armsight.app.hub.push.time", clock)
+    monkeypatch.setattr("armsight.app.hub.push._CHUNK", 1000)
+    (tmp_path / "runs/one").mkdir(parents=True)
+    (tmp_path / "runs/one/run.mcap").write_bytes(b"x" * 12_000)
+    push(Cell("a", "lab"), tmp_path / "runs", str(tmp_path / "store"), 1e-3, lambda sent: clock.sleep(link_s))
+    assert now == pytest.approx([took_s])
 
 
 def test_a_push_makes_no_bucket(tmp_path, armsight):

@@ -51,13 +51,15 @@ def push(cell: Cell, folder: Path, store: str, rate_mb_s: float, advance: Callab
     runs = sorted({path.parent for name in names for path in folder.glob(f"*/{name}")})
     if not runs:
         raise InputError(f"{folder}: no runs are here: expected folders with {', '.join(names)}")
-    done = Pushed()
+    done, due_s = Pushed(), time.monotonic()
 
     def pace(count: int) -> None:
-        """Count what was sent, and wait as long as it may take."""
+        """Wait until so many bytes more may be sent, and count them."""
+        nonlocal due_s
+        time.sleep(max(0.0, due_s - time.monotonic()))
+        due_s = max(due_s, time.monotonic()) + count / (1e6 * rate_mb_s)
         done.sent_bytes += count
         advance(done.sent_bytes)
-        time.sleep(count / (1e6 * rate_mb_s))
 
     resting = Outbox(state_folder() / "cells" / cell.site / cell.name, cell.name)
     try:
@@ -99,8 +101,8 @@ def _push_run(fs: Any, at: str, run: Path, done: Pushed, pace: Callable[[int], N
         fs.makedirs(target.rpartition("/")[0], exist_ok=True)
         with (run / name).open("rb") as source, fs.open(target, "wb") as sink:
             while piece := source.read(_CHUNK):
-                sink.write(piece)
                 pace(len(piece))
+                sink.write(piece)
         done.files += 1
     fs.pipe_file(f"{at}/{_MANIFEST}", expected)
     done.runs += 1

@@ -59,7 +59,7 @@ _FRESH_S = 60.0
 #: px, longer side of an image for the hub, and JPEG quality; half: a rough look, double: four times the bytes (15 kB).
 _SIDE_PX, _JPEG = 480, 70
 #: s between two shots that are kept for who asks, how many are (7 kB each), and for how many s after a question; half:
-#: gaps where a page asks once a second, double: an answer is longer than a hub reads.
+#: gaps where a page asks once a second, double: twice the work while somebody looks.
 _SHOT_S, _SHOTS, _ASKED_S = 0.2, 5, 10.0
 #: findings that a state names at most; half: less is seen at once, double: a state of 2 kB.
 _FINDINGS = 5
@@ -336,9 +336,12 @@ class CellSink(Sink):
         return cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _JPEG])[1].tobytes()
 
     def _shots_kept(self) -> bytes:
-        """Return the newest shots as JSON, thinned; none are kept unless they are asked for."""
+        """Return the newest shots that a hub reads, as JSON, thinned; none are kept unless they are asked for."""
         self._asked_s = time.monotonic()
-        return b"[" + b",".join(shot for at_s, shot in list(self._kept) if self._asked_s - at_s < _ASKED_S) + b"]"
+        shots = [shot for at_s, shot in list(self._kept) if self._asked_s - at_s < _ASKED_S]
+        while sum(len(shot) + 1 for shot in shots) >= LONGEST - 1:
+            del shots[0]
+        return b"[" + b",".join(shots) + b"]"
 
     def _hold(self, query: Any) -> bytes:  # noqa: ANN401 - of the library
         """Answer a request to hold: done, or why not; both are events."""

@@ -33,6 +33,7 @@ NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,30}")
 _ENDPOINT = re.compile(r"(?:(tcp|tls)/)?(\[[0-9a-fA-F:]+\]|[\w.-]+):(\d{1,5})")
 _HERE = ("127.0.0.1", "localhost", "[::1]")
 _FILES = ("ca", "certificate", "key")
+_NEW = "new folder: `armsight hub keys SITE CELL ... -o FOLDER`"
 
 
 @dataclass(frozen=True)
@@ -152,13 +153,12 @@ def certificate(path: Path, *, ended: bool = False) -> x509.Certificate:
     try:
         found = x509.load_pem_x509_certificate(read_bytes(path))
     except ValueError:
-        raise InputError(f"{path}: no certificate is in it: run `armsight hub keys` again") from None
+        raise InputError(f"{path}: no certificate is in it: make the keys in a {_NEW}") from None
     begin, end, now = found.not_valid_before_utc, found.not_valid_after_utc, datetime.now(UTC)
     if not (ended or begin <= now <= end):
-        raise InputError(
-            f"{path}: valid from {begin.date()} to {end.date()}, and this computer's date is {now.date()}: correct the "
-            "date, or run `armsight hub keys` again"
-        )
+        again = f"make the keys in a {_NEW}" if found.issuer == found.subject else "run `armsight hub keys` again"
+        days = f"valid from {begin.date()} to {end.date()}, and this computer's date is {now.date()}"
+        raise InputError(f"{path}: {days}: correct the date, or {again}")
     return found
 
 
