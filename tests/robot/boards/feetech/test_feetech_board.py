@@ -195,7 +195,7 @@ def test_a_servo_that_falls_silent_is_one_line(folded):
 
 def test_some_noise_is_asked_again_and_never_read_as_an_angle():
     device = So101Bus.made(load=unloaded)
-    board, _ = opened(NoisyDevice(device, 0.002, seed=3))
+    board, _ = opened(NoisyDevice(device, 0.002, seed=4))
     board.enable()
     states = board.receive(2.0)
     assert board.broken_messages > 0
@@ -240,6 +240,30 @@ def test_late_answers_are_no_fault_and_answer_no_other_question(late_s):
         assert board.bus.read(1, MODEL) == STS3215
         assert [board.bus.read(1, each) for each in (MODE, TORQUE)] == [POSITION_MODE, 1]
     assert board.broken_messages > 0
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.035, 0.07, 0.1, 0.15])
+def test_late_answers_of_a_moving_joint_are_stamped_between_their_question_and_their_coming(late_s):
+    """A servo reads its angle when it is asked: the middle is late_s / 2 later, however often it was asked before."""
+    device = So101Bus.made(load=unloaded)
+    late = LateDevice(device, 0.0)
+    board = FeetechBoard.connect(ServoBus(SteppedLink(late), "feetech:PORT", now=lambda: device.t_s), begin_s=0.0)
+    board.enable()
+    times, true, step, begin = [], [], device.step, device.servos.shaft[0]
+
+    def turned():
+        device.servos.goal(0, begin + 0.5 * np.sin(2.0 * device.t_s), 5.0)
+        step()
+        times.append(device.t_s)
+        true.append(device.servos.shaft[0])
+
+    device.step, late.late_s = turned, late_s
+    states = [board.receive(0.1) for _ in range(8)]
+    t_s, q = (np.concatenate(each) for each in ([s.t_s for s in states], [s.q[:, 0] for s in states]))
+    off = np.abs(np.interp(t_s - late_s / 2, times, true) - q)
+    assert np.ptp(q) > 0.4
+    assert off.max() < RAD_PER_COUNT + 0.004 * np.abs(np.gradient(true, times)).max()
+    assert (board.broken_messages > 0) == (late_s > 0)
 
 
 def lerobot(tmp_path, **changes):

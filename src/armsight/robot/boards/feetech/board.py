@@ -170,10 +170,9 @@ class FeetechBoard(PolledBoard):
         return self.calibration.angles(self._states.counts)
 
     def _read(self) -> ServoStates:
-        """Read all servos; their time is the middle of the question and the answers."""
-        asked = self.bus.now()
+        """Read all servos; their time is the middle of the question that was answered and the answers."""
         self._states = self.bus.states(self.calibration.ids)
-        self._t_s = (asked + self.bus.now()) / 2 - self._begin_s
+        self._t_s = (self.bus.asked_s + self.bus.now()) / 2 - self._begin_s
         return self._states
 
     def _switch_on(self) -> None:

@@ -38,7 +38,8 @@ LOOKED_FOR = range(1, 13)  # ids that are looked for where an expected one does 
 class ServoBus:
     """The servos on a wire, which :meth:`close` closes; ``name`` and ``baud`` are for errors.
 
-    ``now``: the clock that passes while the link is read, s; ``lost`` counts answers that did not come whole.
+    ``now``: the clock that passes while the link is read, s; ``lost`` counts answers that did not come whole; ``asked_s``
+    is when the question was sent that was answered last.
     """
 
     def __init__(self, link: Link, name: str, baud: int = BAUD, now: Callable[[], float] = time.monotonic) -> None:
@@ -46,6 +47,7 @@ class ServoBus:
         self._link = link
         self._reader = PacketReader()
         self.lost = self._bytes = 0
+        self.asked_s = now()
 
     @property
     def broken(self) -> int:
@@ -100,22 +102,33 @@ class ServoBus:
             raise DeviceError(f"{self.name}: id {id} keeps {kept} in register {register.address} instead of {value}")
 
     def _asked(self, question: bytes, ids: Sequence[int], count: int) -> dict[int, StatusPacket]:
-        """Ask until all of these ids have answered with ``count`` bytes; say what is wrong where they do not."""
-        silent = False
+        """Ask until all of these ids have answered with ``count`` bytes; say what is wrong where they do not.
+
+        After a try with answers that may be on their way still, nobody knows which try an answer is to: what is late is
+        waited for and dropped, and the servos are asked anew.
+        """
+        late = False
         for wait_s in _WAITS_S:
-            before = self._bytes
+            broken = self._reader.broken
             answers = self._ask(question, ids, count, wait_s)
             if len(answers) == len(ids):
-                if silent:
-                    self.wait(wait_s)  # late answers to the tries before would answer the next question
-                return answers
-            silent |= self._bytes == before
-        self._explain([id for id in ids if id not in answers])
+                break
+            late |= len(answers) + self._reader.broken - broken < len(ids)
+        if late and len(answers) == len(ids):
+            self.wait(wait_s)
+            for _ in _WAITS_S:
+                answers = self._ask(question, ids, count, _WAITS_S[-1])
+                if len(answers) == len(ids):
+                    break
+        if len(answers) < len(ids):
+            self._explain([id for id in ids if id not in answers])
+        return answers
 
     def _ask(self, question: bytes, ids: Sequence[int], count: int, wait_s: float) -> dict[int, StatusPacket]:
         """Ask once and return the whole answers of these ids; without those that came twice."""
         self._link.read(0.0)  # what came late answers nothing
         self._reader.clear()
+        self.asked_s = self.now()
         self._link.write(question)
         answers: dict[int, StatusPacket] = {}
         for _ in range(round(wait_s / _POLL_S)):
