@@ -426,4 +426,8 @@ def test_nothing_is_recorded_for_options_that_do_not_work(armsight, tmp_path):
         said = armsight(*given, *wrong)
         assert_rejected(said, str(wrong[1]).rstrip(","))
         assert "recording" not in said.err
+    said = armsight("calibrate", "--source", "sim:", "--target", "circles:7x5:30mm", "-o", tmp_path / "rig.json")
+    assert_rejected(said, "circles:7x5:30mm: simulated cameras show a chessboard or a charuco board")
+    assert "recording" not in said.err
+    assert "shots are in" not in said.err
     assert sorted(path.name for path in tmp_path.iterdir()) == ["report"]

@@ -1,6 +1,7 @@
 """The body on the tool: its file says what its patterns show."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -65,3 +66,23 @@ def test_any_body_of_discs_is_painted_as_its_file_has_it(tmp_path):
     assert len(patterns_of(target)) == 1  # a plate is one face
     with pytest.raises(InputError, match="simulated cameras show discs with normals"):
         patterns_of(open_target("chessboard:9x6:20mm"))
+
+
+def test_a_body_like_the_default_in_its_points_alone_is_painted_as_itself():
+    own = body_target()
+    assert [len(p.discs) for p in patterns_of(own)] == [5, 1, 1, 1, 1]  # the plate, then the wings: the default's
+    for changed in (
+        replace(own.discs, radii_m=own.discs.radii_m * 0.8),
+        replace(own.discs, bright=~own.discs.bright),
+        replace(own.discs, normals=np.tile([0.0, 0.0, -1.0], (9, 1))),
+    ):
+        painted = patterns_of(replace(own, discs=changed))
+        shown = {(round(float(r), 6), value > 0.5) for p in painted for *_, r, value in p.discs}
+        assert shown == {(round(float(r), 6), bool(b)) for r, b in zip(changed.radii_m, changed.bright, strict=True)}
+        plates = np.unique(
+            np.column_stack([changed.normals, np.sum(changed.normals * own.body.points, axis=1)]).round(5), axis=0
+        )
+        assert len(painted) == len(plates)
+    mixed = replace(own.discs, bright=np.arange(9) != 1)
+    with pytest.raises(InputError, match="tool_body: A and B are on one face, and one of them is bright, one dark"):
+        patterns_of(replace(own, discs=mixed))

@@ -89,7 +89,8 @@ def _open(spec: str, folder: Path, target: str) -> Source:
     with contextlib.closing(opened) as live, bar("recording shots", live.count) as advance:
         done = record(live, stored, seconds=_RECORDED_S, on_shot=lambda _: advance())
     if (done.stopped and not done.interrupted) or not done.shots:
-        raise InputError(f"{spec}: {done.stopped or 'no shot came'}; {done.shots} shots are in {stored}")
+        there = f"; {done.shots} shots are in {stored}" if done.shots else ""
+        raise InputError(f"{spec.removesuffix(':')}: {done.stopped or 'no shot came'}{there}")
     return open_source(str(stored))
 
 
@@ -124,6 +125,7 @@ class GivenImages:
         if len(alone) != len(SIDES):
             raise InputError(f"--alone {options.alone}: two globs are needed, LEFT,RIGHT; one of them may be empty")
         self._alone = [(side, file) for side, pattern in enumerate(alone) for file in _files_of(pattern)]
+        self._board = open_board(self._spec)  # before anything is recorded
         self._source, self.named["source"] = _open(spec, options.output.with_suffix(".board"), self._spec), spec
         kind, _, rest = spec.partition(":")
         if kind == "pairs":
@@ -140,7 +142,7 @@ class GivenImages:
 
     def calibrated(self) -> Calibration:
         """Detect the board in all images, and calibrate; where shots have times it may move, and the skew is found."""
-        source, target = self._source, open_board(self._spec)
+        source, target = self._source, self._board
         pairs, times, singles = list[Pair](), list[float | None](), list[Pair]()
         sizes, unseen = None, _Unseen(target)
         with bar("detecting the target", None if source.count is None else source.count + len(self._alone)) as advance:

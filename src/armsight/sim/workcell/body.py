@@ -70,8 +70,8 @@ def body_patterns() -> tuple[Pattern, ...]:
 
 def patterns_of(target: Composite) -> tuple[Pattern, ...]:
     """Return what is painted of a body of discs, a plate for those of each face."""
-    discs, own = target.discs, body_target().body.points
-    if target.body.points.shape == own.shape and np.allclose(target.body.points, own, rtol=0, atol=1e-6):
+    discs, own = target.discs, body_target().discs
+    if discs is not None and own is not None and not target.parts and _alike(discs, own):
         return body_patterns()
     if discs is None or target.parts or np.isnan(discs.normals).any():
         raise InputError(f"{target.body.name}: simulated cameras show discs with normals, such as the demo's body.toml")
@@ -81,6 +81,12 @@ def patterns_of(target: Composite) -> tuple[Pattern, ...]:
     for *normal, offset in planes:
         face = np.flatnonzero(np.all(np.abs(discs.normals - normal) < 1e-5, axis=1) & (np.abs(offsets - offset) < 1e-5))
         points, radii, bright = discs.body.points[face], discs.radii_m[face], bool(discs.bright[face[0]])
+        if len(other := face[discs.bright[face] != bright]):
+            names = [discs.body.point_names[k] for k in (face[0], other[0])]
+            raise InputError(
+                f"{target.body.name}: {names[0]} and {names[1]} are on one face, and one of them is bright, one dark: "
+                "simulated cameras show discs of one contrast on each face"
+            )
         T = pose(Rotation.align_vectors(normal, (0.0, 0.0, -1.0))[0].as_matrix(), np.zeros(3))
         xy = points @ T[:3, :2]
         low, high = (f(xy + s * 1.5 * radii[:, None], axis=0) for f, s in ((np.min, -1), (np.max, 1)))
@@ -89,6 +95,12 @@ def patterns_of(target: Composite) -> tuple[Pattern, ...]:
         width, height = high - low
         found.append(plate(width, height, DARK if bright else BRIGHT, spots).on_body(T))
     return tuple(found)
+
+
+def _alike(a: DiscTarget, b: DiscTarget) -> bool:
+    """Return whether two bodies of discs are painted alike: to a micrometre, and 1e-6 of the normals."""
+    pairs = ((a.body.points, b.body.points), (a.radii_m, b.radii_m), (a.normals, b.normals), (a.bright, b.bright))
+    return all(x.shape == y.shape and np.allclose(x, y, rtol=0, atol=1e-6) for x, y in pairs)
 
 
 def body_target(scale: float = 1.0, depth: float = 1.0) -> Composite:

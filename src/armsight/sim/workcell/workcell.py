@@ -9,6 +9,7 @@ documentation's page on the workcell.
 from __future__ import annotations
 
 import contextlib
+import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -332,18 +333,23 @@ class Workcell:
         return read
 
     def board_shots(self, count: int, spec: str = CHESSBOARD) -> Iterator[Shot]:
-        """Show a board in ``count`` poses, as a person would who calibrates, past the arm; no time passes."""
-        board, shown = open_board(spec), 0
+        """Show a board in ``count`` poses, as a person would who calibrates, past the arm; no time passes.
+
+        InputError, before the first shot: the board is neither a chessboard nor a charuco board that begins at 0.
+        """
+        board = open_board(spec)
         if not isinstance(board, Chessboard | Charuco) or (isinstance(board, Charuco) and board.first):
             raise InputError(f"{spec}: simulated cameras show a chessboard or a charuco board")
         size = (board.columns, board.rows, board.square_m)
         pattern = charuco(*size, board.marker_m, board.family) if isinstance(board, Charuco) else chessboard(*size)
         rng = np.random.default_rng([self._seed, 10])
-        while shown < count:
-            for T in board_poses(rng, self._rig, pattern, count, fill=_CHESSBOARD_FILL):
-                if shown < count and self.source.clear(pattern, T):
-                    yield self.source.still((pattern,), T, shown)
-                    shown += 1
+        poses = (
+            T
+            for _ in itertools.count()
+            for T in board_poses(rng, self._rig, pattern, count, fill=_CHESSBOARD_FILL)
+            if self.source.clear(pattern, T)
+        )
+        return (self.source.still((pattern,), T, k) for k, T in enumerate(itertools.islice(poses, count)))
 
     def cover(self, from_s: float, to_s: float) -> None:
         """Hold a card before the body from one time to another: it is not seen meanwhile."""
