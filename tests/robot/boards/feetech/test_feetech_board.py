@@ -251,13 +251,13 @@ def test_late_answers_of_a_moving_joint_are_stamped_between_their_question_and_t
     board.enable()
     times, true, step, begin = [], [], device.step, device.servos.shaft[0]
 
-    def turned():
+    def carried():
         device.servos.goal(0, begin + 0.5 * np.sin(2.0 * device.t_s), 5.0)
         step()
         times.append(device.t_s)
         true.append(device.servos.shaft[0])
 
-    device.step, late.late_s = turned, late_s
+    device.step, late.late_s = carried, late_s
     states = [board.receive(0.1) for _ in range(8)]
     t_s, q = (np.concatenate(each) for each in ([s.t_s for s in states], [s.q[:, 0] for s in states]))
     off = np.abs(np.interp(t_s - late_s / 2, times, true) - q)
