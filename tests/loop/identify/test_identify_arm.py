@@ -353,6 +353,18 @@ def test_too_few_poses_are_rejected_and_few_are_enough_for_little(scene):
     assert after < before  # what is free beyond 60 numbers does no harm: its prior holds it
 
 
+def test_where_no_pose_can_be_left_out_the_fit_stands_and_says_so(scene):
+    w, measured, _, _ = scene
+    few = measured.rows(np.arange(7))
+    found = armsight.identify(w.nominal, few)
+    assert found.held_out is None
+    np.testing.assert_array_equal(found.cov, identify(w.nominal, few).cov)
+    assert "no pose was left out, and the sigmas are the fit's own, not scaled: 5 poses are fewer than 6" in repr(found)
+    more = armsight.identify(w.nominal, measured.rows(np.arange(12)))
+    assert more.held_out is not None
+    assert more.notes == ()
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [

@@ -8,10 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from armsight.data import Array, Record
+from armsight.errors import CalibrationError
 from armsight.loop.identify.identify import ALIKE, Identified, Validation
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.misread import find_step, without_tool
-from armsight.loop.identify.validate import identify_held_out
+from armsight.loop.identify.validate import check_other, identify_held_out
 from armsight.robot.kinematics.arm import Arm
 
 #: What is written.
@@ -47,11 +48,13 @@ def run_identify(
 
     ``measured``: joint angles, and measured poses of the tool. ``lines``: (N,) lines of the file that they come from.
     ``other``: poses to validate with; None: parts of ``measured`` are left out, one after the other. ``other_name``:
-    what an error calls these: their file. ``priors``: as in :func:`identify`.
+    what an error calls these: their file. ``priors``: as in :func:`identify`. CalibrationError: no pose can be left out.
     """
-    found = identify_held_out(arm, measured, other=other, priors=priors, progress=progress, other_name=other_name)
-    held_out = found.held_out
-    assert held_out is not None  # it is evaluated
+    if other is not None:
+        check_other(arm, measured, other, other_name)
+    found = identify_held_out(arm, measured, other=other, priors=priors, progress=progress)
+    if (held_out := found.held_out) is None:
+        raise CalibrationError(f"too few poses to leave a fifth of them out: {len(measured)}; take 10 and more")
     said = _notes(arm, found, measured, lines)
     if held_out.scale > 1:
         said.insert(

@@ -100,6 +100,7 @@ class Identified(Record):
         joint_sigma_rad: (n,) scatter of each joint from pose to pose, rad; zero where the instrument's covariance is
             not known, because the joints' and the instrument's share cannot be separated then.
         held_out: how it does on poses left out; None where none were.
+        notes: what a person should know, such as why none were.
     """
 
     model: Model
@@ -114,14 +115,16 @@ class Identified(Record):
     moved: Array
     joint_sigma_rad: Array
     held_out: LeftOut | None = None
+    notes: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         """Return how many numbers were fitted, and from how many poses."""
         used, free, weak = self.solution.used, self.solution.free, undetermined(*self.moved_all_over())
         left_out = self.held_out and f"; left out: {self.held_out.validation!r}"
+        notes = "".join(f"; {note}" for note in self.notes)
         return (
             f"Identified({self.model.arm.name}, {int(free.sum())} of {len(free)} numbers fitted, {int(used.sum())} of "
-            f"{len(used)} poses used{weak and f'; {weak}'}{left_out or ''}; columns() lists them)"
+            f"{len(used)} poses used{weak and f'; {weak}'}{left_out or ''}{notes}; columns() lists them)"
         )
 
     def __str__(self) -> str:

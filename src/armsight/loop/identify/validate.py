@@ -108,7 +108,6 @@ def identify_held_out(
     other: Measured | Read | None = None,
     priors: Mapping[str, float] | None = None,
     progress: Callable[[str], None] = lambda line: None,
-    other_name: str = "other",
 ) -> Identified:
     """Identify an arm from poses, as ``armsight identify`` does: fifths of them are left out, to know how good it is.
 
@@ -118,29 +117,30 @@ def identify_held_out(
         other: poses to validate with, instead of those left out.
         priors: sigma by name of a parameter or a kind, instead of ``fit.SIGMA``; 0 keeps one at its nominal value.
         progress: called with the name of each step as it begins.
-        other_name: what an error calls ``other``: its file.
 
     Returns:
-        Every number with its sigma, as large as the residuals of the poses left out show it to be (``held_out``):
+        Every number with its sigma, as large as the residuals of the poses left out show it to be (``held_out``; with
+        6 or 7 poses, of which none can be left out, that is None, the sigmas are the fit's own, and ``notes`` say so):
         ``columns()`` is a table for pandas, ``validate`` says how far off it is on more poses, ``Corrected.of`` makes an
         arm of it that computes and is saved.
 
     Raises:
-        InputError: too few poses, or data that cannot be of this arm; the message says what would make them fit.
-        CalibrationError: poses so alike that not even base and tool are observable, or too few to leave some out.
+        InputError: fewer than 6 poses, or data that cannot be of this arm; the message says what would make them fit.
+        CalibrationError: poses so alike that not even base and tool are observable.
     """
     call = "identify(arm, measured)"
     require(call, "arm", arm, isinstance(arm, Arm), 'open_arm("ur10")')
     measured = measured_of(call, measured)
     if other is not None:
         other = measured_of(call, other, "other")
-        try:
-            _check_other(arm, measured, other)
-        except InputError as error:
-            raise InputError(f"{other_name}: {error}") from None
+        check_other(arm, measured, other, "other")
     found = identify(arm, measured, priors=priors, progress=progress)
     if other is None:
-        held_out = _left_out(arm, measured.rows(found.solution.used), priors, progress)
+        try:
+            held_out = _left_out(arm, measured.rows(found.solution.used), priors, progress)
+        except (InputError, CalibrationError) as error:  # the whole was identified: its parts are too small
+            why = f"no pose was left out, and the sigmas are the fit's own, not scaled: {error}"
+            return replace(found, notes=(*found.notes, f"{why}, without a fifth of {len(measured)}"))
         apart = f", {len(found.left_out)} taken for mistakes apart" if len(found.left_out) else ""
     else:
         held_out = LeftOut(validate(found, other), other.q, f"{len(other)} poses of another file")
@@ -149,6 +149,14 @@ def identify_held_out(
     scale = over if over**2 > chdtri(numbers, TOO_SMALL) / numbers else 1.0
     held_out = held_out._replace(how=held_out.how + apart, scale=scale)
     return replace(found, cov=scale**2 * found.cov, held_out=held_out)
+
+
+def check_other(arm: Arm, measured: Measured, other: Measured, name: str) -> None:
+    """Reject poses to validate with that cannot be of the arm, before anything is fitted; ``name`` is for the error."""
+    try:
+        _check_other(arm, measured, other)
+    except InputError as error:
+        raise InputError(f"{name}: {error}") from None
 
 
 def _check_other(arm: Arm, measured: Measured, other: Measured) -> None:
@@ -173,18 +181,18 @@ def _check_other(arm: Arm, measured: Measured, other: Measured) -> None:
 def _left_out(
     arm: Arm, measured: Measured, priors: Mapping[str, float] | None, progress: Callable[[str], None]
 ) -> LeftOut:
-    """Identify without a part of the poses, and validate on it; with few poses once for every part."""
+    """Identify without a part of the poses, and validate on it; with few poses once for every part.
+
+    InputError, CalibrationError: the other poses are too few or too alike.
+    """
     which = visits(measured.q)
     shuffled = np.random.default_rng(0).permutation(int(which.max()) + 1)
     parts = [np.flatnonzero(np.isin(which, part)) for part in np.array_split(shuffled, min(FOLDS, len(shuffled)))]
     tried, done = parts if len(measured) <= MANY else parts[:1], []
     for i, part in enumerate(tried, 1):
         progress(f"error on poses left out, part {i} of {len(tried)}")
-        try:
-            others = measured.rows(np.setdiff1d(np.arange(len(which)), part))
-            done.append(validate(identify(arm, others, priors=priors), measured.rows(part)))
-        except (InputError, CalibrationError) as error:
-            raise CalibrationError(f"too few poses to leave a fifth of them out: {error}") from None
+        others = measured.rows(np.setdiff1d(np.arange(len(which)), part))
+        done.append(validate(identify(arm, others, priors=priors), measured.rows(part)))
     over = float(np.sqrt(np.mean([v.residual_over_predicted**2 for v in done])))
     nominal, identified = (
         Errors(*map(np.concatenate, zip(*each, strict=True)))
