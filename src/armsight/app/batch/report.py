@@ -151,7 +151,7 @@ def _runs(folder: Path) -> Iterator[_PushedRun]:
 
 
 def _of_result(found: Any, name: str = "") -> dict[str, float]:  # noqa: ANN401 - whatever JSON holds
-    """Return the numbers of a result by their names, joined by dots; of one with its uncertainty itself alone."""
+    """Return the numbers of a result by their names, joined by dots; of one with its uncertainty the number alone."""
     if isinstance(found, dict):
         found = found.get("clean", found.get("value", found))
     if isinstance(found, dict):

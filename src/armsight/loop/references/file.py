@@ -142,7 +142,7 @@ def written(entry: Entry, folder: Path) -> str:
 
 
 def read_recording(path: Path, kind: str = IMU) -> tuple[Array, Array]:
-    """Return times (N,), s, and values (N, 6) of an inertial unit: rad/s, then m/s2.
+    """Return times (N,), s, and values of a recording: of an IMU (N, 6), rad/s and m/s2, of a FIELD (N, 3), T.
 
     Raises:
         InputError: the file, the line and what was expected.
@@ -165,7 +165,7 @@ def _of_bag(bag: Bag, kind: str) -> tuple[Array, Array]:
 
 
 def reading_of(message: BagMessage, kind: str = IMU) -> tuple[float, Array]:
-    """Return the time, s, and the reading (6,), rad/s and m/s2, of a message of ``sensor_msgs/Imu``.
+    """Return the time, s, and the reading of a message: (6,), rad/s and m/s2, or of a field (3,), T.
 
     Raises:
         InputError: it is too short.
