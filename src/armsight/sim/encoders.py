@@ -38,9 +38,12 @@ class EncoderFault(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class Encoders(Record):
-    """What reads six joints (6,): kinds, and counts of a revolution of the joint, negative where they fall with the angle.
+    """What reads six joints.
 
-    ``zero_counts``: reading of an absolute one at 0 rad.
+    Attributes:
+        kind: (6,) of :class:`~armsight.robot.boards.codes.SensorKind`.
+        counts_per_rev: (6,) of a revolution of the joint, negative where counts fall with the angle.
+        zero_counts: (6,) reading of an absolute one at 0 rad.
     """
 
     kind: NDArray[np.int64]

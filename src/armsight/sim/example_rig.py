@@ -158,10 +158,20 @@ def _tried(
 def path(
     rig: StereoRig, patterns: Sequence[Pattern], times_s: Array, *, distance_m: float = 0.5, speed: float = 1.0
 ) -> tuple[Array, Array]:
-    """Return a smooth path of a target, all of it in view of both cameras, about distance_m away.
+    """Return a smooth path of a target through the volume that both cameras see.
 
-    (N, 4, 4) poses in the left camera's frame, m, at times (N,), s, and (N, 6) velocities in the target's axes. Speed 1
-    comes back to its start after some ten seconds. InputError: not in view even at rest in the middle.
+    Args:
+        rig: the cameras.
+        patterns: the target; all of it stays in view.
+        times_s: (N,) times, s.
+        distance_m: of the path's middle from the cameras.
+        speed: 1 for a path that comes back to its start after some ten seconds.
+
+    Returns:
+        (N, 4, 4) poses of the target in the left camera's frame, m, and (N, 6) its velocity in its own axes, m/s, rad/s.
+
+    Raises:
+        InputError: the target is not in view even at rest in the middle.
     """
     middle = _between(rig, np.array([distance_m]))[0]
     rates = speed * np.array([0.7, 1.1, 0.5, 0.9, 0.6, 0.8])

@@ -65,12 +65,21 @@ _USUAL_SIZE = {PotFault.JUMP: 0.35, PotFault.SLIP: 0.3, PotFault.DRIFT: 0.36, Po
 
 @dataclass(frozen=True, eq=False)
 class JointModel(Record):
-    """What six joints (6,) are made of: windings, motor constants at the joint, V s/rad and N m/A, friction, gravity.
+    """What six joints are made of.
 
-    ``gravity_n_m``: at 0 rad; it falls with the angle's cosine; ``backlash_rad``: from stop to stop; ``coupling``:
-    share of a joint's inertia that the acceleration of the joint before it acts on; ``noise_counts``: sigma of a
-    reading; ``current_gain``: a current's reading over the current; ``brake_n_m``: what a closed brake holds, 0
-    without.
+    Attributes:
+        resistance_ohm: (6,) of the windings.
+        constant_v_s: (6,) motor constants at the joint, V s/rad and N m/A.
+        inertia_kg_m2: (6,) at the joint.
+        viscous_n_m_s: (6,) friction that grows with speed, N m s/rad.
+        dry_n_m: (6,) dry friction, N m.
+        gravity_n_m: (6,) gravity's torque at 0 rad, N m; it falls with the angle's cosine.
+        backlash_rad: (6,) between the motor and the joint with its potentiometer, from stop to stop.
+        coupling: (6,) share of a joint's inertia that the acceleration of the joint before it acts on.
+        noise_counts: (6,) standard deviation of a reading.
+        current_noise_ma: (6,) standard deviation of a current's reading.
+        current_gain: (6,) a current's reading over the current.
+        brake_n_m: (6,) what a closed brake holds, N m; 0 where there is none.
     """
 
     resistance_ohm: Array
@@ -126,13 +135,17 @@ def drawn_model(seed: int, *, load: float = 0.6, inertia: float = 6.0, spread: f
 
 @dataclass(frozen=True, eq=False)
 class Transmission(Record):
-    """What lies between the motors of six joints and what they drive: springs and eccentric drums.
+    """What lies between the motors of six joints and what they drive.
 
-    ``stiffness_n_m``: N m/rad at 0 rad, 0 rigid; ``link_share``: of the joint's inertia behind the spring;
-    ``pose_share``: by which the stiffness is greater at 1 rad, linearly; ``back_share``: stiffness while the joint is
-    ahead of the motor over that while it is behind; ``drum_rad``: amplitude by which a drum leads the joint before and
-    behind the motor, ``drum_per_rev`` times in a revolution of the motor, gear included, from ``drum_phase`` of a cycle
-    at 0 rad.
+    Attributes:
+        stiffness_n_m: (6,) of the spring between them, N m/rad, where the joint is at 0 rad; 0: rigid.
+        damping_n_m_s: (6,) of the spring, N m s/rad.
+        link_share: (6,) share of the joint's inertia behind the spring.
+        pose_share: (6,) by which share the stiffness is greater at 1 rad; it changes linearly with the angle.
+        back_share: (6,) stiffness while the joint is ahead of the motor, over that while it is behind.
+        drum_rad: (6,) amplitude by which an eccentric drum leads the joint before and behind the motor.
+        drum_per_rev: (6,) how often it does so in a revolution of the motor, gear included.
+        drum_phase: (6,) its phase at 0 rad, of a cycle.
     """
 
     stiffness_n_m: Array
@@ -317,10 +330,23 @@ def _read(
 class JointPlant:
     """Six joints behind the contract :class:`~armsight.robot.boards.link.Plant`; what breaks on them is set here.
 
-    True angles of the motors ``q``, at the joint, and of the joints ``link``, rad: the motors' but for backlash, twist
-    and drum. May be set: the torque ``hand_n_m`` of a hand; ``supply_mv``; joints ``blocked``; ``stuck``: share of the
-    supply, -1 to 1, that a broken bridge puts out while it is awake, 0 where sound; ``offset_a`` of the current's
-    sensor.
+    Args:
+        q: (6,) where the joints are at first, rad.
+        seed: of the converters' noise.
+        model: what they are made of; the data sheet's without.
+        transmission: what lies between motors and joints; rigid and even without.
+
+    Attributes:
+        q: (6,) true angles of the motors, rad, at the joint.
+        qd: (6,) their speeds, rad/s.
+        link: (6,) true angles of the joints, rad: the motors' but for backlash, twist and drum.
+        hand_n_m: (6,) torque with which a hand pushes, N m.
+        supply_mv: motor supply, mV.
+        stop_pressed: whether the emergency stop is pressed.
+        blocked: (6,) joints that something holds fast.
+        stuck: (6,) share of the supply, -1 to 1, that a broken bridge puts out while it is awake, whatever its duty; 0
+            where it is sound.
+        offset_a: (6,) offset of the current's sensor, A.
     """
 
     def __init__(

@@ -437,6 +437,17 @@ def plan_report(
     """Return the motions of the recording that a report needs, as a motion file, and the space (3,) it covers, m.
 
     Poses all over where the body is seen, each from two opposite sides of all joints, and five of them again and again.
+
+    Args:
+        arm: the nominal arm, as slow as its board.
+        around: (M, n) joint angles at which the body was seen, rad; the arm stands at the first to begin with.
+        visible: returns whether the body is seen at poses (N, 4, 4) of the tool.
+        poses: how many poses from both sides.
+        cycles: how often five of them come again.
+        seed: of the choice.
+
+    Raises:
+        InputError: too few poses are in view.
     """
     rng, found = np.random.default_rng([seed, 40]), list[tuple[Array, Array]]()
     low, high = arm.q_min + 2 * _ASIDE_RAD, arm.q_max - 2 * _ASIDE_RAD

@@ -195,6 +195,9 @@ def ar4_changes(path: Path, further_rad: Array) -> tuple[str, list[ZeroChange]]:
     """Return the text of a ``joint_offsets`` file of ar4_ros_driver with other offsets, and the changes.
 
     The driver's joint is at ``reported + offset``, in degrees; its joint 1 has the opposite sense of armsight's ``ar4``.
+
+    Raises:
+        InputError: it is no such file, or another number of angles (6,), rad.
     """
     further_deg = np.degrees(_checked(further_rad, len(SENSE)) * SENSE)
     changes: list[ZeroChange] = []

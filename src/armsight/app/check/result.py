@@ -181,7 +181,14 @@ class LimitResult:
 
 
 def read_limits(texts: Iterable[str]) -> dict[str, float]:
-    """Read NAME=LENGTH texts, such as AP=0.5mm."""
+    """Read NAME=LENGTH texts, such as AP=0.5mm.
+
+    Returns:
+        Name of each metric -> its limit, m.
+
+    Raises:
+        InputError: an unknown name, a name given twice, or no positive length with a unit.
+    """
     limits: dict[str, float] = {}
     for given in texts:
         name, _, length = given.partition("=")

@@ -188,7 +188,15 @@ def write_png(path: Path, image: Image) -> None:
 
 
 def write_cloud(path: Path, form: Rectification, result: Disparity, depth: Depth, image: Image) -> int:
-    """Write the measured points as a binary PLY file, and return how many there are."""
+    """Write the measured points as a binary PLY file, and return how many there are.
+
+    Args:
+        path: where to.
+        form: how the images were rectified.
+        result: the disparities.
+        depth: their depths.
+        image: (H, W) grey or (H, W, 3) BGR, the rectified left image.
+    """
     chosen = result.measured & np.isfinite(depth.depth_m)
     count = int(np.count_nonzero(chosen))
     kinds = {"<f4": "float", "u1": "uchar"}

@@ -65,7 +65,15 @@ def search_of(form: Rectification | None, max_disparity: int | None, near: float
 
 
 def check_near(form: Rectification, near: float) -> None:
-    """Check that a nearest depth leaves something to search."""
+    """Check that a nearest depth leaves something to search.
+
+    Args:
+        form: how the images are rectified.
+        near: the nearest depth, m.
+
+    Raises:
+        InputError: the disparity at that depth is so small that all of a scene is nearer.
+    """
     disparity = float(form.disparity_of(near))
     if disparity < _LEAST_DISPARITY:
         raise InputError(

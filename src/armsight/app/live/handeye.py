@@ -260,7 +260,10 @@ def _errors_after_m(run: HandEyeRun, Ts_base_flange: Array) -> Array:
 
 
 def visit_poses(loop: Loop, guide: HandEyeGuide, start: Array, progress: Callable[[str], None]) -> None:
-    """Move an arm from pose to pose, each chosen by those before, until the calibration is good; and back to the start."""
+    """Move an arm from pose to pose, each chosen by those before, until the calibration is good; and back to the start.
+
+    ``start``: (n,) joint angles at which it stands, rad; ``progress`` is called with a line about what is being done.
+    """
     q = start
     for number in range(1, MOST_POSES + 1):
         goal = guide.next_q

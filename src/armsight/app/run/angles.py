@@ -79,7 +79,12 @@ class LoggedAngles(Record):
 
 
 def read_angles(path: str | Path, arm: Arm) -> LoggedAngles:
-    """Read the logged joint angles of an arm."""
+    """Read the logged joint angles of an arm.
+
+    Raises:
+        InputError: unreadable, a joint is missing or too many, a field is no number, degrees came as radians, or times
+            fall.
+    """
     table = read_pose_table(Path(path), arm=arm, only_joints=True)
     assert table.q is not None
     t_s = table.t_s if table.names is None else None

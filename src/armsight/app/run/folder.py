@@ -116,6 +116,13 @@ def finish(
 ) -> Report:
     """Write everything a run measured, and raise what ended it early.
 
+    Args:
+        result: what was measured.
+        folder: of the run.
+        truth: times (N,), s, and poses (N, 4, 4) of the tool in the base frame; None for a real arm.
+        studies: made after it.
+        workcell: returns an image (H, W, 3) BGR of the workcell from aside; None for a real arm.
+
     Raises:
         ArmsightError: what ended the run early, or that not all files could be written; those that were are complete.
         KeyboardInterrupt: the keyboard interrupted the run, or the writing.

@@ -97,7 +97,15 @@ def report_of(
     picture: Image | None = None,
     workcell: Callable[[], Image] | None = None,
 ) -> Report:
-    """Return the report of a run."""
+    """Return the report of a run.
+
+    Args:
+        result: what was measured.
+        tracks: its tracks; None where the run ended before the hand-eye calibration.
+        studies: made after it.
+        picture: (H, W, 3) BGR, the left image with the measured pose overlaid; None without.
+        workcell: returns (H, W, 3) BGR, the workcell from aside; None on a real arm.
+    """
     led = None if result.led is None else result.led.to_json()
     values: dict[str, Any] = {"version": VERSION}
     tables, lines = list[TextTable | None](), list[str]()

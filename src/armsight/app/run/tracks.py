@@ -120,7 +120,13 @@ class Tracks:
 
 
 class Part:
-    """The tracks of a run between two times, each made when it is asked for."""
+    """The tracks of a run between two times, each made when it is asked for.
+
+    Attributes:
+        begin_s: begin, which is not included, s.
+        end_s: end, s.
+        segments: motions and rests that lie within.
+    """
 
     def __init__(self, tracks: Tracks, begin_s: float, end_s: float, most: int | None) -> None:
         self._of, self.begin_s, self.end_s, self._most = tracks, begin_s, end_s, most

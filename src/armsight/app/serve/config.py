@@ -31,6 +31,13 @@ class ServeConfig:
     Attributes:
         arguments: of `armsight measure`, without --output.
         folder: where relative paths begin: that of the file.
+        http: where /healthz and /metrics are, ``host:port``; empty for nowhere.
+        log: file of the log, empty for stderr.
+        log_mb: size at which it is begun anew, MB.
+        log_files: older logs that are kept.
+        stale_s: time without a shot after which the command is started again, s.
+        retry_s: longest time between two tries, s.
+        output: file of the poses, empty for none.
     """
 
     arguments: tuple[str, ...]

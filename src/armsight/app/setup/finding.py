@@ -127,7 +127,7 @@ def _opened(port: str, kinds: Iterable[str] = KINDS) -> tuple[str, MotionBoard] 
 
 
 def find_board(say: Callable[[str], None], ports: Callable[[], Sequence[str]] = list_ports) -> str:
-    """Return the arm's board, such as ``feetech:/dev/ttyACM0``: the only one, or the one whose joint or cable a person moves."""
+    """Return the arm's board, as in ``feetech:/dev/ttyACM0``: the only one, or that whose joint or cable a person moves."""
     say("Looking at the ports.")
     there = ports()
     found = dict(each for port in there if (each := _opened(port)) is not None)

@@ -106,6 +106,11 @@ def _hottest(temperatures_c: Callable[[], Array | None] | None) -> float | None:
 def tilt_and_size(rig: StereoRig, points: Array, pose: PoseEstimate) -> tuple[float, float]:
     """Say what one pose shows of its rig: a rotation of one camera changes one of the two.
 
+    Args:
+        rig: the calibrated pair.
+        points: (M, 3) of the body, m.
+        pose: measured in a shot.
+
     Returns:
         The mean signed angle of the left rays out of the plane of baseline and right ray, rad, and the size of the
         triangulated body over its drawing, less one.

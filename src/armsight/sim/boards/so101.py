@@ -48,10 +48,18 @@ def arm_load(q: Array) -> Array:
 
 
 class So101Servos:
-    """The mechanics of six servos at joint angles q (6,), rad by the sensors, with what is wrong with them.
+    """The mechanics of six servos.
 
-    ``load`` returns the torques (6,) that pull the joints towards smaller angles, N m, at their angles. ``shaft`` (6,),
-    rad, and ``rate`` (6,), rad/s, of the output shafts; ``shaft_speed`` is the same as a servo measures it, filtered.
+    Args:
+        mechanics: what is wrong with them.
+        load: returns the torques (6,) that pull the joints towards smaller angles, N m, at their angles (6,), rad.
+        q: (6,) where the joints are, rad by the sensors.
+
+    Attributes:
+        shaft: (6,) angles of the output shafts, rad.
+        rate: (6,) how fast the shafts move, rad/s; ``shaft_speed`` is the same as a servo measures it, filtered.
+        on: (6,) whether the torque is on.
+        celsius: (6,) temperatures.
     """
 
     def __init__(self, mechanics: So101Mechanics, load: Callable[[Array], Array], q: Array) -> None:
@@ -182,7 +190,11 @@ class So101Bus(Wired):
     ) -> So101Bus:
         """Return a bus of six servos; by default as issue 134 measured them, half folded.
 
-        ``load`` returns the torques (6,), N m, at angles q (6,), rad; ``options`` are fields of this class.
+        Args:
+            mechanics: what is wrong with the joints.
+            load: returns the torques (6,), N m, at angles (6,), rad.
+            q: (6,) where the joints are, rad by the sensors.
+            options: fields of this class.
         """
         q = np.radians([5.0, -40.0, 60.0, 20.0, 0.0, 10.0]) if q is None else q
         return cls(So101Servos(mechanics or So101Mechanics(), load, q), **options)  # type: ignore[arg-type]

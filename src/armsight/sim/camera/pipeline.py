@@ -74,10 +74,18 @@ class SimulatedCamera:
         self._gain_step: int | None = None
 
     def expose(self, radiance: Radiance, time_s: float = 0.0, number: int | None = None) -> Image:
-        """Return the image (H, W) of a scene, linear radiance (H, W), 1 for a white reflector, with blur and motion.
+        """Return the image of a scene.
 
-        ``time_s``: middle of the exposure of the middle row, for flicker; ``number``: of the image, from which and the
-        seed its noise follows; by default images are counted.
+        Args:
+            radiance: (H, W) linear light of each pixel, 1 for a white reflector, with the renderer's blur and motion.
+            time_s: middle of the exposure of the middle row, s; flicker follows it.
+            number: of the image; its noise follows from it and the camera's seed. By default images are counted.
+
+        Returns:
+            (H, W) uint8, grey.
+
+        Raises:
+            InputError: the radiance is of another size.
         """
         if radiance.shape != (self._height, self._width):
             raise InputError(f"the radiance is {radiance.shape}, must be ({self._height}, {self._width})")

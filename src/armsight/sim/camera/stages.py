@@ -82,7 +82,11 @@ class ExposureTiming(Stage):
 
 @dataclass(frozen=True)
 class Lens(Stage):
-    """A lens in focus; the renderer applies its blur, exactly in area, see :attr:`CameraPipeline.psf_sigma_px`."""
+    """A lens in focus; the renderer applies its blur, exactly in area, see :attr:`CameraPipeline.psf_sigma_px`.
+
+    Attributes:
+        psf_sigma_px: standard deviation of the Gaussian blur, pixels of the output.
+    """
 
     psf_sigma_px: float = _number(0.1, 5)
 
@@ -211,7 +215,13 @@ class ToneCurve(Stage):
 
 @dataclass(frozen=True)
 class SpatialDenoise(Stage):
-    """A bilateral filter of the luma: diameter and weights by distance, px of the sensor, weight by grey levels."""
+    """A bilateral filter of the luma.
+
+    Attributes:
+        diameter_px: of the neighbourhood, pixels of the sensor.
+        sigma_px: weight by distance.
+        sigma_grey: weight by difference, grey levels.
+    """
 
     diameter_px: int = _number(3, 15, whole=True)
     sigma_px: float = _number(0.3, 10)

@@ -29,16 +29,22 @@ class InertialErrors(Record):
 
     Attributes:
         noise: (6,) density, per sqrt(Hz).
-        walk: (6,) of the bias at power-on, per sqrt(s).
-        warming: (6,) change of the bias as the chip warms up, with time constant ``warming_s``, s.
+        bias: (6,) at power-on.
+        walk: (6,) of the bias, per sqrt(s).
+        warming: (6,) change of the bias as the chip warms up.
+        warming_s: time constant of that, s.
         scale: (6, 3) by how much the matrices of gyro and accelerometer differ from the identity, row by row.
         g_sensitivity: (3, 3) of the gyro, rad/s per m/s2.
-        largest: (6,) end of the range; values are rounded to ``step``.
+        largest: (6,) end of the range.
+        step: (6,) that values are rounded to.
         bandwidth_hz: of the chip's low-pass of second order.
-        rate_hz: readings a second, by its own clock, which is slow by ``clock``, relative.
-        lost, repeated: share of the readings that are missing, or repeat the one before.
+        rate_hz: readings a second, by its own clock.
+        clock: by how much that clock is slow, relative.
+        lost: share of the readings that are missing.
+        repeated: share of the readings that repeat the one before.
         mount_hz: resonance of a loose mount about the sensor's x axis; 0: rigid.
-        hum: (6,) amplitude of the motors' vibration at ``hum_hz``.
+        hum: (6,) amplitude of the motors' vibration.
+        hum_hz: its frequency.
     """
 
     noise: Array = field(default_factory=lambda: np.repeat([9e-5, 4e-3], 3))
@@ -72,8 +78,14 @@ class InertialErrors(Record):
     ) -> InertialErrors:
         """Return those of a unit of a class, drawn.
 
-        One sigma of what is given for gyro and accelerometer; noise density per sqrt(Hz), g_sensitivity in rad/s per
-        m/s2. ``good``: the gyro is of the better sort: warms up less, is rounded less.
+        Args:
+            density: of the noise of gyro and accelerometer, per sqrt(Hz).
+            bias: one sigma of both.
+            scale: one sigma, relative.
+            g_sensitivity: one sigma, rad/s per m/s2.
+            rng: random numbers.
+            good: whether the gyro is of the better sort: warms up less, is rounded less.
+            rate_hz: readings a second.
         """
         noise = np.repeat(density, 3)
         return InertialErrors(

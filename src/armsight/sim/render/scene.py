@@ -60,11 +60,14 @@ class Pattern(Record):
 
 @dataclass(frozen=True, eq=False)
 class PosedBody(Record):
-    """A rigid body in front of a camera at T_camera_body (4, 4), m, in the middle of the exposure of the middle row.
+    """A rigid body in front of a camera.
 
-    ``patterns`` are painted in their order: a tag comes after the plate it is stuck on. ``twist`` (6,), m/s and rad/s,
-    in the body's axes, and ``acceleration``, its change: at time t the pose is T_camera_body @ exp_se3(t twist + t^2
-    acceleration / 2).
+    Attributes:
+        patterns: what is on the body, painted in this order: a tag comes after the plate it is stuck on.
+        T_camera_body: (4, 4) pose in the camera's frame in the middle of the exposure of the middle row, m.
+        twist: (6,) velocity [m/s; rad/s] in the body's axes.
+        acceleration: (6,) its change, m/s^2 and rad/s^2: at time t the pose is T_camera_body @ exp_se3(t twist +
+            t^2 acceleration / 2).
     """
 
     patterns: tuple[Pattern, ...]
@@ -184,7 +187,17 @@ def charuco(
 ) -> Pattern:
     """Return a ChArUco board as OpenCV (4.6 and later) draws it, with a white margin of one square.
 
-    Its origin is the inner corner of the square at the upper left, which is black.
+    Args:
+        columns: squares along x.
+        rows: squares along y.
+        square_m: side of a square, m.
+        marker_m: side of a marker, m.
+        family: of the markers, as in :func:`marker_bits`.
+        black: reflectance of black squares and cells.
+        white: reflectance of white squares and cells, and of the margin.
+
+    Returns:
+        The board; its origin is the inner corner of the square at the upper left, which is black.
     """
     bits = [marker_bits(family, k) for k in range(columns * rows // 2)]
     cells = len(bits[0])

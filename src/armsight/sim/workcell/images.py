@@ -282,9 +282,16 @@ class WorkcellCamera:
         psf_sigma_px: float = LENS.psf_sigma_px,
         more: Array | None = None,
     ) -> None:
-        """Stand there, among clutter of a seed, by default with noise of 2 grey levels; the first image takes a second.
+        """Stand there; the first image takes a second longer.
 
-        ``foot``: the arm's solids, whose base stands still; ``more``: boxes that stand there besides, see ``raycast``.
+        Args:
+            camera: its lens.
+            T_base_camera: (4, 4) where it is, m.
+            foot: the arm's solids, whose base stands still.
+            seed: of the clutter.
+            sensor: noise of 2 grey levels by default.
+            psf_sigma_px: blur of its lens, px.
+            more: boxes that stand there besides, see ``raycast``.
         """
         self.camera, self.T_base_camera = camera, T_base_camera
         self._foot, self._seed, self._more = foot, seed, more
@@ -521,9 +528,17 @@ def picture(
     rig: tuple[Array, StereoRig],
     seed: int,
 ) -> Image:
-    """Return the workcell as it is now, (H, W, 3) BGR, uint8.
+    """Return the workcell as it is now.
 
-    ``body``: the patterns on the tool, and T_tool_body; ``rig``: T_base_rig, (4, 4), m, and the cameras.
+    Args:
+        size_px: (width, height).
+        plant: the arm.
+        body: the patterns on the tool, and T_tool_body (4, 4), m.
+        rig: T_base_rig (4, 4), m, and the cameras.
+        seed: of the clutter.
+
+    Returns:
+        (H, W, 3) BGR, uint8.
     """
     width, height = size_px
     focal = _FOCAL * width

@@ -36,7 +36,15 @@ _SHORTEST_M = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Solids(Record):
-    """Capsules that move with an arm's links: ends (K, 2, 3), m, in the row frame of ``link`` (K,), 0 for the base."""
+    """Capsules that move with an arm's links.
+
+    Attributes:
+        link: (K,) 0 for the base, 1 to n.
+        ends: (K, 2, 3) their axes' ends, m, row frame of the link.
+        radius: (K,) m.
+        mass: (K,) kg.
+        housing: (K,) whether it is a joint's housing.
+    """
 
     link: Ids
     ends: Array
@@ -148,12 +156,20 @@ _POSES = 400  # at which the arm is looked at
 
 @dataclass(frozen=True, eq=False)
 class Motors(Record):
-    """Six geared motors (6,); inertia and friction are given at the joint.
+    """Six geared motors; inertia and friction are given at the joint.
 
-    ``torque_constant``: N m/A, also V s/rad, at the motor; ``rotor_inertia``: kg m^2, of rotor and gear;
-    ``current_max_a``: the driver's own limit; ``coulomb_nm``: dry friction of motor and gear; ``bearing_nm``: of the
-    link's own bearing; ``brake_nm``: what the brake holds, closed until the board opens it; ``needed_nm``: for gravity
-    and the greatest acceleration.
+    Attributes:
+        gear_ratio: (6,) revolutions of the motor for one of the joint.
+        torque_constant: (6,) N m/A, also V s/rad, at the motor.
+        resistance_ohm: (6,) of the winding.
+        rotor_inertia: (6,) kg m^2, of rotor and gear, at the joint.
+        current_max_a: (6,) the driver's own limit.
+        coulomb_nm: (6,) dry friction of motor and gear, N m.
+        viscous: (6,) friction that grows with speed, N m s/rad.
+        bearing_nm: (6,) dry friction of the link's own bearing, N m.
+        brake_nm: (6,) what the brake holds, N m; closed until the board opens it.
+        needed_nm: (6,) torque that the joint needs, N m: of gravity and of its greatest acceleration.
+        gravity_nm: (6,) greatest gravity torque, N m.
     """
 
     gear_ratio: Array

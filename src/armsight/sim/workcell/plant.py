@@ -200,7 +200,12 @@ _SETTLE_S = 0.5
 class Travelled:
     """What an arm's angles were, at each millisecond of the last minutes; longer ago at fewer times, so that hours fit.
 
-    ``begin``: the tick of the first row of ``recent``; ``ticks``: how many have passed since the first.
+    Args:
+        first: (K,) the first angles, rad.
+
+    Attributes:
+        begin: the tick of the first row of ``recent``.
+        ticks: how many ticks have passed since the first.
     """
 
     def __init__(self, first: Array) -> None:

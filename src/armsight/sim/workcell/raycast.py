@@ -236,11 +236,20 @@ def still(
     depth: Light,
     ids: NDArray[np.int16],
 ) -> None:
-    """Cast one ray a pixel at things that stand still, with the lamp's shadows: light, depth, m, and ids (N,).
+    """Cast one ray a pixel at things that stand still, with the lamp's shadows.
 
-    Rays are cast in bunches: what lies outside the cone around a bunch, from the camera or from the lamp, none of it
-    meets. rays (N, 3): unit, camera frame; those that follow each other had best be close together. boxes (M, BOX);
-    ``capsules``: ends (K, 2, 3), m, radii (K,), m, albedos (K,). ids: boxes, then capsules; -1 where there is none.
+    Rays are cast in bunches: what lies outside the cone around a bunch, from the camera or from the lamp, none of it meets.
+
+    Args:
+        rays: (N, 3) unit rays of the pixels, camera frame; those that follow each other had best be close together.
+        R_base_camera: (3, 3) the camera's axes.
+        p_base: (3,) where it is, m.
+        boxes: (M, BOX).
+        capsules: ends (K, 2, 3), m; radii (K,), m; albedos (K,).
+        lamp_base: (3,) where the lamp is, m.
+        light: (N,) the light that comes from each pixel.
+        depth: (N,) distance of the surface, m.
+        ids: (N,) which surface it is: boxes, then capsules; -1 where there is none.
     """
     ends, radius, albedo = capsules
     balls, n = _balls(boxes, ends, radius), np.empty(3)
@@ -294,7 +303,13 @@ _SAMPLES = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))
 
 @dataclass(frozen=True, eq=False)
 class StillView(Record):
-    """What stands still before a camera, (H, W): light before the lens, depth, m, and which surface, -1 for none."""
+    """What stands still before a camera.
+
+    Attributes:
+        light: (H, W) light on each pixel before the lens.
+        depth: (H, W) distance of the surface, m.
+        ids: (H, W) which surface it is.
+    """
 
     light: NDArray[np.float32]
     depth: NDArray[np.float32]
@@ -363,9 +378,15 @@ def pixel_rays(corners: Array) -> Array:
 def view(
     camera: Camera, rays: Array, T_base_camera: Array, seed: int, foot: Solids, more: Array | None = None
 ) -> StillView:
-    """Return what stands still before a camera at T_base_camera: a ray a pixel (H, W, 3), four more where light changes.
+    """Return what stands still before a camera: a ray a pixel, four more where light changes.
 
-    ``foot``: the arm's solids, whose base stands still; ``more``: boxes (N, BOX) that stand there besides.
+    Args:
+        camera: the camera.
+        rays: (H, W, 3) its pixels'.
+        T_base_camera: (4, 4) where it is, m.
+        seed: of the clutter.
+        foot: the arm's solids; its base stands still.
+        more: boxes (N, BOX) that stand there besides.
     """
     boxes, (ends, radius, albedo) = furniture(seed)
     if more is not None:
@@ -401,7 +422,13 @@ def _tiled(height: int, width: int) -> Ids:
 
 
 def arm_capsules(parts: Solids, Ts_base_link: Array, T_base_camera: Array) -> tuple[Array, Array, Array]:
-    """Return the arm's moving solids, but its load, as the rays take them, in a camera's frame; Ts (n + 1, 4, 4)."""
+    """Return the arm's moving solids, but its load, as the rays take them, in a camera's frame.
+
+    Args:
+        parts: what the arm is made of.
+        Ts_base_link: (n + 1, 4, 4) row frames.
+        T_base_camera: (4, 4) where the camera is, m.
+    """
     shown = np.flatnonzero(parts.link > 0)[:-1]
     Ts = inverse(T_base_camera) @ Ts_base_link[parts.link[shown]]
     ends = transform(Ts[:, None], parts.ends[shown])
@@ -412,7 +439,13 @@ _CUBE = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (
 
 
 def capsule_boxes(camera: Camera, ends: Array, radius: Array) -> Ids:
-    """Return (K, 4) the pixels that capsules can cover: first column, first row, end column, end row."""
+    """Return (K, 4) the pixels that capsules can cover: first column, first row, end column, end row.
+
+    Args:
+        camera: the camera.
+        ends: (K, 2, 3), m, its frame.
+        radius: (K,) m.
+    """
     corners = ends[:, :, None] + radius[:, None, None, None] * _CUBE
     size = np.array(camera.image_size_px)
     uv = camera.project(corners.reshape(-1, 3)).reshape(len(radius), 2 * len(_CUBE), 2)

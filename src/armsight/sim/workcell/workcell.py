@@ -84,11 +84,17 @@ _POSES_SIZE_M = (
 
 @dataclass(frozen=True, eq=False)
 class WorkcellTruth(Record):
-    """The true values of a workcell up to now, arm and cameras (covariance zero). No estimator gets them.
+    """The true values of a workcell up to now. No estimator gets them.
 
-    Poses (4, 4), m; at every millisecond t_s (N,), s, the angles (N, n), rad, of the links, behind backlash and twist,
-    ``q``, and of the gears' shafts, where the potentiometers sit; ``shot_t_s``: name of each shot handed out -> middle
-    of its left exposure, s.
+    Attributes:
+        arm: the true table.
+        rig: the true cameras; covariance zero.
+        T_base_rig: (4, 4) where the left camera is, m.
+        T_tool_body: (4, 4) where the body is on the tool, m.
+        t_s: (N,) every millisecond since the beginning, s.
+        q: (N, n) true joint angles, rad: of the links, behind backlash and twist.
+        shaft: (N, n) true angles of the gears' shafts, where the potentiometers sit, rad.
+        shot_t_s: name of each shot handed out -> middle of its left exposure, s.
     """
 
     arm: Arm

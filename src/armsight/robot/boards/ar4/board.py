@@ -142,7 +142,7 @@ class Ar4Board(PolledBoard):
         return self._count()
 
     def command(self, command: Command) -> int:
-        """Take the arm over, or reset the emergency stop, DeviceError while it is pressed; InputError for other commands."""
+        """Take the arm over, or reset the emergency stop, DeviceError while pressed; InputError for other commands."""
         if command in (Command.ENABLE, Command.ENABLE_INWARD):
             self._take_over()
         elif command is Command.CLEAR_STOP:
