@@ -60,28 +60,13 @@ def budget_report(found: RigBudget, alternatives: Sequence[Alternative] = (), ru
     )
     caption, title = "95 % of the errors in motion are within, mm.", "Error at 95 % over the volume, seen from above"
     sections: dict[str, Section] = {
-        "result": (
-            "Result",
-            [
-                Fact(said),
-                Fact(others),
-                table,
-                more,
-                *_compared(alternatives),
-                *beside,
-            ],
-        ),
+        "result": ("Result", [Fact(said), Fact(others), table, more, *_compared(alternatives), *beside]),
         "map": ("Over the volume", [Plot("volume", partial(_map, found.found), caption, title)]),
         "missing": ("Not in the budget", [Fact(f"not in the budget: {why}") for why in NOT_MODELLED]),
     }
-    notes = [
-        *(
-            [Note("note", "the run's cameras are not known: give --camera")]
-            if run and "camera" not in plan.named
-            else []
-        ),
-        Note("note", f"chosen: {_chosen(plan)}"),
-    ]
+    notes = [Note("note", f"chosen: {_chosen(plan)}")]
+    if run and "camera" not in plan.named:
+        notes.insert(0, Note("note", "the run's cameras are not known: give --camera"))
     headline = f"{plan.cameras.text}; {plan.baseline} apart, volume {plan.volume} at {plan.distance}"
     return Report("budget", "Before you buy", plan.volume, headline, sections, notes, values, "budget", _answer(found))
 
@@ -92,9 +77,8 @@ def to_build(found: RigBudget) -> dict[str, str]:
     if plan.rig:
         return {}
     rig = replace(plan.stereo_rig, cov=plan.conditions().cov_calibration, provenance=source)
-    return {"rig.json": rig.to_text()} | (
-        {} if plan.body else {"body.toml": body_text(plan.body_scale, plan.body_depth)}
-    )
+    body = {} if plan.body else {"body.toml": body_text(plan.body_scale, plan.body_depth)}
+    return {"rig.json": rig.to_text()} | body
 
 
 def _asked(plan: RigPlan) -> dict[str, Any]:
