@@ -2,7 +2,7 @@
 Dense stereo
 ============
 
-Render a box in front of a wall, match the pair of images, and compute the depth of every pixel.
+Render a tilted plate in front of a wall, match the pair of images, and compute the depth of every pixel.
 
 .. code-block:: console
 
@@ -11,29 +11,32 @@ Render a box in front of a wall, match the pair of images, and compute the depth
 
 import numpy as np
 
-from armsight.geometry.pose import inverse, pose
+from armsight.geometry.pose import pose
 from armsight.geometry.rotation import exp_so3
 from armsight.sim.example_rig import example_rig
-from armsight.sim.render.mesh import box, see, with_noise
+from armsight.sim.render.render import render_pair
+from armsight.sim.render.scene import Pattern, PosedBody
 from armsight.vision.dense import open_method
 from armsight.vision.dense.depth import depth_of
 from armsight.vision.dense.method import Search
 from armsight.vision.dense.rectified import match_pair
 
-BOX_M = np.array([0.20, 0.15, 0.12])
-T_TRUE = pose(exp_so3(np.array([0.5, 0.6, 0.2])), np.array([0.05, 0.0, 0.8]))
+PLATE = pose(exp_so3(np.array([0.5, 0.6, 0.2])), np.array([0.05, 0.0, 0.8]))
 WALL = pose(exp_so3(np.array([0.1, 0.1, 0.0])), np.array([0.1, 0.0, 1.4]))
+
+
+def printed(side_m: float, cell_m: float, T: np.ndarray, rng: np.random.Generator) -> PosedBody:
+    """Return a square at T (4, 4) in the left camera, m, printed with cells of random greys: matching needs texture."""
+    count = round(side_m / cell_m)
+    edges = (np.arange(count + 1) - count / 2) * cell_m
+    return PosedBody((Pattern(edges, edges, rng.integers(2, 18, (count, count)) / 20.0),), T)
 
 
 def main() -> np.ndarray:
     """Render and match; return the depth (H, W) in m, NaN where it was not measured."""
     rng, rig = np.random.default_rng(1), example_rig((480, 360), focal_px=480.0, baseline_m=0.12, convergence_deg=6.0)
-    thing = box(BOX_M, grain_m=0.02, seed=1)
-    wall = box(np.array([3.0, 3.0, 0.02]), grain_m=0.05, seed=2)
-    images = []
-    for camera, T in ((rig.left, np.eye(4)), (rig.right, inverse(rig.T_left_right))):
-        image, _, _ = see(camera, [(wall, T @ WALL), (thing, T @ T_TRUE)])
-        images.append(with_noise(image, 1.5, rng))
+    bodies = [printed(3.0, 0.012, WALL, rng), printed(0.25, 0.006, PLATE, rng)]
+    images = render_pair((rig.left, rig.right), rig.T_left_right, bodies, rng=rng)
     form = rig.rectify()
     search = Search(0, int(form.disparity_of(0.55)))
     result = match_pair(open_method("semiglobal"), *form.images(*images), search)

@@ -65,7 +65,7 @@ def dense(main, folder, capsys):
     ((share, sigma_mm, _),) = re.findall(r"measured (\d+)% .* ([\d.]+) mm at ([\d.]+) m", capsys.readouterr().out)
     assert int(share) > 80  # a strip of either side is in one image only
     assert 2.0 < float(sigma_mm) < 7.0  # 0.06 to 0.2 px at 1.4 m (f 480 px, baseline 0.12 m)
-    assert np.nanmin(depth_m) > 0.6  # the box before, the wall behind
+    assert np.nanmin(depth_m) > 0.6  # the plate before, the wall behind
     assert 1.2 < np.nanmax(depth_m) < 2.0
 
 
