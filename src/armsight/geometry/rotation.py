@@ -90,11 +90,16 @@ def from_euler_zyx(roll: float, pitch: float, yaw: float) -> Array:
 
 
 def euler_zyx(R: Array) -> tuple[Array, bool]:
-    """Split a rotation R_z(roll) R_y(pitch) R_x(yaw) into (3,) Euler angles about z, y, x, rad (18.16 with atan2).
+    """Split a rotation into Euler angles about z, y, x (18.16 with atan2).
 
-    docs/concepts/method.md calls them roll, pitch, yaw; in ROS roll is the one about x. Also return whether the pitch
-    is singular (+-90 degrees): then yaw is zero and roll carries what is determined, roll - yaw at +90 degrees, roll +
-    yaw at -90.
+    docs/concepts/method.md calls them roll, pitch, yaw; in ROS roll is the one about x.
+
+    Args:
+        R: (3, 3) rotation, R_z(roll) R_y(pitch) R_x(yaw).
+
+    Returns:
+        (3,) roll, pitch, yaw in rad, and whether the pitch is singular (+-90 degrees): then yaw is set to zero and roll
+        carries what is determined, roll - yaw at +90 degrees, roll + yaw at -90.
     """
     cos_pitch = float(np.hypot(R[0, 0], R[1, 0]))
     pitch = np.arctan2(-R[2, 0], cos_pitch)

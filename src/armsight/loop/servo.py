@@ -198,8 +198,11 @@ class PoseServo:
     ) -> Aim:
         """Return the reference of the next command.
 
-        ``t_s``: time since its start, on the clock of the estimator's newest reading, s. ``gravity``: returns the duty
-        (n,) that holds the arm against gravity at joint angles (n,), passed on.
+        Args:
+            motion: the motion under way; a next one must start where the last one ended.
+            t_s: time since its start, on the clock of the estimator's newest reading, s.
+            gravity: returns the duty (n,) that holds the arm against gravity at joint angles (n,), passed on.
+            rest_s: how long the arm rests after the motion, s, where that is known.
         """
         passed_s = t_s - self._last[1] if self._last is not None and self._last[0] is motion else 0.0
         self._last = motion, t_s

@@ -334,7 +334,17 @@ class SyncEstimate(Record):
 def estimate_sync(
     left: Brightness, right: Brightness, bit_s: float, *, near: SyncEstimate | None = None
 ) -> SyncEstimate | Missed:
-    """Estimate delay and skew by the LED's brightness in the same shots of two cameras; a miss names the camera."""
+    """Estimate delay and skew from the LED's brightness in the same shots of two cameras.
+
+    Args:
+        left: in the left images.
+        right: in the right ones, with the same stamps.
+        bit_s: how long each bit of the code lasts, s.
+        near: an earlier estimate.
+
+    Returns:
+        The estimate, or why there is none; the text begins with the camera.
+    """
     if not np.array_equal(left.stamp_s, right.stamp_s):
         raise InputError("both cameras' brightness must be of the same shots")
     found = []
@@ -380,6 +390,9 @@ _Batch: TypeAlias = list[tuple[float, tuple[Any, Any]]]
 
 class SyncLedWatch:
     """Finds the LED in the images of two cameras, and follows the cameras' clock by it.
+
+    Args:
+        bit_s: how long each bit of the LED's code lasts, s.
 
     Attributes:
         estimates: what it said, window by window.

@@ -33,7 +33,10 @@ BODY = Usual("size of the body", 2e-3, 20.0)  # half, double: likewise
 def fitting_unit(length_m: float, unit_m: float, usual: Usual) -> str | None:
     """Return the unit in which a length that cannot be one would be ordinary; None where it is, or none makes it so.
 
-    ``unit_m``: the unit that it was read in, m.
+    Args:
+        length_m: as it was read, m.
+        unit_m: the unit that it was read in, m.
+        usual: what it is of.
     """
     if usual.least_m <= length_m <= usual.most_m:
         return None

@@ -35,9 +35,15 @@ def join(left: Detections, right: Detections) -> Correspondences:
 
 
 def epipolar_distances(rig: StereoRig, uv_left: Array, uv_right: Array) -> Array:
-    """Return (N, 2) distances of points, raw pixels (N, 2), from the epipolar lines of their partners, undistorted px.
+    """Measure the distance of each point from the epipolar line of its partner.
 
-    In the left and in the right image; NaN where a pixel has no ray.
+    Args:
+        rig: the calibrated pair.
+        uv_left: (N, 2) raw pixels.
+        uv_right: (N, 2) raw pixels of the same points.
+
+    Returns:
+        (N, 2) distance in the left and in the right image, undistorted px; NaN where a pixel has no ray.
     """
     out = np.empty((len(uv_left), 2))
     focal = np.array([camera.intrinsics[:2] for camera in rig.cameras])

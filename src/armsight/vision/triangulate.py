@@ -26,9 +26,15 @@ _LOOKING = 0.99
 
 
 def midpoints(rig: StereoRig, uv_left: Array, uv_right: Array) -> Array:
-    """Return the points (N, 3), m, left frame, halfway between the rays of raw pixels uv_left, uv_right (N, 2).
+    """Return the points halfway between the two rays of each pair of raw pixels.
 
-    NaN where the rays are parallel or come closest behind a camera.
+    Args:
+        rig: the calibrated pair.
+        uv_left: (N, 2) raw pixels.
+        uv_right: (N, 2) raw pixels of the same points.
+
+    Returns:
+        (N, 3) points, m, left frame; NaN where the rays are parallel or come closest behind a camera.
     """
     p = np.empty((len(uv_left), 3))
     _between(rig.left.unproject(uv_left), rig.right.unproject(uv_right), np.array(rig.T_left_right), p)

@@ -58,6 +58,10 @@ class Mounting(Record):
         T_base_tool = T_base_rig T_rig_body T_tool_body^-1; with right tangents z of the first, b of the second and x of
         T_tool_body its own is Ad(T_tool_body) (Ad(T_rig_body^-1) z + b - x).
 
+        Args:
+            pose: where the body is in the rig.
+            t_s: the middle of the exposure as the camera stamps it, s.
+
         Raises:
             InputError: ``t_s`` is no number.
         """

@@ -46,7 +46,12 @@ class Interval(NamedTuple):
 
 
 def intervals(states: list[ErrorState], t_s: Array) -> list[Interval]:
-    """Return times (N,), rising, grouped by the measurements around them."""
+    """Return times (N,), rising, grouped by the measurements around them.
+
+    Args:
+        states: the filter's, oldest first.
+        t_s: the times, s.
+    """
     ends = [state for state in states if state.pose_measurement is not None]
     at, found = np.searchsorted([state.t_s for state in ends], t_s), list[Interval]()
     for k in np.unique(at).tolist():

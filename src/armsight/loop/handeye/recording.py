@@ -214,8 +214,10 @@ def paired(robot: PoseTable, seen: Seen, in_hand: bool, arm: Arm | None) -> Pair
 def upright(A: Array, B: Array, symmetries: Sequence[Array]) -> tuple[Array, Rows]:
     """Decide which way up a board was that looks the same rotated: angles between poses are the same on both sides.
 
-    ``B``: (N, 4, 4) poses of the body, some of them rotated by a symmetry. ``symmetries``: the motions of the body that
-    change nothing to see.
+    Args:
+        A: (N, 4, 4) poses of the flange.
+        B: (N, 4, 4) poses of the body, some of them rotated by a symmetry.
+        symmetries: the motions of the body that change nothing to see.
 
     Returns:
         B with the rotated ones rotated back to agree with the first, and which symmetry was used, -1 for none.

@@ -63,6 +63,10 @@ class ToolView(Record):
 
         Points appear nearer along the optical axis by that share of their depth; the body is fitted to them. With A the
         scatter of its points and a the axis, it rotates by -(tr A - A)^-1 (A a x a) about their mean.
+
+        Args:
+            R: (..., 3, 3) rotation of the tool in the base.
+            p: (..., 3) its position, m.
         """
         origin, axis, middle = self.T_base_rig[:3, 3], self.T_base_rig[:3, 2], self.points.mean(axis=0)
         A = (self.points - middle).T @ (self.points - middle)

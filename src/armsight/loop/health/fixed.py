@@ -67,7 +67,15 @@ class _Fitted(NamedTuple):
 
 
 class FixedWatch:
-    """Watches whether rig, body, potentiometers and clock stay as they are."""
+    """Watches whether rig, body, potentiometers and clock stay as they are.
+
+    Args:
+        joints: how many the arm has.
+
+    Attributes:
+        changes: the hypotheses of the test that found the clearest change, the best first; empty where none was found.
+        reopened: how many times the estimator dropped what it had learned, and when it first did, s.
+    """
 
     def __init__(self, joints: int) -> None:
         at = self._parts = layout(joints)

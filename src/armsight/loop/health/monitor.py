@@ -107,7 +107,12 @@ class HealthMonitor:
             self._cameras_s = min(begins, default=-np.inf) - TEST_S
 
     def measured(self, pose: PoseEstimate, t_s: float | None) -> PoseEstimate:
-        """Take a measured pose, in order of time (s, None without); return it with what is suspected in its covariance."""
+        """Take a measured pose, in order of time; return it with what is suspected added to its covariance.
+
+        Args:
+            pose: as it was measured.
+            t_s: time of its shot, s; None where it has none.
+        """
         self._take(pose, t_s)
         return self._widened(pose)
 

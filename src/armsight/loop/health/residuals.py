@@ -230,7 +230,10 @@ class ShotReader:
         return ShotResiduals(now_s, found, response, with_all, response_with_all, both)
 
     def linear_about(self, estimate: PoseEstimate) -> tuple[float, Array]:
-        """Return the size of the body over that of its file, and the pose (4, 4), about which residuals are linear."""
+        """Return the size of the body over that of its file, and the pose (4, 4), about which residuals are linear.
+
+        Those of the file and of the estimate, unless the triangulated points are of another size (Umeyama, 1991).
+        """
         p_body, p_left = self._p_body[estimate.points.ids], estimate.points.p_left
         middle_body, middle_left = p_body.mean(axis=0), p_left.mean(axis=0)
         from_body, from_left = p_body - middle_body, p_left - middle_left
@@ -492,7 +495,14 @@ class History:
         return self._reduced[onset]
 
     def dated(self, count: int, oldest_s: float | None = None) -> tuple[float, Onset]:
-        """Return the least that a change of the next parameters leaves, and when that began and ended."""
+        """Return the least that a change of the next parameters leaves, and when that began and ended.
+
+        The test before its beginning, which may be of both times, counts as noise.
+
+        Args:
+            count: of these parameters.
+            oldest_s: when it may have begun before all tests that are kept, s; before all tests if None.
+        """
         settled_s, tests, times_s = self._settled.begin_s, len(self.kept), [each.begin_s for each in self.kept]
         times_s.insert(0, settled_s if oldest_s is None or oldest_s >= times_s[0] else oldest_s)
         ages = np.geomspace(1.0, tests, _BEGINS).round().astype(int)

@@ -102,8 +102,13 @@ class Solution(Record):
 def linear_of(model: Model, x: Array, measured: Measured, phi: Array, free: Mask, prior: Array) -> Linear:
     """Return the residuals of poses near a vector by the free parameters, with noise of position and of rotation.
 
-    ``measured``: the poses. ``free``: (P,) what may be off. ``prior``: (P,) sigma about the nominal arm's values;
-    infinite where nothing is known.
+    Args:
+        model: the arm.
+        x: (P,) the vector.
+        measured: the poses.
+        phi: :meth:`Model.feature_values` of them.
+        free: (P,) what may be off.
+        prior: (P,) sigma about the nominal arm's values; infinite where nothing is known.
     """
     e, J = model.linearised(x, measured, phi)
     each = np.broadcast_to(np.eye(measured.size), (len(e), measured.size, measured.size))

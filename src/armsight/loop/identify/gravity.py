@@ -61,7 +61,11 @@ class ArmRests(Carrier):
         return other
 
     def zeros(self, cov: Array) -> tuple[Array, Array]:
-        """Return how far the joints (n,) are beyond their readings, rad, at the mean of the rests, and its covariance."""
+        """Return how far the joints (n,) are beyond their readings, rad, the mean of the rests, and its covariance (n, n).
+
+        That is the zero with what linearity and compliance add to it where the arm rested: a wave of the one cannot be
+        distinguished from the other there.
+        """
         n, at = self._at.joints, self._at
         each = np.empty((len(self._q), n, at.size))
         for q, by in zip(self._q, each, strict=True):

@@ -48,7 +48,12 @@ class Observed(NamedTuple):
 def observed(model: Model, x: Array, measured: Measured, prior: Array, noise: tuple[float, float]) -> Observed:
     """Find which parameters are observable from poses.
 
-    ``model``: the arm. ``prior``: (P,) prior sigmas; 0 freezes. ``noise``: sigmas of the instrument.
+    Args:
+        model: the arm.
+        x: (P,) base and tool estimated, the rest nominal.
+        measured: the poses.
+        prior: (P,) prior sigmas; 0 freezes.
+        noise: sigmas of the instrument.
     """
     T = _triangle(model, x, measured, prior, noise)
     preference = _preference(model, x)

@@ -31,7 +31,15 @@ MAX_ROTATION_RAD = 0.3
 
 
 class CheckPlan(NamedTuple):
-    """Poses to go to: names, T_base_tool (N, 4, 4), joint angles (N, n), rad, side and middle of the cube, base, m."""
+    """Poses to go to.
+
+    Attributes:
+        names: of the poses.
+        Ts_base_tool: (N, 4, 4).
+        q: (N, n) joint angles, rad.
+        side_m: of the cube.
+        centre: (3,) of the cube, base, m.
+    """
 
     names: tuple[str, ...]
     Ts_base_tool: Array

@@ -170,8 +170,11 @@ def _errors_of_means(groups: list[Array]) -> Array:
 def distance_metrics(from_m: Array, to_m: Array, commanded_m: float, cov: Array) -> tuple[Metric, Metric]:
     """Return AD and RD (7.3): error of the mean distance between two poses, and three deviations of it.
 
-    ``from_m``: (n, 3) positions attained at the first pose. ``to_m``: (n, 3) at the second, in the same cycles.
-    ``cov``: (n, 3, 3) covariance of either position by the instrument, m^2.
+    Args:
+        from_m: (n, 3) positions attained at the first pose.
+        to_m: (n, 3) at the second, in the same cycles.
+        commanded_m: distance of the commands, m.
+        cov: (n, 3, 3) covariance of either position by the instrument, m^2.
     """
     along = to_m - from_m
     d = np.linalg.norm(along, axis=1)

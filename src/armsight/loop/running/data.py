@@ -1,4 +1,7 @@
-"""What a running loop publishes: a record of a shot, of a batch of joint readings, of an event; and to whom."""
+"""What a running loop publishes: a record of a shot, of a batch of joint readings, of an event; and to whom.
+
+docs/reference/data.md lists the names of their JSON. Numbers are SI.
+"""
 
 from __future__ import annotations
 
@@ -129,7 +132,11 @@ class EventDatum:
 
 
 def quaternion(R: Array) -> tuple[float, float, float, float]:
-    """Return the quaternion w x y z of a rotation (3, 3), w not below zero."""
+    """Return the quaternion w x y z of a rotation (3, 3), w not below zero.
+
+    As :func:`~armsight.geometry.rotation.quaternion_wxyz` to the rounding, at a fiftieth of the time for a single one:
+    many are published a second. Shepperd, J. Guidance and Control 1(3), 1978: the largest of the four is found first.
+    """
     (a, b, c), (d, e, f), (g, h, i) = R.tolist()
     found = (
         (1 + a + e + i, h - f, c - g, d - b),

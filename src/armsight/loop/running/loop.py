@@ -74,7 +74,10 @@ def beside(work: Callable[[], _Result], meanwhile: Callable[[Callable[[], bool]]
 
 
 class Watch:
-    """Measures shots in a thread: a search of the whole image takes longer than the loop may pause."""
+    """Measures shots in a thread: a search of the whole image takes longer than the loop may pause.
+
+    :meth:`take` waits ``patience_s`` for a result, s; a later one is returned in the next iteration.
+    """
 
     def __init__(self, measure: Callable[[Shot], PoseEstimate | Missed], patience_s: float) -> None:
         self._measure, self._patience_s = measure, patience_s

@@ -50,6 +50,9 @@ class HostClock:
     arrives quickly restores it. How fast they drift is the slope of the line under all minima of the last ``_WINDOW_S``
     that is highest in their middle (Moon, Skelly and Towsley, "Estimation and removal of clock skew from network delay
     measurements", 1999), so that a host that is busy for seconds does not move the offset by as much as any clock drifts.
+
+    Args:
+        now: the host's clock, s; the one that stamps the images.
     """
 
     def __init__(self, now: Callable[[], float] = time.monotonic) -> None:

@@ -75,10 +75,20 @@ class Elasticity:
 def tuned_gains(
     motor: MotorFigures, supply_v: float, bandwidth_rad_s: float, damping: float = 0.7, pairs: float = _PAIRS
 ) -> Array:
-    """Return the gains (8,) of a joint by the rule above: kp, ki, kd, kv, ka, kf, derivative filter, anti-windup.
+    """Return the gains of a joint by the rule above.
 
-    ``bandwidth_rad_s`` and ``damping``, of critical, are of the slower pair of poles, ``pairs`` its frequency over the
-    faster one's. InputError: a number is not positive.
+    Args:
+        motor: its motor.
+        supply_v: nominal supply, V.
+        bandwidth_rad_s: natural frequency of the slower pair of poles, rad/s.
+        damping: of both pairs, of critical.
+        pairs: natural frequency of the slower pair over that of the faster one, 0 to 1.
+
+    Returns:
+        (8,) kp, ki, kd, kv, ka, kf, derivative filter, anti-windup.
+
+    Raises:
+        InputError: a number is not positive.
     """
     needed = {"supply_v": supply_v, "bandwidth_rad_s": bandwidth_rad_s, "damping": damping}
     needed |= {name: getattr(motor, name) for name in ("resistance_ohm", "constant_v_s", "inertia_kg_m2")}

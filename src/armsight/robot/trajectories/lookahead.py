@@ -38,9 +38,13 @@ NEWTON, REFINED = 3, 1e-10
 
 
 class Walk(NamedTuple):
-    """The joints along a path, as far as it can be travelled: angles q (K, n), rad, at shares (K,) of the way, from 0 on.
+    """The joints along a path, as far as it can be travelled.
 
-    ``q1`` and ``q2``, (K, n), are their derivatives by the share.
+    Attributes:
+        share: (K,) shares of the way, rising from 0.
+        q: (K, n) joint angles, rad.
+        q1: (K, 6) their derivative by the share, and ``q2`` the second.
+        q2: see ``q1``.
     """
 
     share: Array

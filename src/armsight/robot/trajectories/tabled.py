@@ -13,7 +13,11 @@ STEP_S = 0.004
 
 
 class Tabled:
-    """Another trajectory, looked up in a table."""
+    """Another trajectory, looked up. A trajectory.
+
+    Attributes:
+        duration_s: how long the motion takes, s.
+    """
 
     def __init__(self, motion: Trajectory) -> None:
         """Fill the table."""

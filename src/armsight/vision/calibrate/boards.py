@@ -195,7 +195,16 @@ class Trial(Record):
 
 @dataclass(frozen=True, eq=False)
 class LensModelSearch(Record):
-    """The choice of the distortion model by held-out error."""
+    """The choice of the distortion model by held-out error.
+
+    Attributes:
+        model: the board.
+        motion: first motion of the board between the exposures; None where it stands still.
+        screened: the detections to fit, and those to evaluate on.
+        folds: how many parts the pairs are split into.
+        sizes: image size of the left and of the right camera, px.
+        progress: called with a line about what is being done.
+    """
 
     model: BundleModel
     motion: ExposureMotion | None
@@ -611,14 +620,30 @@ def calibrate_recording(
     singles: Sequence[Pair] = (),
     progress: Progress = lambda message: None,
 ) -> Calibration:
-    """Calibrate two cameras that may expose at different times, from a recording of a board that moves, shots at t_s.
+    """Calibrate two cameras that may expose at different times, from a recording of a board that moves.
 
     Skew and cameras are estimated alternately (:mod:`armsight.vision.pose.shutter`), then every detection is moved to
-    the time of its left image, and the pairs are calibrated as simultaneous ones. Alternating leaves the sigma of the
-    skew at given cameras; with rho its correlation with them an error shrinks by rho^2 each round, so the sigma of both
-    is that over sqrt(1 - shrinkage).
-    Arguments, result and errors are those of :func:`calibrate_boards`, with the skew in the rig where there is one; a
-    note says so, or why it was not found. InputError: the times (N,), s, do not rise.
+    the time of its left image, and the pairs are calibrated as simultaneous ones. Alternating leaves the sigma of the skew
+    at given cameras; with rho its correlation with them an error shrinks by rho^2 each round, so the sigma of both is that
+    over sqrt(1 - shrinkage).
+
+    Args:
+        board: the board's drawing and its symmetries.
+        pairs: detections of every shot, in the order of their time.
+        t_s: (N,) times of the shots, s, rising.
+        sizes: image size of the left and of the right camera, px.
+        models: distortion models to choose from by held-out error.
+        flat: hold the board to its drawing.
+        folds: how many parts the pairs are split into for the held-out errors.
+        singles: detections of further images by one camera alone.
+        progress: called with a line about what is being done.
+
+    Returns:
+        As :func:`calibrate_boards`, with the skew in the rig where there is one; a note says so, or why it was not found.
+
+    Raises:
+        CalibrationError: fewer than three usable pairs, or views that do not determine the cameras.
+        InputError: the times do not rise.
     """
     seen = [pair for pair in pairs if min(len(pair.left.ids), len(pair.right.ids)) >= LEAST_CORNERS]
     if len(seen) < LEAST_PAIRS:

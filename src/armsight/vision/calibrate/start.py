@@ -71,10 +71,16 @@ def _apart(a: Array, b: Array, scale_m: float = 1.0) -> Array:
 
 
 def relative_poses(left: list[list[Array]], right: list[list[Array]], scale_m: float) -> list[Array]:
-    """Return a few T_left_right (4, 4) that most shots agree on, the widest agreement first; none without candidates.
+    """Return the relative poses of two cameras that most shots agree on.
 
-    ``left``, ``right``: candidate poses of the body of each shot; ``scale_m``: its distance, makes rotations and
-    translations comparable.
+    Args:
+        left: per shot, candidate poses T_left_body.
+        right: per shot, candidate poses T_right_body.
+        scale_m: typical distance of the body, m: makes rotations and translations comparable.
+
+    Returns:
+        A few different T_left_right (4, 4), the one with the widest agreement first; none where no shot has candidates
+        in both cameras.
     """
     each = [[Tl @ inverse(Tr) for Tl in ls for Tr in rs] for ls, rs in zip(left, right, strict=True)]
     each = [of_shot for of_shot in each if of_shot]

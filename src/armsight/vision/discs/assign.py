@@ -43,7 +43,15 @@ class Assigned(Record):
 def assign(
     rig: StereoRig, target: DiscTarget, T_left_body: Array, cov: Array, left: Discs, right: Discs
 ) -> Correspondences | Missed:
-    """Identify the discs of a body whose pose, covariance cov (6, 6) of its tangent, is known approximately.
+    """Identify the discs of a body whose pose is known approximately.
+
+    Args:
+        rig: the calibrated pair.
+        target: the discs.
+        T_left_body: (4, 4) approximate pose: predicted, or from its coded markers.
+        cov: (6, 6) covariance of its tangent.
+        left: the discs detected in the left image.
+        right: the discs detected in the right image.
 
     Returns:
         Ellipse centres by rows of the target's body; discs for which detections compete are dropped by name. Missed

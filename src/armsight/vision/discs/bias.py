@@ -288,9 +288,14 @@ def disc_bias(camera: Camera, T_camera_board: Array, points: Array, radius_m: fl
 
 
 def apparent_radii(camera: Camera, T_camera_board: Array, points: Array, shape: Array, about_m: float) -> Array:
-    """Return (N,) which radius, m, the ellipse of each disc of a board has according to its area, near about_m.
+    """Return (N,) which radius, m, the ellipse of each disc of a board has according to its area.
 
-    ``shape`` (N, 3): S11, S12, S22, px^2; ``points`` (N, 3) the middles, m, board frame, where discs face along z.
+    Args:
+        camera: the camera.
+        T_camera_board: (4, 4) pose of the board, whose discs face along z.
+        points: (N, 3) the discs' middles, m, board frame.
+        shape: (N, 3) S11, S12, S22 of the ellipses, px^2.
+        about_m: a radius of about the right size.
     """
     p = transform(T_camera_board, points)
     normals = np.tile(T_camera_board[:3, 2], (len(p), 1))
@@ -383,9 +388,16 @@ def expect(rig: StereoRig, target: DiscTarget, T_left_body: Array) -> Expected:
 def centred(rig: StereoRig, target: DiscTarget, T_left_body: Array, seen: Correspondences) -> Correspondences:
     """Convert centres of ellipses to images of the discs' centres: subtract the perspective bias.
 
-    An error of T_left_body, the pose that is estimated from the result, is none of the detections', for the bias
-    follows the estimate. The covariance has that of the bias as far as normals are not known. Detections whose disc
-    would have no image at the pose become NaN.
+    Args:
+        rig: the calibrated pair.
+        target: the discs; ``seen.ids`` are rows of its body.
+        T_left_body: (4, 4) pose of the body, the one that is estimated from the result: an error of it is none of the
+            detections', for the bias follows the estimate.
+        seen: centres of ellipses.
+
+    Returns:
+        The same correspondences less the bias, with the covariance of both, as far as the normals are not known.
+        Detections whose disc would have no image at the pose become NaN.
     """
     expected = expect(rig, target, T_left_body)
     cov = seen.cov_uv + expected.cov_bias[seen.ids]

@@ -31,9 +31,14 @@ _STEPS, _DONE = 12, 1e-4
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis(Record):
-    """A naming of detections, rows (M, 2), -1 where not seen, the pose that follows, and its covariance (6, 6).
+    """A naming of detections and the pose that follows.
 
-    ``seen``: ellipse centres by rows of the body; ``score``: logarithm of the Bayes factor against clutter.
+    Attributes:
+        rows: (M, 2) rows of the left and the right camera's discs, -1 where a disc was not seen.
+        T_left_body: (4, 4) the pose.
+        cov: (6, 6) covariance of its tangent, noise and calibration.
+        seen: ellipse centres by rows of the target's body.
+        score: logarithm of the Bayes factor against clutter.
     """
 
     rows: Ids
@@ -70,7 +75,17 @@ class _Fit(Record):
 
 
 def hypothesis(view: DiscView, pairs: Pairs, T_left_body: Array, rows: Ids) -> Hypothesis | str:
-    """Extend a naming of three discs or more, rows (M, 2), -1 elsewhere, to one of all discs, or why it is rejected."""
+    """Extend a few named detections to a hypothesis over all discs.
+
+    Args:
+        view: the discs that both cameras detected.
+        pairs: all pairs of discs that may be one disc of the body.
+        T_left_body: (4, 4) the approximate pose.
+        rows: (M, 2) detections of three discs or more, -1 elsewhere.
+
+    Returns:
+        The hypothesis, or the reason why it is rejected.
+    """
     fit = _fit(view, T_left_body, rows)
     if fit is None:
         return "no pose fits"

@@ -22,10 +22,15 @@ _LEVER = 3.0
 
 @dataclass(frozen=True, eq=False)
 class Symmetry(Record):
-    """One way to take discs in view, rows ``seen`` (V,), for others, ``taken_for`` (V,).
+    """One way to take discs for others.
 
-    T (4, 4) maps the former onto the latter; the body's mirror image in z = 0 where ``mirrored``. ``off_m``: largest
-    difference of two discs' distance from that of those they are taken for.
+    Attributes:
+        seen: (V,) the discs in view, rows of the body's points.
+        taken_for: (V,) what each may be taken for.
+        T: (4, 4) the motion that maps the former onto the latter, p_taken_for ~ T @ p_seen; of the body's mirror image
+            in z = 0 where ``mirrored``.
+        mirrored: whether it is a reflection.
+        off_m: largest difference of two discs' distance from that of the discs they are taken for, m.
     """
 
     seen: Ids

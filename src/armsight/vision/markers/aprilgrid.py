@@ -34,7 +34,15 @@ OFF_GRID = 0.2
 
 @dataclass(frozen=True, eq=False)
 class AprilGrid(Record, CalibrationBoard):
-    """A grid of ``columns`` x ``rows`` AprilTags of ``tag_m``, gaps ``spacing`` of a side, numbered from ``first`` on."""
+    """A grid of AprilTags.
+
+    Attributes:
+        columns: tags along x.
+        rows: tags along y.
+        tag_m: side of a tag, m.
+        spacing: gap between tags as a share of their side.
+        first: number of its first tag; the others follow.
+    """
 
     columns: int
     rows: int

@@ -37,9 +37,15 @@ _POSE_KEYS = ("position_mm", "normal", "x_axis", "quaternion_wxyz", "euler_zyx_d
 
 @dataclass(frozen=True, eq=False)
 class Marker(Record):
-    """One ``[[markers]]`` entry of a body file: ``fields`` are the table of its ``kind``, ``where`` is for messages.
+    """One ``[[markers]]`` entry of a body file.
 
-    ``position`` (3,) m, body frame; ``orientation`` is a subset of normal, x_axis, quaternion_wxyz, euler_zyx_deg.
+    Attributes:
+        where: file and entry, for messages.
+        name: its name.
+        kind: its kind, the key of its own table.
+        fields: its own table.
+        position: (3,) its position, m, body frame.
+        orientation: what the file gives of its orientation: a subset of normal, x_axis, quaternion_wxyz, euler_zyx_deg.
     """
 
     where: str
@@ -185,7 +191,16 @@ _OPPOSED = -0.5
 
 
 def check_discs(markers: Sequence[Marker], radii_m: Sequence[float]) -> None:
-    """Reject discs of radii ``radii_m`` that cannot all exist: a wrong unit, or two at one position (InputError)."""
+    """Reject discs of one body that cannot all exist.
+
+    Args:
+        markers: their entries in the body file.
+        radii_m: their radii, m.
+
+    Raises:
+        InputError: a radius or a distance that suggests a wrong unit, or two discs at one position; the message names
+            file and entry.
+    """
     positions = np.array([marker.position for marker in markers])
     away = np.linalg.norm(positions - positions[0], axis=1)
     for marker, radius, distance in zip(markers, radii_m, away, strict=True):

@@ -44,7 +44,13 @@ _ENDS = ((np.s_[0], np.s_[1]), (np.s_[-1], np.s_[-2]), (np.s_[:, 0], np.s_[:, 1]
 
 @dataclass(frozen=True, eq=False)
 class Chessboard(Record, CalibrationBoard):
-    """A chessboard; its points are the columns x rows inner corners, row by row."""
+    """A chessboard; its points are the inner corners, row by row.
+
+    Attributes:
+        columns: inner corners along x.
+        rows: inner corners along y.
+        square_m: side of a square, m.
+    """
 
     columns: int
     rows: int

@@ -277,7 +277,12 @@ class Fits(Record):
 
 
 def odd_sized(theta: Array, factor: float) -> NDArray[np.bool_]:
-    """(N,) whether a disc's area is off by more than ``factor`` from that of the others, linear over the image."""
+    """(N,) whether a disc's area is far from what the others' areas, linear over the image, let expect.
+
+    Args:
+        theta: (N, 10) discs of one grid.
+        factor: by which an area may be larger or smaller, beyond what is usual among them.
+    """
     area, uv = -0.5 * np.log(np.maximum(theta[:, 2] * theta[:, 4] - theta[:, 3] ** 2, 1e-300)), theta[:, :2]
     keep = np.ones(len(area), bool)
     basis = np.column_stack([np.ones(len(area)), (uv - uv.mean(axis=0)) / max(float(np.ptp(uv)), 1.0)])

@@ -186,7 +186,15 @@ def _beside(cell: Cell) -> list[Cell]:
 
 
 def extrapolated(cell: Cell, known: Mapping[Cell, complex]) -> tuple[complex, float] | None:
-    """Predict where a cell of a lattice is from positions u + iv, px, of cells nearby, and the step there, px."""
+    """Predict where a cell of a lattice is from the positions of cells nearby.
+
+    Args:
+        cell: the cell.
+        known: positions u + iv, px, of cells.
+
+    Returns:
+        The position, px, and the step from its neighbours, px; None where nothing beside it is known.
+    """
     x, y = cell
     guesses: list[complex] = []
     steps: list[float] = []
@@ -356,6 +364,11 @@ def shown_size(cells: Ids, *, staggered: bool, like: tuple[int, int]) -> tuple[i
     Outer lines that lack more than a tenth of the discs of the next ones (in a staggered grid the next but one) are not of
     the grid.
 
+    Args:
+        cells: (N, 2) the lattice's cells.
+        staggered: whether the lattice lies diagonally in the grid.
+        like: columns and rows of the board.
+
     Returns:
         None where the lattice fills no grid.
     """
@@ -385,7 +398,16 @@ def positions(cells: Ids, uv: Array) -> dict[Cell, complex]:
 
 
 def expected(cells: Ids, theta: Array, size_px: tuple[int, int]) -> tuple[Ids, Array]:
-    """Predict discs next to those, theta (N, 10), of a lattice's cells (N, 2) in the image: (K, 2) cells, (K, 2) px."""
+    """Predict where discs next to those of a lattice would be, as far as they would be in the image.
+
+    Args:
+        cells: (N, 2) the lattice's cells.
+        theta: (N, 10) its discs.
+        size_px: width and height of the image.
+
+    Returns:
+        (K, 2) further cells; (K, 2) where they would be, px.
+    """
     seen = positions(cells, theta[:, :2])
     radius_px = float(np.median(theta[:, 2] * theta[:, 4] - theta[:, 3] ** 2) ** -0.25)
     known, front = dict(seen), set(seen)

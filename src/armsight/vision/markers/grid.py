@@ -20,7 +20,9 @@ def grid_points(columns: int, rows: int, pitch_m: float) -> Array:
 def rotations(points: Array) -> tuple[tuple[int, Ids], ...]:
     """Find the rotations by 90, 180 and 270 degrees in the plane that map a set of points (M, 3) onto itself.
 
-    Each is a multiple of 90 degrees and a permutation (M,): point i moves to where point perm[i] was.
+    Returns:
+        Pairs of the multiple of 90 degrees (1, 2, 3) and the permutation (M,): point i moves to where point perm[i]
+        was.
     """
     p = points[:, :2] - 0.5 * (points[:, :2].min(axis=0) + points[:, :2].max(axis=0))
     rows, squares = np.empty(len(p), np.int64), np.empty(len(p))

@@ -50,10 +50,18 @@ def instances(
     shot: SeenShot,
     found: tuple[list[Candidate], list[Candidate]],
 ) -> list[tuple[Array, Correspondences]]:
-    """Find the bodies of points (M, 3), m, in one shot: T_left_body (4, 4) and the correspondences of each.
+    """Find the bodies in one shot.
 
-    The one with most detections comes first; no detection is used twice. ``found`` are the poses that each camera alone
-    allows, from :func:`candidates`.
+    Args:
+        points: (M, 3) points of the body, m.
+        cameras: left and right.
+        T_left_right: (4, 4) their relative pose.
+        shot: the detections of both cameras.
+        found: the poses that each camera alone allows, from :func:`candidates`.
+
+    Returns:
+        T_left_body (4, 4) and the correspondences of every body, the one with most detections first; no detection is
+        used twice.
     """
     starts = [c.T_camera_body for c in found[0]] + [T_left_right @ c.T_camera_body for c in found[1]]
     poses = [_polished(points, cameras, T_left_right, shot, T) for T in starts]

@@ -107,10 +107,15 @@ _SOUND = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Arrow(Record):
-    """Normal equations of Q shared parameters and K own ones of each of S shots, ``cost`` being minimised.
+    """Normal equations of Q shared parameters and K own ones of each of S shots.
 
-    Information of the shared parameters H_shared (Q, Q), of every shot's own H_shots (S, K, K), of both H_cross (S, K,
-    Q); downhill gradients g_shared (Q,), g_shots (S, K).
+    Attributes:
+        H_shared: (Q, Q) information of the shared parameters.
+        H_cross: (S, K, Q) what couples them with every shot's own.
+        H_shots: (S, K, K) information of every shot's own parameters.
+        g_shared: (Q,) downhill gradient.
+        g_shots: (S, K) downhill gradient.
+        cost: what is minimised.
     """
 
     H_shared: Array

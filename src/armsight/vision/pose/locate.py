@@ -41,9 +41,15 @@ _MISFIT_QUANTILE = 0.999
 def implausible(
     rig: StereoRig, body: Body, points: Points, fit: PoseFit, used: PixelObservations, rigid: Array
 ) -> str | None:
-    """Return the reason why a fit to ``used`` observations is not a plausible measurement of the body, or None.
+    """Return the reason why a fit is not a plausible measurement of the body, or None.
 
-    ``points`` are three or more, not all on one line; ``rigid`` (4, 4) is T_left_body of the rigid fit to all of them.
+    Args:
+        rig: the calibrated pair.
+        body: the body's points, m.
+        points: triangulated points, three or more, not all on one line.
+        fit: the pose's plain fit.
+        used: the observations that were fitted, all of the points' or fewer.
+        rigid: (4, 4) T_left_body of the rigid fit to all points.
     """
     everything = len(used.point) == np.count_nonzero(points.seen.seen)
     count = np.bincount(used.point, minlength=len(body.points))

@@ -60,7 +60,13 @@ def _poses(rotations: Sequence[NDArray[Any]], translations: Sequence[NDArray[Any
 
 @dataclass(frozen=True, eq=False)
 class Candidate(Record):
-    """A pose T_camera_body that some of one camera's detections, ``rows`` (K,), each of another point, agree on."""
+    """A pose that some of one camera's detections agree on.
+
+    Attributes:
+        T_camera_body: (4, 4) the pose.
+        rows: (K,) the detections that agree, each of another point.
+        rms_px: their RMS distance from the projections.
+    """
 
     T_camera_body: Array
     rows: Ids

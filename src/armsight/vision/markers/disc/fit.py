@@ -546,8 +546,16 @@ def slope_inside(n: int, theta: Array, x0: float, y0: float, variance: float, wo
     """Estimate a gradient inside the disc beside the ten unknowns, and what it would do to the centre.
 
     One step of the twelve unknowns, in which the model is nearly linear (Schur complement of the two that are new).
-    ``work.shown`` is filled from 3 on: the gradient over the disc's level, 1/px (2); its information, px^2, as elements
-    00, 01, 11 (3); by how much the fitted centre is off for each of it, px^2 (2, 2). Without information: zeros.
+    ``work.shown`` is filled from 3 on: the gradient over the disc's level, 1/px (2); its information, px^2, as
+    elements 00, 01, 11 (3); by how much the fitted centre is off for each of it, px^2 (2, 2). Without information: zeros.
+
+    Args:
+        n: pixels.
+        theta: (10,) the converged parameters.
+        x0: the pixels' origin.
+        y0: see x0.
+        variance: of the noise, as the residuals have it.
+        work: the pixels, linearised, with the last step in ``work.x``.
     """
     g, L, scale, x, out, shown = work.g, work.L, work.scale, work.x, work.products, work.shown
     _inside_products(n, F(theta[0] - x0), F(theta[1] - y0), work, out)
@@ -643,6 +651,11 @@ def levelled(theta: Array, variance: float, work: FitBuffers) -> None:
     Centre and gradient have errors in common, V_cg: the centre of the eight other unknowns alone is c - V_cg V_gg^-1 g.
     ``work.shown`` is filled from LEVELLED on: chi-square of g in the noise's variance; V_cg V_gg^-1 g, px (2); by how much
     the centre's covariance falls, V_cg V_gg^-1 V_gc, px^2, as elements 00, 01, 11 (3).
+
+    Args:
+        theta: (10,) the converged parameters.
+        variance: of the noise, grey levels^2.
+        work: buffers, with the factor of the normal matrix.
     """
     g, L, scale, x, out = work.g, work.L, work.scale, work.x, work.shown[LEVELLED:]
     # The last corner of the factor is that of the last two unknowns' information, the others marginalised.
