@@ -280,3 +280,15 @@ def test_a_kind_before_the_port_and_a_space_in_a_name_are_understood(armsight, t
     assert armsight("setup", "six_r", "--source", "usb:a b,c", "--board", "serial:/dev/ttyUSB9").code == 0
     ran = next(each for each in came if each.startswith("run "))
     assert "--source usb:a b,c --board serial:/dev/ttyUSB9 " in ran
+
+
+def test_a_run_that_did_not_end_is_set_aside(armsight, typed, person, folder):
+    typed[1]["run"] = 2
+    armsight("setup", "six_r", "--source", "usb:3,1", "--board", "/dev/ttyUSB9")
+    (folder / "run").mkdir()
+    (folder / "run" / "summary.json").write_text("{}")
+    (folder / "run-1").mkdir()
+    said = armsight("setup", "six_r")
+    assert "renamed: run of an earlier try is run-2" in said.err + said.out
+    assert (folder / "run-2" / "summary.json").exists()
+    assert not (folder / "run").exists()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import shlex
 import sys
@@ -114,6 +115,8 @@ class SetupWalk:
                 return 0
             row["state"] = "left out"
             if possible and not answer.lower().startswith("s"):
+                if step.command.startswith("run "):
+                    _set_aside(Path("run"), say)
                 code = run(shlex.split(self.typed(step)))
                 if code and not (step.endless and code == INTERRUPTED):
                     row |= {"state": "failed", "exit_code": code}
@@ -141,6 +144,13 @@ def words_of(cameras: str | None, board: str | None) -> dict[str, str]:
     kind = next((kind for kind in finding.KINDS if (board or "").startswith(kind)), "")
     given = {CAMERAS: cameras, PORT: board and board.removeprefix(kind)}
     return {word: shlex.quote(here) for word, here in given.items() if here is not None}
+
+
+def _set_aside(folder: Path, say: Callable[[str], None]) -> None:
+    """Rename the folder of a run that did not end: `armsight run` writes over none of a real arm's."""
+    if folder.exists():
+        name = next(name for n in itertools.count(1) if not (name := Path(f"{folder}-{n}")).exists())
+        say(f"renamed: {folder} of an earlier try is {folder.rename(name)}")
 
 
 def _asked(question: str) -> str:
