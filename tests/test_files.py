@@ -388,5 +388,11 @@ def test_a_folder_that_another_process_is_just_removing_is_in_use(tmp_path, monk
 
 
 def test_the_nearest_of_many_names_also_where_one_is_a_number():
-    assert nearest("3", [f"n{k}" for k in range(99)] + ["3"]).startswith("3, ")
-    assert nearest(3, [f"n{k}" for k in range(99)] + ["3"]).startswith("3, ")
+    assert nearest("3", [f"n{k}" for k in range(99)] + ["3"]) == "3 and 99 more"
+    assert nearest(3, [f"n{k}" for k in range(99)] + ["3"]) == "3 and 99 more"
+
+
+def test_names_that_are_not_near_are_listed_in_their_order():
+    head = ["temp", *(f"j{k}" for k in range(1, 7)), "px", "py", "pz", "a", "b", "c", "u", "v"]
+    assert nearest("x_m", head) == ", ".join(head)
+    assert nearest("x_m", [*head, "w"]) == f"{', '.join(head)} and 1 more"

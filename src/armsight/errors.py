@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from difflib import get_close_matches
 
-#: Names that a message lists; of more, those that are spelt most alike. Half: a joint's six columns are not all shown;
-#: double: lines of 300 characters.
-_LISTED = 10
+#: Names that a message lists, in their order; of more, those near what was given, _NEAR at most. Half: the columns of a
+#: table of poses are not all shown; double: lines of 300 characters.
+_LISTED, _NEAR = 15, 5
 
 
 class ArmsightError(Exception):
@@ -37,9 +37,10 @@ def require(call: str, name: str, value: object, fits: bool, expected: str) -> N
 
 
 def nearest(name: object, known: Iterable[str]) -> str:
-    """Return the known names as text; of many those nearest to an unknown one, and how many more there are."""
-    names = list(known)
+    """Return the known names as text: of many those that begin so or are spelt alike, else the first; how many more."""
+    names, text = list(known), str(name)
     if len(names) <= _LISTED:
         return ", ".join(names) or "none"
-    near = get_close_matches(str(name), names, _LISTED // 2, 0.0)
-    return f"{', '.join(near)} and {len(names) - len(near)} more"
+    near = [each for each in names if text and each.startswith(text)][:_NEAR] or get_close_matches(text, names, _NEAR)
+    listed = near or names[:_LISTED]
+    return f"{', '.join(listed)} and {len(names) - len(listed)} more"

@@ -1,5 +1,7 @@
 """Columns of a CSV by their names, and the names that ``--columns`` gives them."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -18,9 +20,11 @@ def test_columns_are_read_under_other_names(tmp_path):
     assert read_columns(None, ("a",)) == {}
     with pytest.raises(InputError, match=r"table\.csv: line 1: no column 'J3' for q2_rad; there are J1, J2, x_m, X"):
         Columns.of_csv(path, {"q2_rad": "J3"})
-    known = [f"q{k}_{unit}" for k in range(1, 8) for unit in ("rad", "deg")]
-    with pytest.raises(InputError, match=r"'q3_grad'; known are q3_rad, [^,]+, [^,]+, [^,]+, \S+ and 9 more$"):
+    known = [f"q{k}_{unit}" for k in range(1, 9) for unit in ("rad", "deg")]
+    with pytest.raises(InputError, match=r"'q3_grad'; known are q3_rad, [^,]+, [^,]+, [^,]+, \S+ and 11 more$"):
         read_columns("q3_grad=J3", known)
+    with pytest.raises(InputError, match=r"'q3'; known are q3_rad, q3_deg and 14 more$"):
+        read_columns("q3=J3", known)
     for text, said in (
         ("q1_rad", "expected NAME=COLUMN"),
         ("q9=J9", "unknown name 'q9'; known are q1_rad"),
@@ -29,6 +33,24 @@ def test_columns_are_read_under_other_names(tmp_path):
     ):
         with pytest.raises(InputError, match=f"--columns {text}: .*{said}"):
             read_columns(text, ("q1_rad", "x_m"))
+
+
+def test_a_mapping_or_parts_rename_as_the_text_does():
+    known = ("q1_rad", "x_m")
+    for given in ({"q1_rad": "J, 1", "x_m": "X"}, ["q1_rad=J, 1", "x_m=X"]):
+        assert read_columns(given, known) == {"q1_rad": "J, 1", "x_m": "X"}
+    assert read_columns({}, known) == {}
+    assert read_columns(["x_m", "_"], known) == ["x_m", ""]
+    with pytest.raises(InputError, match="columns is a int; expected NAMES to COLUMNS"):
+        read_columns(3, known)
+
+
+def test_a_column_of_points_is_no_misspelt_joint(tmp_path):
+    path, five = tmp_path / "only5.csv", ",".join(f"q{k}_rad" for k in range(1, 6))
+    for column, said in (("p1_x_mm", "column q6_rad is missing"), ("q6", "column 'q6' is not known: is it q6_rad?")):
+        path.write_text(f"{five},p2_y_mm,{column}\n1,2,3,4,5,6,7\n")
+        with pytest.raises(InputError, match=rf"5 joints \(q1_rad..q5_rad\); ur10 has 6; {re.escape(said)}$"):
+            Columns.of_csv(path).joint_names(6, "ur10")
 
 
 def test_cells_that_are_empty_and_lines_that_end_early(tmp_path):

@@ -16,6 +16,7 @@ from armsight.tables.nested import BY_COUNT, PACKED, document_rows, is_document,
 from armsight.tables.programs import program_rows
 
 Rows = Sequence[tuple[int, list[str]]]
+Renames = str | Mapping[str, str] | Sequence[str]  # what ``--columns`` may be
 #: A number with its unit.
 _WITH_UNIT = re.compile(rf"({NUMBER}|{DECIMAL_COMMA.pattern})\s*(mm|m|deg|\N{{DEGREE SIGN}}|rad|s)")
 _LIST = re.compile(r"\[([^\[\]{}\"]*)\],?")  # a list alone in its line
@@ -72,11 +73,22 @@ def said_columns(text: str | None, known: Collection[str] = ("units", "rotation"
     return Said(columns, said.get("units"), "detect" in said, said.get("rotation"), said.get("frames"))
 
 
-def read_columns(text: str | None, known: Collection[str]) -> Mapping[str, str] | list[str]:
-    """Read the option ``--columns``: NAME=THEIRS,... or the names of all columns in order, _ for one that is not used.
+def column_parts(given: Renames | None) -> list[str]:
+    """Return the parts of ``--columns``, NAME=THEIRS or a name each; InputError where it is neither text nor names."""
+    if given is None or isinstance(given, str):
+        return [] if given is None else given.split(",")
+    if isinstance(given, Mapping):
+        return [f"{name}={theirs}" for name, theirs in given.items()]
+    if not isinstance(given, Sequence) or not all(isinstance(each, str) for each in given):
+        raise InputError(f"columns is a {type(given).__name__}; expected NAMES to COLUMNS, such as {{'x_mm': 'X'}}")
+    return list(given)
+
+
+def read_columns(given: Renames | None, known: Collection[str]) -> Mapping[str, str] | list[str]:
+    """Read ``--columns``: what each name is in the file, or the names of all columns in order, _ for one not used.
 
     Args:
-        text: its value; None where it is not given.
+        given: NAME=THEIRS,... or NAME,... as text, a mapping of NAME to THEIRS, or the parts of such a text; None: nothing.
         known: the names that the command looks for.
 
     Returns:
@@ -86,7 +98,8 @@ def read_columns(text: str | None, known: Collection[str]) -> Mapping[str, str] 
         InputError: no such form, an unknown name, or one given twice.
     """
     columns: dict[str, str] = {}
-    parts = [] if text is None else [part.strip() for part in text.split(",")]
+    parts = [part.strip() for part in column_parts(given)]
+    text = ",".join(parts)
     in_order = len(parts) > 1 and not any("=" in part for part in parts)
     for part in parts:
         name, equals, theirs = (piece.strip() for piece in part.partition("="))

@@ -319,13 +319,13 @@ class Columns:
     def _near(self, names: list[str], count: int) -> str:
         if len(names) == count + 1:
             return "; is the last one a gripper? remove its column"
-        unknown = next((name for name in self.at if name and name not in COLUMNS), None)
-        if unknown is None:
-            gone = {f"q{k}" for k in range(1, count + 1)} - {name[:2] for name in names}
-            return f"; column {min(gone)}{names[0][2:]} is missing" if gone else ""
-        known = [*self.links, *(f"{name}_joint" for name in self.links), *COLUMNS]
-        near = get_close_matches(unknown, known, 1)
-        return f"; column {unknown!r} is not known" + (f": is it {near[0]}?" if near else "")
+        joints = [name for name in COLUMNS if _JOINT.fullmatch(name) and name[-3:] == names[0][-3:]]
+        known = [*self.links, *(f"{name}_joint" for name in self.links), *joints]
+        for unknown in (name for name in self.at if name and name not in COLUMNS):
+            if near := get_close_matches(unknown, known, 1, 0.5):  # q6 is half of what q6_rad and it have
+                return f"; column {unknown!r} is not known: is it {near[0]}?"
+        gone = {f"q{k}" for k in range(1, count + 1)} - {name[:2] for name in names}
+        return f"; column {min(gone)}{names[0][2:]} is missing" if gone else ""
 
     def joints(self, names: Sequence[str], *, gaps: bool = False) -> Array:
         """Return joint angles (N, J), rad."""
@@ -393,7 +393,7 @@ class Columns:
         if unit is None and "n1" not in self.at:
             raise InputError(
                 f"{self.path}: line 1: no rotation: qw qx qy qz, rx_deg ry_deg rz_deg, or r11 .. r33 are needed; there are "
-                f"{', '.join(list(self.at)[:10])}"
+                f"{nearest('qw', self.at)}"
             )
         found = self.numbers(names)
         convention = rotation or ("rotvec" if unit == "_rad" else None)

@@ -22,7 +22,7 @@ from armsight.data import Array, Record
 from armsight.errors import InputError, nearest
 from armsight.files import columns_unused
 from armsight.geometry.pose import pose
-from armsight.tables.cells import Cells, Rows, read_cells, read_columns
+from armsight.tables.cells import Cells, Renames, Rows, read_cells, read_columns
 from armsight.tables.columns import COLUMNS, Columns, degree_columns, is_unitless, understood
 from armsight.tables.lengths import REACH, UNITS_M
 from armsight.tables.rotations import CONVENTIONS
@@ -80,7 +80,7 @@ def read_pose_table(
     rotation: str | None = None,
     unit: str | None = None,
     detect_units: bool = False,
-    columns: str | None = None,
+    columns: Renames | None = None,
     arm: ArmJoints | None = None,
     only_joints: bool = False,
     side: str = "robot",
@@ -92,7 +92,7 @@ def read_pose_table(
         rotation: one of CONVENTIONS; None: what the columns' names say.
         unit: "m" or "mm" for lengths whose columns do not name one; None: m.
         detect_units: whether lengths that cannot be metres are taken for millimetres, with a note.
-        columns: NAME=THEIRS,... with names of COLUMNS, or the names of all columns in their order.
+        columns: a mapping of names of COLUMNS to the file's, as text NAME=THEIRS,... or the names of all in their order.
         arm: the model whose joints the table has.
         only_joints: whether positions are passed over: the poses are then those of the joints.
         side: "robot" or "seen": whose poses are read where a file holds both.
@@ -136,7 +136,7 @@ def read_pose_table(
 
 
 def _table(
-    path: Path, rotation: str | None, unit: str | None, columns: str | None, arm: ArmJoints | None, side: str
+    path: Path, rotation: str | None, unit: str | None, columns: Renames | None, arm: ArmJoints | None, side: str
 ) -> tuple[Columns, str | None, tuple[str, ...], tuple[str, ...]]:
     """Return the columns of a file, the convention of its rotations, notes, and why rows of it have no pose."""
     if rotation is not None and rotation not in CONVENTIONS:

@@ -209,6 +209,10 @@ def test_an_identified_arm_gives_the_correction(tmp_path):
     assert further_of("six_r", nominal) == pytest.approx(np.zeros(6))
     with pytest.raises(InputError, match="are different arms"):
         further_of(str(path), replace(nominal, direction=-nominal.direction))
+    further_of(str(path), replace(nominal, name="the_urdf"))
+    other = replace(nominal, name="ur10", a=nominal.a + 0.1)
+    with pytest.raises(InputError, match=r"corrected\.toml is of six_r, not ur10: give --arm"):
+        further_of(str(path), other)
 
 
 AR4 = """# measured in May

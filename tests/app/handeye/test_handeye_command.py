@@ -195,7 +195,7 @@ def test_people_read_sigma_whose_error_blunders_and_a_plan_and_get_a_page(armsig
     B[7] = B[7] @ exp_se3(np.array([0.05, 0, 0, 0.3, 0, 0]))
     robot, seen = matrices(tmp_path / "robot.txt", A), matrices(tmp_path / "seen.txt", B)
     said = armsight(
-        "handeye", "--robot", robot, "--seen", seen, "--eye", "in-hand", "--plan", 2, "-o", tmp_path / "out"
+        "handeye", "--robot", robot, "--seen", seen, "--eye", "in_hand", "--plan", 2, "-o", tmp_path / "out"
     )
     assert said.code == 0, said.err
     assert "T_flange_rig" in said.out

@@ -27,7 +27,8 @@ def test_the_covariance_holds_the_error_and_blunders_are_left_out(eye):
 def test_without_noise_the_answer_is_exact(eye):
     A, _, _, Z, X = recording(3, eye)
     B = inverse(Z) @ A @ X if eye == "to_hand" else inverse(A @ X) @ Z
-    h = calibrate_handeye(A, B, eye=eye)
+    h = calibrate_handeye(A, B, eye=eye.replace("_", "-"))  # as the command has it
+    assert h.eye == eye
     assert np.abs(error(h, Z, X)).max() < 1e-9
     assert h.held_out.most()[0] < 1e-9
     assert np.abs(h.predict(A) - B).max() < 1e-9

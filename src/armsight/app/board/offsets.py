@@ -42,6 +42,9 @@ from armsight.robot.kinematics.arm import Arm
 
 #: Zeros of joints that home, or have a potentiometer, are off by a few degrees; more looks like a mistake, degrees.
 USUAL_CHANGE_DEG = 10.0
+#: Tables of one arm under two names, such as its URDF's, differ by less, m and rad. Half: an arm without nominal table that
+#: is off by 6 mm counts as another; double: a UR3 and its UR3e count as one.
+_SAME = 0.01
 #: A line of a joint_offsets file of ar4_ros_driver.
 _AR4_LINE = re.compile(r"(?m)^(?P<head>joint_(?P<joint>[1-6])[ \t]*:[ \t]*)(?P<value>[+-]?\d+(?:\.\d*)?)")
 
@@ -58,6 +61,9 @@ def further_of(identified: str, nominal: Arm) -> Array:
         arm, zeros = open_arm(identified), None
     if len(arm.a) != len(nominal.a) or not np.array_equal(arm.direction, nominal.direction):
         raise InputError(f"{arm.name} and {nominal.name} are different arms: other joints, or other directions")
+    same = all(np.allclose(getattr(arm, k), getattr(nominal, k), atol=_SAME) for k in ("a", "d", "alpha"))
+    if arm.name != nominal.name and not same:
+        raise InputError(f"{identified} is of {arm.name}, not {nominal.name}: give --arm as in identify")
     further = (arm.offset - nominal.offset) * nominal.direction if zeros is None else zeros
     return np.asarray((further + np.pi) % (2 * np.pi) - np.pi)
 

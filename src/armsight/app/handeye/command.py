@@ -54,7 +54,9 @@ class Options:
 @click.option(
     "--eye",
     required=True,
-    type=click.Choice(["in-hand", "to-hand"]),
+    type=click.Choice(["in-hand", "to-hand", "in_hand", "to_hand"]),
+    metavar="in-hand|to-hand",
+    callback=lambda context, option, eye: eye.replace("_", "-"),
     help="Does the arm carry the camera, or the target?",
 )
 @click.option("--model", metavar="ARM", help="The arm whose joints the table has: a name, a .toml or a .urdf file.")

@@ -13,7 +13,7 @@ Kronecker product", J. Mechanisms Robotics 5(3), 2013).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -159,7 +159,7 @@ def _scores(A: Array, B: Array, Xs: Array, Zs: Array) -> Array:
     return np.asarray(np.quantile(sizes, MIDDLE, axis=1))
 
 
-Eye = Literal["to_hand", "in_hand"]
+Eye = Literal["to_hand", "in_hand", "to-hand", "in-hand"]
 MIN_POSES = 4  # fewest poses: three determine both transforms, and what is left out must leave three
 
 
@@ -192,14 +192,20 @@ class HeldOut(Record):
         return float(np.nanmax(self.position_m)), float(np.nanmax(self.angle_rad))
 
 
+def is_in_hand(eye: Eye) -> bool:
+    """Return whether the rig is on the flange; InputError where it is neither that nor to hand."""
+    if eye not in get_args(Eye):
+        raise InputError(f"eye is {eye!r}; known are to_hand, in_hand")
+    return eye in ("in_hand", "in-hand")
+
+
 def checked_poses(A: ArrayLike, B: ArrayLike, covs: ArrayLike | None, eye: Eye, centre: ArrayLike) -> Poses:
     """Return poses as given, checked.
 
     Raises:
         InputError: wrong shapes, NaN, no rigid motions, an unknown eye.
     """
-    if eye not in ("to_hand", "in_hand"):
-        raise InputError(f"eye is {eye!r}; known are to_hand, in_hand")
+    in_hand = is_in_hand(eye)
     Ts_base_flange = checked(A, (None, 4, 4), "Ts_base_flange")
     Ts_rig_body = checked(B, (len(Ts_base_flange), 4, 4), "Ts_rig_body")
     for name, Ts in (("Ts_base_flange", Ts_base_flange), ("Ts_rig_body", Ts_rig_body)):
@@ -219,4 +225,4 @@ def checked_poses(A: ArrayLike, B: ArrayLike, covs: ArrayLike | None, eye: Eye, 
         )
     shape = (len(Ts_base_flange), 6, 6)
     cov = np.zeros(shape) if covs is None else checked(covs, shape, "covs")
-    return Poses(Ts_base_flange, Ts_rig_body, cov, eye == "in_hand", checked(centre, (3,), "centre"))
+    return Poses(Ts_base_flange, Ts_rig_body, cov, in_hand, checked(centre, (3,), "centre"))

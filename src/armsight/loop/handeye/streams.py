@@ -20,7 +20,7 @@ from armsight.geometry.check import checked
 from armsight.geometry.pose import inverse, log_se3
 from armsight.geometry.rotation import log_so3
 from armsight.loop.handeye.handeye import HandEye, calibrate_poses
-from armsight.loop.handeye.poses import Eye, Poses
+from armsight.loop.handeye.poses import Eye, Poses, is_in_hand
 from armsight.vision.sources.bag.states import PoseTrack
 
 MAX_POSES = 600  # poses used at most for the fit, spread evenly: a stream's neighbours say the same
@@ -114,7 +114,7 @@ def calibrate_streams(
         if good.sum() < 20:
             raise CalibrationError(f"the streams overlap in {int(good.sum())} poses only; 20 and more are needed")
         poses = Poses(
-            A[good], B[good], np.zeros((int(good.sum()), 6, 6)), eye == "in_hand", np.asarray(centre, dtype=float)
+            A[good], B[good], np.zeros((int(good.sum()), 6, 6)), is_in_hand(eye), np.asarray(centre, dtype=float)
         )
         speed = log_se3(inverse(early[good]) @ late[good]) / SPEED_S
         found = calibrate_poses(

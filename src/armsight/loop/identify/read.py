@@ -21,7 +21,7 @@ from armsight.loop.handeye.recording import matched_rows
 from armsight.loop.identify.measured import Measured, Read
 from armsight.robot.kinematics.arm import Arm
 from armsight.robot.kinematics.table import FEWEST_JOINTS, MOST_JOINTS
-from armsight.tables.cells import Cells, Rows, read_cells, read_columns
+from armsight.tables.cells import Cells, Renames, Rows, column_parts, read_cells, read_columns
 from armsight.tables.columns import COLUMNS as _COLUMNS
 from armsight.tables.columns import NAMES, Columns
 from armsight.tables.lengths import number
@@ -43,7 +43,7 @@ REST_RAD, REST_S = 3e-3, 0.2
 
 
 def read_poses(
-    path: str | Path, *, rotation: str | None = None, columns: str | None = None, arm: ArmJoints | None = None
+    path: str | Path, *, rotation: str | None = None, columns: Renames | None = None, arm: ArmJoints | None = None
 ) -> Read:
     """Read joint angles and the poses measured at them: a table with names in line 1, a row a pose.
 
@@ -54,7 +54,7 @@ def read_poses(
         path: the file.
         rotation: the convention of rx_deg, ry_deg, rz_deg, such as "zyx"; None: they are not used; a wrong one: the error
             lists all.
-        columns: what the file calls its columns, NAME=THEIRS,... with names of COLUMNS, or the names of all in order.
+        columns: a mapping of names of COLUMNS to the file's, as text NAME=THEIRS,... or the names of all in order.
         arm: whose joints they are, where that is known.
 
     Raises:
@@ -64,7 +64,7 @@ def read_poses(
 
 
 def read_measured(
-    data: Path, arm: Arm, joints: Path | None = None, *, rotation: str | None = None, columns: str | None = None
+    data: Path, arm: Arm, joints: Path | None = None, *, rotation: str | None = None, columns: Renames | None = None
 ) -> Read:
     """Read measured poses with their joint angles, of one file or of two.
 
@@ -81,10 +81,10 @@ def read_measured(
     """
     if joints is None:
         return read_poses(data, rotation=rotation, columns=columns, arm=arm)
-    parts = [] if columns is None else columns.split(",")
+    parts = column_parts(columns)
     theirs = [part for part in parts if re.match(r"\s*(?:q\d+_|image|name|shot)", part)]
-    table = read_pose_table(joints, columns=",".join(theirs) or None, arm=arm, only_joints=True)
-    ours = ",".join(part for part in parts if part not in theirs) or None
+    table = read_pose_table(joints, columns=theirs, arm=arm, only_joints=True)
+    ours = [part for part in parts if part not in theirs]
     cells, notes = _with_joints(data, read_cells(data, read_columns(ours, COLUMNS), "seen"), table)
     read = _poses_in(data, cells, rotation)
     return read._replace(notes=(*table.notes, *notes, *read.notes))
@@ -233,7 +233,7 @@ def _points(table: Columns) -> tuple[list[list[str]], float]:
             return [[f"{axis}{suffix}" for axis in "xyz"]], metres
     raise InputError(
         f"{table.path}: line 1: no point 1; columns p1_x_mm .. p1_z_mm, or x_m .. z_m, are needed, there are "
-        f"{', '.join(list(table.at)[:8])}: --columns p1_x_mm=NAME,... gives yours"
+        f"{nearest('p1_x_mm', table.at)}: --columns p1_x_mm=NAME,... gives yours"
     )
 
 
