@@ -128,7 +128,7 @@ def test_gains_are_printed_and_changed(armsight):
         (("build", "--board", "mega"), ["no board 'mega'", "stm32f4"]),
         (("build", "--board", "stm32f4", "--compiler", "tcc"), ["no firmware compiler 'tcc'"]),
         (("build", "--board", "stm32f4", "-o", "/proc/none"), ["/proc/none: cannot be made"]),
-        (("build", "--board", "stm32f4", "-o", "-"), ["-o -: give the name of a file or folder"]),
+        (("build", "--board", "stm32f4", "-o", "-"), ["-: give the name of a file or folder"]),
     ],
 )
 def test_a_mistake_is_one_line(armsight, arguments, parts):
