@@ -72,7 +72,7 @@ def test_a_person_reads_a_sentence_and_the_held_out_line_first(tmp_path, capsys)
     lines = answer.out.splitlines()
     assert lines[0].startswith(("Good: ", "Usable: "))
     assert lines[1].startswith("held-out error ")
-    assert "in five rounds" in lines[1]
+    assert "in 5 rounds" in lines[1]
     assert len(lines) <= 25
     assert "not fitted, or not alone" not in answer.out
     assert re.search(

@@ -199,6 +199,6 @@ def _left_out(
         for each in ([v.nominal for v in done], [v.identified for v in done])
     )
     rows, again = np.concatenate(tried), len(which) - len(shuffled)
-    how = f"{len(rows)} poses left out" + (" in five rounds" if len(tried) > 1 else " of the fit")
+    how = f"{len(rows)} poses left out" + (f" in {len(tried)} rounds" if len(tried) > 1 else " of the fit")
     how += f", {again} of them visits of another's pose, with which they are left out" if again else ""
     return LeftOut(Validation(nominal, identified, False, over), measured.q[rows], how)
