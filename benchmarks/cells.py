@@ -11,8 +11,9 @@
 Cells are processes of their own with the sink that commands have; they are fed with measured poses of a simulated rig
 at 10 Hz, or --rate. The hub runs in a process of its own, and is looked at through its pages.
 
-With --beside workcell and hub share all cores. The others stand for computers of their own: the scheduler gives them
-what is left (nice 19, SCHED_IDLE), so that what changes is what the hub and the workcell's own stream cost.
+With --beside the workcell has a core of its own, as it has a computer of its own; hub, cells and the other workcells
+share the rest. There, the scheduler gives the cells what the hub leaves (nice 19, SCHED_IDLE). Fifty processes on one
+core delay another core of a virtual machine: while hub and cells rest, as many processes do the same, but send nothing.
 """
 
 import argparse
@@ -29,6 +30,7 @@ import threading
 import time
 import urllib.request
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 
@@ -42,6 +44,7 @@ RECORDED = 50
 #: s that the cells go on and are stopped alternately, less than a zenoh session lasts without a sign of life; s of each
 #: that do not count.
 BLOCK_S, BEGIN_S = 2.5, 0.3
+CORES = sorted(os.sched_getaffinity(0))
 #: Runs the simulated workcell again and again, and writes when each shot's command was sent, and how long it took.
 BESIDE = """
 import gc, sys, time
@@ -96,8 +99,11 @@ def cell(number, spec, seed, drifts):
     rig, breath, began = example_rig(), np.zeros(3), time.monotonic()
     body, _ = measured(rig, rig, rng)
     axis = rng.integers(0, 2)
-    sink = open_cell(spec, Published(rig, body, properties={"command": "measure"}))
-    sink.start()
+    if spec:
+        sink = open_cell(spec, Published(rig, body, properties={"command": "measure"}))
+        sink.start()
+    else:
+        sink = SimpleNamespace(put=lambda datum: None, close=lambda: None, cpu_s=0.0)
     known, ended = [], []
     signal.signal(signal.SIGTERM, lambda *_: ended.append(True))
     image, count, keep = np.zeros((480, 640), np.uint8), 0, np.exp(-1.0 / (ARGUMENTS.rate * BREATH_S))
@@ -203,7 +209,7 @@ def started(count, port, seed, drifting, cable):
     context = multiprocessing.get_context("fork")
     cells = []
     for number in range(count):
-        spec = f"c{number:03d}@127.0.0.1:{port if number < count - 1 else cable}"
+        spec = f"c{number:03d}@127.0.0.1:{port if number < count - 1 else cable}" if port else ""
         cells.append(context.Process(target=cell, args=(number, spec, seed, number in drifting), daemon=True))
         cells[-1].start()
         time.sleep(0.1)
@@ -266,11 +272,14 @@ def workcell(folder):
     return ["run", "--source", "sim:", "--board", "emulated:", *files]
 
 
-def beside(seconds, run, hub_pid, cells, folder, port, http):
+def beside(seconds, run, hub_pid, cells, silent, folder, port, http):
     """Print how long a workcell takes from image to command, alternately with and without hub, cells and its stream."""
+    for pid in silent:
+        os.kill(pid, signal.SIGSTOP)
     taken = folder / "taken"
     quiet = {"cwd": folder, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "start_new_session": True}
-    alone = subprocess.Popen([sys.executable, "-c", BESIDE, taken, f"cell:beside@127.0.0.1:{port}", *run], **quiet)
+    watched = [sys.executable, "-c", BESIDE, taken, f"cell:beside@127.0.0.1:{port}", *run]
+    alone = subprocess.Popen(watched, preexec_fn=lambda: os.sched_setaffinity(0, CORES[:1]), **quiet)
     until(lambda: alone.poll() is not None or (taken.exists() and taken.read_text().count("\n") > 1), 600)
     if alone.poll() is not None:
         raise SystemExit("the workcell beside has ended")
@@ -287,7 +296,8 @@ def beside(seconds, run, hub_pid, cells, folder, port, http):
         for what in (signal.SIGSTOP, signal.SIGCONT):
             for pid in (hub_pid, *cells):
                 os.kill(pid, what)
-            os.killpg(other.pid, what)
+            for pid in silent:
+                os.kill(pid, signal.SIGCONT if what == signal.SIGSTOP else signal.SIGSTOP)
             if what == signal.SIGSTOP:
                 time.sleep(BLOCK_S)
                 ends.append(time.monotonic())
@@ -296,6 +306,8 @@ def beside(seconds, run, hub_pid, cells, folder, port, http):
     shots = sum(each["state"].get("shots") or 0 for each in page(http)["cells"] if each["name"][0] == "c") - before
     for each in (alone, other):
         os.killpg(each.pid, signal.SIGKILL)
+    for pid in silent:
+        os.kill(pid, signal.SIGKILL)
     at, took = np.loadtxt(taken).T
     first = np.maximum.accumulate(np.where(took < 0, np.arange(len(took)), 0))  # the line with which the run began
     streams = took[first] == -2.0
@@ -430,6 +442,7 @@ def main():
     port, http, count = free_port(), free_port(), ARGUMENTS.cells
     if ARGUMENTS.beside:
         run = workcell(folder)
+        os.sched_setaffinity(0, CORES[1:])  # of all that is started, but of the workcell that is watched
     drifting = set(np.random.default_rng(ARGUMENTS.seed).choice(count, 3, replace=False)) if ARGUMENTS.drift else set()
     if ARGUMENTS.page:
         page_drawn(fed(count, folder, port))
@@ -450,7 +463,10 @@ def main():
                 flush=True,
             )
     elif ARGUMENTS.beside:
-        beside(ARGUMENTS.beside, run, process.pid, [each.pid for each in cells], folder, port, http)
+        silent = started(count, None, ARGUMENTS.seed, drifting, cut)
+        beside(
+            ARGUMENTS.beside, run, process.pid, *([p.pid for p in each] for each in (cells, silent)), folder, port, http
+        )
     else:
         before = cpu_s(process.pid)
         began = time.monotonic()

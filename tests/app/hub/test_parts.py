@@ -3,6 +3,7 @@
 import errno
 import json
 import math
+import threading
 import time
 from datetime import UTC, datetime, timedelta
 from types import SimpleNamespace
@@ -349,7 +350,23 @@ def test_a_store_that_is_full_or_does_not_answer_is_one_line(tmp_path, armsight,
         def _open(self, *arguments, **named):
             raise OSError(errno.ENOSPC, "No space left on device")
 
-    for kind in (Silent, Full):
+    class Stalled(Full):
+        """Takes the first file, then nothing of the second one, as behind a cable that is cut."""
+
+        protocol, store, pseudo_dirs = "stalled", {}, ["", "archive"]
+
+        @classmethod
+        def _strip_protocol(cls, path):
+            return path.removeprefix("stalled://").strip("/")
+
+        def _open(self, path, *arguments, **named):
+            file = MemoryFileSystem._open(self, path, *arguments, **named)
+            if len(self.store) > 1:
+                file.write = lambda piece: ended.wait(30.0)
+            return file
+
+    ended = threading.Event()
+    for kind in (Silent, Full, Stalled):
         fsspec.register_implementation(kind.protocol, kind, clobber=True)
     monkeypatch.setattr("armsight.app.hub.push._ANSWER_S", 0.2)
     folder = runs(tmp_path / "runs")
@@ -357,6 +374,9 @@ def test_a_store_that_is_full_or_does_not_answer_is_one_line(tmp_path, armsight,
     assert_rejected(said, "silent://bucket: no answer for 0 s; started again it goes on where it was")
     said = armsight("hub", "push", folder, "full://archive", "--cell", "a")
     assert_rejected(said, "full://archive: No space left on device; started again it goes on where it was")
+    said = armsight("hub", "push", folder, "stalled://archive", "--cell", "a")
+    ended.set()
+    assert_rejected(said, "stalled://archive: no answer for 0 s; started again it goes on where it was")
 
 
 def test_clocks_of_two_tables(tmp_path, armsight):

@@ -8,12 +8,15 @@ from __future__ import annotations
 
 import hashlib
 import json
+import queue
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from armsight.app.stream.cell_file import Cell
 from armsight.app.stream.outbox import Outbox, state_folder
@@ -21,7 +24,10 @@ from armsight.errors import ArmsightError, InputError
 
 #: bytes that are read and sent at once; half: more calls, double: a coarser limit of the rate.
 _CHUNK = 1 << 20
-#: s that a store may take for its first answer; half: a slow one is not used, double: a dead one keeps the cell longer.
+#: bytes of which a store makes a part; half: S3, with 10,000 parts, takes files of 80 GB, double: a slow network needs more
+#: than _ANSWER_S for one.
+_PART = 16 << 20
+#: s that a store may take for an answer; half: a slow one is not used, double: a dead one keeps the cell longer.
 _ANSWER_S = 30.0
 _MANIFEST = "manifest.json"
 
@@ -64,9 +70,8 @@ def push(cell: Cell, folder: Path, store: str, rate_mb_s: float, advance: Callab
     resting = Outbox(state_folder() / "cells" / cell.site / cell.name, cell.name)
     try:
         fs, root = fsspec.core.url_to_fs(store)
-        # By itself s3fs waits for minutes, and the cell with it; and it makes a bucket of a mistyped name.
-        waits = {"timeout": _ANSWER_S} if fs.async_impl else {}
-        if (bucket := root.partition("/")[0]) and not fs.exists(bucket, **waits):
+        # s3fs makes a bucket of a mistyped name.
+        if (bucket := root.partition("/")[0]) and not _answer(fs.exists, bucket):
             raise InputError(f"{store}: no {bucket!r} is there, or it cannot be reached: is its name right?")
         for run in runs:
             day = datetime.fromtimestamp(min(each.stat().st_mtime for each in _files(run)), UTC)
@@ -77,7 +82,7 @@ def push(cell: Cell, folder: Path, store: str, rate_mb_s: float, advance: Callab
     except (ImportError, ValueError) as error:
         raise InputError(f"{store}: {error}") from None
     except Exception as error:  # noqa: BLE001 - a store's library has errors of its own; our own code has its tests
-        why = getattr(error, "strerror", None) or str(error) or f"no answer for {_ANSWER_S:.0f} s"
+        why = getattr(error, "strerror", None) or str(error) or type(error).__name__
         raise ArmsightError(f"{store}: {why}; started again it goes on where it was") from None
     finally:
         resting.close()
@@ -87,30 +92,61 @@ def _push_run(fs: Any, at: str, run: Path, done: Pushed, pace: Callable[[int], N
     manifest = {}
     for path in _files(run):
         with path.open("rb") as source:
-            manifest[path.relative_to(run).as_posix()] = _digest(source)
+            manifest[path.relative_to(run).as_posix()] = _digest(source.read)
     expected = json.dumps({"files": manifest}, indent=1).encode()
-    if fs.exists(f"{at}/{_MANIFEST}") and fs.cat_file(f"{at}/{_MANIFEST}") == expected:
+    last = f"{at}/{_MANIFEST}"
+    if _answer(fs.exists, last) and _answer(fs.cat_file, last) == expected:
         done.complete_before += 1
         return
     for name, digest in manifest.items():
         target = f"{at}/{name}"
-        if fs.exists(target) and fs.size(target) == digest["bytes"]:
-            with fs.open(target, "rb") as there:
-                if _digest(there) == digest:
+        if _answer(fs.exists, target) and _answer(fs.size, target) == digest["bytes"]:
+            with _answer(fs.open, target, "rb", block_size=_PART) as there:
+                if _digest(partial(_answer, there.read)) == digest:
                     continue
-        fs.makedirs(target.rpartition("/")[0], exist_ok=True)
-        with (run / name).open("rb") as source, fs.open(target, "wb") as sink:
+        _answer(fs.makedirs, target.rpartition("/")[0], exist_ok=True)
+        with (run / name).open("rb") as source:
+            sink = _answer(fs.open, target, "wb", block_size=_PART)
             while piece := source.read(_CHUNK):
                 pace(len(piece))
-                sink.write(piece)
+                _answer(sink.write, piece)
+            _answer(sink.close)  # not by `with`: that would wait for a store that is silent
         done.files += 1
-    fs.pipe_file(f"{at}/{_MANIFEST}", expected)
+    _answer(fs.pipe_file, last, expected)
     done.runs += 1
+
+
+def _answer(call: Callable[..., Any], *given: Any, **named: Any) -> Any:  # noqa: ANN401 - of fsspec
+    """Return what a call to the store returns; by themselves s3fs and its like wait for many minutes.
+
+    Raises:
+        TimeoutError: the store is silent; the call is left alone in its thread.
+    """
+    answers: queue.SimpleQueue[tuple[Any, BaseException | None]] = queue.SimpleQueue()
+
+    def work() -> None:
+        try:
+            answers.put((call(*given, **named), None))
+        except BaseException as error:  # noqa: BLE001 - raised below
+            answers.put((None, error))
+
+    threading.Thread(target=work, daemon=True).start()
+    try:
+        value, error = answers.get(timeout=_ANSWER_S)
+    except queue.Empty:
+        raise TimeoutError(f"no answer for {_ANSWER_S:.0f} s") from None
+    if error is not None:
+        raise error
+    return value
 
 
 def _files(run: Path) -> list[Path]:
     return sorted(path for path in run.rglob("*") if path.is_file() and not path.is_symlink())
 
 
-def _digest(file: IO[bytes]) -> dict[str, Any]:
-    return {"sha256": hashlib.file_digest(file, "sha256").hexdigest(), "bytes": file.seek(0, 2)}  # type: ignore[arg-type]
+def _digest(read: Callable[[int], bytes]) -> dict[str, Any]:
+    digest, count = hashlib.sha256(), 0
+    while piece := read(_CHUNK):
+        digest.update(piece)
+        count += len(piece)
+    return {"sha256": digest.hexdigest(), "bytes": count}
