@@ -1,11 +1,12 @@
-"""``armsight serve`` in days: cameras that go and freeze, a child that is killed, a full disk, a clock that is set.
+"""``armsight serve`` in days: cameras, a board and a child that are lost, a full disk, a clock that is set.
 
-    python benchmarks/serve.py [LOSSES] [--seed N]
+    python benchmarks/serve.py [LOSSES] [--boards LOSSES] [--seed N] [--steady S] [--rate HZ]
 
-Two cameras are MJPEG streams of this process. Days of losses are compressed: each loss follows the return from the last
-by a second or two. Printed: time from the return of the cameras to the first shot, lines for each loss, memory of the
-service over the losses and of its child over the shots of an undisturbed minute. The clock is set by a library that is
-loaded before (LD_PRELOAD), the full disk is /dev/full.
+Two cameras are MJPEG streams of this process, the board an emulated SO-101 whose drives are on, at a pseudo-terminal that
+is pulled and plugged in again. Days of losses are compressed: each loss follows the return from the last by a second or
+two. Printed: time from the return of what was lost to its first shot or reading, lines for each loss, memory of the service
+over the losses and of its child over the shots of an undisturbed minute, and where the arm is after SIGTERM. The clock is
+set by a library that is loaded before (LD_PRELOAD), the full disk is /dev/full.
 """
 
 from __future__ import annotations
@@ -27,10 +28,13 @@ from pathlib import Path
 
 import numpy as np
 
+from armsight.robot.boards.feetech.bus import BAUD
+from armsight.robot.boards.feetech.registers import TORQUE
+from armsight.sim.boards.device import PtyPort
+from armsight.sim.boards.so101 import So101Bus
 from armsight.sim.example_rig import demo_recording
 from armsight.vision.sources import open_source
 
-RATE_HZ = 10.0  # of the cameras
 CLOCK = """
 #define _GNU_SOURCE
 #include <dlfcn.h>
@@ -51,7 +55,7 @@ int clock_gettime(clockid_t id, struct timespec *t) {
 class Cameras:
     """Two MJPEG streams that go, freeze and come back."""
 
-    def __init__(self, images: list[tuple[bytes, bytes]]) -> None:
+    def __init__(self, images: list[tuple[bytes, bytes]], rate_hz: float) -> None:
         self.gone, self.frozen = threading.Event(), threading.Event()
         outer = self
 
@@ -66,12 +70,12 @@ class Cameras:
                 self.end_headers()
                 try:
                     while not outer.gone.is_set():
-                        k = int(time.monotonic() * RATE_HZ)
+                        k = int(time.monotonic() * rate_hz)
                         if not outer.frozen.is_set():
                             data = images[k % len(images)][side]
                             head = f"--f\r\nContent-Type: image/jpeg\r\nContent-Length: {len(data)}\r\n\r\n"
                             self.wfile.write(head.encode() + data + b"\r\n")
-                        time.sleep(max((k + 1) / RATE_HZ - time.monotonic(), 0.001))
+                        time.sleep(max((k + 1) / rate_hz - time.monotonic(), 0.001))
                 except OSError:
                     pass
                 self.close_connection = True
@@ -85,6 +89,32 @@ class Cameras:
         self.port = self.server.server_address[1]
 
 
+class Cable:
+    """An emulated SO-101 that holds its pose, behind a cable that is pulled and plugged in; ``name`` stays the same."""
+
+    def __init__(self, folder: Path) -> None:
+        self.bus, self.name = So101Bus.made(), folder / "port"
+        for servo in range(6):
+            self.bus.servos.switch(servo, True)
+            self.bus.tables[servo][TORQUE.address] = 1
+        self.plug()
+
+    def plug(self) -> None:
+        """Plug it in."""
+        self.port = PtyPort(self.bus, BAUD)
+        self.name.symlink_to(self.port.name)
+
+    def pull(self) -> None:
+        """Pull it: the port is gone."""
+        self.name.unlink()
+        self.port.pull()
+
+    @property
+    def holds(self) -> bool:
+        """Whether the drives are on and the joints where they were."""
+        return bool(self.bus.servos.on.all() and np.abs(self.bus.servos.shaft - self.began).max() < np.radians(0.1))
+
+
 def rss_mb(pid: int) -> float:
     """Return the resident memory of a process, MB."""
     return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
@@ -93,7 +123,7 @@ def rss_mb(pid: int) -> float:
 class Serving:
     """The service, and its events with the time on this process' clock."""
 
-    def __init__(self, folder: Path, cameras: Cameras, log: str) -> None:
+    def __init__(self, folder: Path, cameras: Cameras, arm: Cable, log: str) -> None:
         step = folder / "step"
         step.write_text("0")
         self.step, text = step, CLOCK
@@ -104,7 +134,7 @@ class Serving:
         (folder / "serve.toml").write_text(
             f'[measure]\nrig = "rig.json"\ntarget = "plate.toml"\n'
             f'source = "url:http://127.0.0.1:{cameras.port}/left,http://127.0.0.1:{cameras.port}/right"\n'
-            f'[serve]\nhttp = "127.0.0.1:0"\nlog = "{log}"\nstale_s = 3.0\n'
+            f'[board]\nport = "feetech:{arm.name}"\n[serve]\nhttp = "127.0.0.1:0"\nlog = "{log}"\nstale_s = 3.0\n'
         )
         environment = os.environ | {"LD_PRELOAD": str(library), "CLOCK_STEP": str(step)}
         arguments = [sys.executable, "-m", "armsight", "serve", str(folder / "serve.toml"), "--json"]
@@ -147,7 +177,9 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("losses", type=int, nargs="?", default=60)
     parser.add_argument("--seed", type=int, default=9)
+    parser.add_argument("--boards", type=int, default=20)
     parser.add_argument("--steady", type=float, default=60.0)
+    parser.add_argument("--rate", type=float, default=10.0)
     given = parser.parse_args()
     rng = random.Random(given.seed)
     with tempfile.TemporaryDirectory() as name:
@@ -160,12 +192,16 @@ def main() -> None:
             tuple(cv2.imencode(".jpg", image)[1].tobytes() for image in (shot.left, shot.right))
             for shot in open_source(folder / "arm")
         ]
-        cameras = Cameras(images)
-        for log, losses in (("serve.log", given.losses), ("/dev/full", max(given.losses // 10, 2))):
-            campaign(Serving(folder, cameras, log), cameras, rng, losses, log, given.steady)
+        cameras, arm = Cameras(images, given.rate), Cable(folder)
+        for log, share in (("serve.log", 1.0), ("/dev/full", 0.1)):
+            kinds = ["cameras"] * max(round(share * given.losses), 2) + ["board"] * max(round(share * given.boards), 2)
+            rng.shuffle(kinds)
+            campaign(Serving(folder, cameras, arm, log), cameras, arm, rng, kinds, log, given.steady)
 
 
-def campaign(served: Serving, cameras: Cameras, rng: random.Random, losses: int, log: str, steady_s: float) -> None:
+def campaign(
+    served: Serving, cameras: Cameras, arm: Cable, rng: random.Random, kinds: list[str], log: str, steady_s: float
+) -> None:
     """Print one row for a log."""
     if served.wait("measuring", 0) is None:
         raise SystemExit(f"never began: {served.process.stderr.read()}")
@@ -177,11 +213,19 @@ def campaign(served: Serving, cameras: Cameras, rng: random.Random, losses: int,
         shots.append(found["armsight_shots_total"])
         memory.append(found["armsight_process_resident_bytes"] / 1e6)
     slope = np.polyfit(shots[len(shots) // 3 :], memory[len(memory) // 3 :], 1)[0]
-    back: dict[str, list[float]] = {"gone": [], "frozen": [], "killed": []}
+    ways = ("gone", "frozen", "killed")
+    back: dict[str, list[float]] = {kind: [] for kind in (*ways, "board")}
     lines, own, never = [], [], 0
-    for k in range(losses):
-        kind, at = rng.choice(list(back)), len(served.events)
-        if kind == "killed":
+    arm.began = arm.bus.servos.shaft.copy()
+    for k, lost in enumerate(kinds):
+        kind, at = rng.choice(ways) if lost == "cameras" else lost, len(served.events)
+        event = "board " if kind == "board" else ""
+        if kind == "board":
+            arm.pull()
+            served.wait("board lost", at, 30.0)
+            time.sleep(rng.uniform(0.2, 4.0))
+            arm.plug()
+        elif kind == "killed":
             if (child := served.child()) is not None:
                 os.kill(child, signal.SIGKILL)
         else:
@@ -193,19 +237,22 @@ def campaign(served: Serving, cameras: Cameras, rng: random.Random, losses: int,
         if k % 7 == 3:
             served.step.write_text(str(rng.choice([-86400, -3600, 3600, 86400])))  # the clock is set meanwhile
         restored = time.monotonic()
-        found = served.wait("back", at)
+        found = served.wait(f"{event}back", at)
         never += found is None
         if found is not None:
             back[kind].append(found[0] - restored)
-        lines.append([event["why"] for _, event in served.events[at:] if event["event"] == "lost"])
+        lines.append([event["why"] for _, event in served.events[at:] if event["event"].endswith("lost")])
         own.append(rss_mb(served.process.pid))
         time.sleep(rng.uniform(0.5, 2.0))
+    healthy = served.metrics()
     served.process.send_signal(signal.SIGTERM)
     began = time.monotonic()
     code = served.process.wait(30)
+    ended_s = time.monotonic() - began
+    time.sleep(0.5)
     repeated = sum(len(each) != len(set(each)) for each in lines)
     print(
-        f"log {log}: {losses} losses, {never} without return, {repeated} that said a reason twice, lines a loss "
+        f"log {log}: {len(kinds)} losses, {never} without return, {repeated} that said a reason twice, lines a loss "
         f"{np.mean([len(each) for each in lines]):.2f} (most {max(map(len, lines))})"
     )
     for kind, each in back.items():
@@ -213,7 +260,11 @@ def campaign(served: Serving, cameras: Cameras, rng: random.Random, losses: int,
             print(f"  {kind}: {len(each)}, back after {np.median(each):.1f} s (median), {max(each):.1f} at most")
     print(f"  service {own[0]:.1f} MB after the first loss, {own[-1]:.1f} after the last, {max(own):.1f} at most")
     print(f"  child {memory[0]:.1f} to {memory[-1]:.1f} MB over {shots[-1]:.0f} shots: {1e3 * slope:.2f} kB a shot")
-    print(f"  SIGTERM: ended with {code} after {time.monotonic() - began:.1f} s")
+    print(f"  up {healthy['armsight_up']:.0f}, board {healthy['armsight_board_up']:.0f}, ", end="")
+    print(
+        f"{healthy['armsight_readings_total']:.0f} readings, {healthy['armsight_board_losses_total']:.0f} board losses"
+    )
+    print(f"  SIGTERM: ended with {code} after {ended_s:.1f} s, the arm {'held' if arm.holds else 'NOT held'}")
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ import pickle
 import pydoc
 import re
 import sys
+from pathlib import Path
 
 import numpy as np
 import pinocchio
@@ -34,6 +35,9 @@ from armsight.vision.source import Source
 from made_once import made_once
 from strategies import ordinary_rig
 
+ROOT = Path(__file__).parents[1]
+#: A word that may be a constant's name; video:FILE and NAME=THEIRS are what one types.
+CONSTANT = re.compile(r"(?<![:,=\w])[A-Z][A-Z_]{3,}\b(?!=)")
 #: What a pose measured alone and a row of a table have alike.
 SHARED = ("T_left_body", "position_mm", "sigma_mm", "angles_deg", "sigma_deg", "cov_left", "quaternion_wxyz")
 
@@ -57,6 +61,24 @@ def test_completion_and_help_show_the_public_names():
         assert name in armsight.__doc__
         assert inspect.getdoc(getattr(armsight, name)), name
         assert re.search(rf"^    (class )?{name}( =|\()", text, re.MULTILINE), name
+
+
+def test_help_names_nothing_that_cannot_be_typed():
+    """No default is a function's address, and no constant of a module is named that is not public."""
+    constants = {
+        name
+        for path in (ROOT / "src" / "armsight").rglob("*.py")
+        for name in re.findall(r"^([A-Z][A-Z_]{3,})\b *[:=]", path.read_text(), re.MULTILINE)
+    }
+    for name in armsight.__all__:
+        found = getattr(armsight, name)
+        text = pydoc.plain(pydoc.render_doc(found))
+        assert "<function" not in text, name
+        named = {*CONSTANT.findall(inspect.getdoc(found))} & constants
+        for each in vars(found).values() if inspect.isclass(found) else ():
+            if inspect.isfunction(each) and not each.__name__.startswith("_") and each.__doc__:
+                named |= {*CONSTANT.findall(each.__doc__)} & constants
+        assert not named, (name, named)
 
 
 def test_the_sigmas_of_a_pose_are_those_of_what_it_prints():

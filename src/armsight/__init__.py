@@ -179,6 +179,10 @@ def _in_python(function: Callable[..., Any], name: str) -> Callable[..., Any]:
             raise
 
     call.__module__, call.__name__, call.__qualname__ = __name__, name, name  # where pickle finds it
+    shown = importlib.import_module("inspect").signature(function)
+    given = list(shown.parameters.values())
+    plain = [each.replace(default=...) if isinstance(each.default, types.FunctionType) else each for each in given]
+    call.__signature__ = shown.replace(parameters=plain)  # type: ignore[attr-defined]  # help shows no lambda
     return call
 
 

@@ -6,7 +6,8 @@ code 2. What is expected to go wrong now and then (a marker out of view) is a va
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from difflib import get_close_matches
 
 #: Names that a message lists, in their order; of more, those near what was given, _NEAR at most. Half: the columns of a
@@ -34,6 +35,17 @@ def require(call: str, name: str, value: object, fits: bool, expected: str) -> N
     """Raise the InputError of an argument of a wrong type, which names what opens a right one."""
     if not fits:
         raise InputError(f"{call}: {name} is a {type(value).__name__}; expected {expected}")
+
+
+@contextmanager
+def noted(notes: Sequence[str]) -> Iterator[None]:
+    """Add what was found while data were read to the errors of a block: it is often their cause."""
+    try:
+        yield
+    except ArmsightError as error:
+        if notes:
+            error.args = (f"{error} ({'; '.join(notes)})",)
+        raise
 
 
 def nearest(name: object, known: Iterable[str]) -> str:

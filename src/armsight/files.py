@@ -96,7 +96,8 @@ def read_bytes(path: str | Path, most_mb: float = DOCUMENT_MB) -> bytes:
     """Read a whole file; errors as :func:`opened`."""
     with opened(path, most_mb) as file:
         try:
-            data = file.read(int(most_mb * _MB) + 1) or b""  # some files of the system have no size, and no end
+            pieces = iter(lambda: file.read(_MB) or b"", b"")  # some files of the system have no size, and no end
+            data = b"".join(itertools.islice(pieces, int(most_mb) + 1))
         except OSError as error:
             raise InputError(f"{path}: cannot be read: {error.strerror}") from None
     if len(data) > most_mb * _MB:

@@ -156,6 +156,7 @@ def _run(arguments: list[str], at_exit: list[Callable[[int, str], None]]) -> tup
         return code if isinstance(code, int) else 0, ""
     except (click.exceptions.Abort, KeyboardInterrupt) as error:
         if isinstance(error.__context__, EOFError):
+            click.echo(err=True)  # the question stands in this line
             return 2, f"{UNANSWERED}, or with --yes where there is one"
         click.echo("armsight: interrupted", err=True)
         return 130, ""

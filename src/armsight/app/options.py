@@ -17,6 +17,8 @@ SIM = "sim:"
 DETECTIONS = "detections:"
 #: Joint angles that another program logged: ``--board poses:FILE``.
 LOGGED = "poses:"
+#: What every line about a board beside the cameras begins with; a loss is an error, a fault a warning, its end an info.
+BOARD = "board: "
 #: What a cell is called among the streams.
 CELL = "cell:"
 _HELP = (

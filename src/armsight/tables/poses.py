@@ -62,7 +62,7 @@ class PoseTable(Record):
     numbers: Array = field(default_factory=lambda: np.zeros((0, 0)))
     #: (N, 6) or (N, 7) position and rotation as in the file, where its columns have this order; (N, 0) else
     written: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    convention: str = ""  #: what they were taken for, one of CONVENTIONS; "" for matrices and joints
+    convention: str = ""  #: what they were taken for, as ``rotation``; "" for matrices and joints
     q: Array | None = None  #: (N, J) joint angles, rad; None where there are none
     t_s: Array | None = None  #: (N,) times, s; None where there are none
     names: tuple[str, ...] | None = None  #: of the rows, or of their images; None where there are none
@@ -89,10 +89,12 @@ def read_pose_table(
 
     Args:
         path: the file.
-        rotation: one of CONVENTIONS; None: what the columns' names say.
+        rotation: what three or four numbers of a rotation are: "wxyz", "xyzw", "rotvec", or the order of the axes, "zyx"
+            about fixed ones, "ZYX" about those that rotate; None: what the columns' names say.
         unit: "m" or "mm" for lengths whose columns do not name one; None: m.
         detect_units: whether lengths that cannot be metres are taken for millimetres, with a note.
-        columns: a mapping of names of COLUMNS to the file's, as text NAME=THEIRS,... or the names of all in their order.
+        columns: a mapping of names ("x_mm", "qw", "q1_deg") to the file's, as text NAME=THEIRS,... or the names of all in
+            their order.
         arm: the model whose joints the table has.
         only_joints: whether positions are passed over: the poses are then those of the joints.
         side: "robot" or "seen": whose poses are read where a file holds both.

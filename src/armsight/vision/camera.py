@@ -151,9 +151,9 @@ class Camera(Record):
 
     Attributes:
         image_size_px: (width, height).
-        model: a key of DISTORTION_MODELS.
+        model: "none", "brown4", "brown5", "brown8" or "fisheye".
         intrinsics: (4,) fx fy cx cy, px.
-        distortion: (n,) coefficients in OpenCV's order; n as DISTORTION_MODELS says.
+        distortion: (n,) coefficients in OpenCV's order; n as the model's name, 4 of "fisheye".
     """
 
     image_size_px: tuple[int, int]

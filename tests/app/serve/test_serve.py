@@ -103,6 +103,45 @@ def test_an_interrupt_ends_the_child(serving):
     assert time.monotonic() - before < service._END_S  # the child was not waited for in vain
 
 
+def test_a_board_that_is_lost_and_back_is_said_once(tmp_path):
+    """Also where the child that reads it begins anew meanwhile, and says so itself."""
+    events = []
+    served = Service(ServeConfig(("--board=feetech:arm",), tmp_path, http="", log="log"), events.append)
+
+    def says(**datum):
+        served._take(json.dumps(datum).encode())
+
+    def log(text, level):
+        says(kind="log", t_s=1.0, text=text, level=level)
+
+    says(**SHOT)
+    log("board: connected", "info")
+    says(kind="joints", t_s=[1.0, 1.1], q_rad=[[0.0] * 5] * 2)
+    assert (served.state()["healthy"], served.state()["reading_age_s"] < 5) == (True, True)
+    assert (served.values()["board_up"], served.values()["readings_total"]) == (1, 2)
+    for _ in range(2):
+        log("board: arm: no such port; trying again", "error")
+    assert (served.state()["healthy"], served.state()["why"]) == (False, "board: arm: no such port; trying again")
+    assert (served.values()["board_up"], served.values()["up"]) == (0, 1)
+    log("board: connected", "info")
+    log("board: joint 2: hot", "warning")
+    log("no board", "error")
+    assert served.state()["healthy"]
+    assert [each["event"] for each in events] == ["measuring", "board lost", "board back"]
+    assert served.values()["board_losses_total"] == 1
+    said = (tmp_path / "log").read_text()
+    assert (said.count("no such port"), said.count("joint 2: hot")) == (1, 1)
+    served._hear("board: joint 2: hot")  # the child's own line of what it published
+    assert (tmp_path / "log").read_text() == said
+
+
+def test_a_board_without_readings_is_no_healthy_one(tmp_path):
+    served = Service(ServeConfig(("--board=feetech:arm",), tmp_path, http="", log="log", stale_s=0.01), print)
+    served._take(json.dumps(SHOT).encode())
+    time.sleep(0.02)
+    assert served.state()["why"] == "board: no reading for 0.01 s"
+
+
 def fetch(port, path):
     """Return the code and the text of a page."""
     try:
@@ -162,6 +201,8 @@ def test_options_become_arguments(rendered, tmp_path):
     assert found.arguments[0] == str(rendered.rig)
     assert {"--source=usb:0,1", "--stream=json+tcp:1", "--stream=json+tcp:2"} <= set(found.arguments)
     assert (found.folder, found.log_files) == (tmp_path, 2)
+    found = read_config(write(tmp_path / "b.toml", text + '[board]\nport = "emulated:host"\n'))
+    assert "--board=emulated:host" in found.arguments
 
 
 def test_no_start_writes_over_the_poses_of_another(rendered, tmp_path):
@@ -193,7 +234,15 @@ def test_a_first_start_without_a_shot_ends_it_and_what_is_no_datum_is_passed_ove
     ("old", "new", "words"),
     [
         ("source =", "sorce =", "[measure] has an unknown key 'sorce': did you mean source?"),
-        ("[measure]", "[mesure]", "unknown table [mesure]; known are [measure] and [serve]"),
+        ("[measure]", "[mesure]", "unknown table [mesure]; known are [measure], [board] and [serve]"),
+        ("[measure]", "[board]\n[measure]", "[board] has no port, such as feetech:/dev/ttyACM0"),
+        ("[measure]", '[board]\nport = "usb:1"\n[measure]', "no board 'usb:1'; there are emulated:unicorn"),
+        ("[measure]", '[board]\nport = "serial:/none"\n[measure]', "/none: no such port"),
+        (
+            "[measure]",
+            '[measure]\nboard = "serial:/none"',
+            "board: not for a service: it is the port of the table [board]",
+        ),
         ("[measure]", "[serve]", "expected a table [measure]"),
         ("[measure]", "[run]", "[run] is not served: an arm must not begin to move again"),
         ("[measure]", "[serve]\nlog_files = 0.5\n[measure]", "log_files is 0.5: expected a whole number above 0"),

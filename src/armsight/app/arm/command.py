@@ -66,7 +66,7 @@ def list_(as_json: bool) -> None:
 
 @command.command()
 @_ARM
-@output("ARM.png", "Draw the arm at home.")
+@output("ARM.png", "Draw the arm at home; needs armsight[report].")
 @_JSON
 def show(arm_name: str, output: Path | None, as_json: bool) -> None:
     """Print an arm's table, limits and reach."""
@@ -257,7 +257,7 @@ def plan(arm_name: str, around: Path, output: Path, as_json: bool, **chosen: int
 @click.argument("run", metavar="RUN", type=PATH)
 @click.option("--arm", "arm_name", metavar="ARM", help="The nominal arm; by default the one that the run names.")
 @click.option("--compare", multiple=True, metavar="FILE.json", type=PATH, help="Another arm's report.json.")
-@output("DIR", "Folder for report.html, .pdf and .json.")
+@output("DIR", "Folder for report.html, .pdf and .json; needs armsight[report].")
 @_JSON
 def report(run: Path, arm_name: str | None, compare: tuple[Path, ...], output: Path | None, as_json: bool) -> None:
     """Report what an arm does, what explains its error, and what each remedy would bring.

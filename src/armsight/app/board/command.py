@@ -6,6 +6,7 @@ import contextlib
 import json
 import re
 import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
 
 _JSON = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 _FILE = click.argument("file", type=PATH)
-_WATCH_S = 2.0  # how long an emulated board is watched where nobody says how long
 #: The steps of a bring-up, in their order, and what each finds of a joint (``found.JointFound``).
 STEPS = {
     "readings": "noise_counts",
@@ -79,7 +79,7 @@ def _open(name: str) -> Board:
     return open_board(name, plant)
 
 
-def _open_any(name: str) -> MotionBoard:
+def open_any(name: str) -> MotionBoard:
     """Open any board; an emulated one has six free joints at its motors."""
     from armsight.robot.board_registry import is_real, open_motion_board
     from armsight.sim.joints import JointPlant
@@ -155,11 +155,9 @@ def monitor(name: str, seconds: float | None, every: float, as_json: bool) -> No
     from armsight.robot.board_registry import is_real
     from armsight.robot.boards.ar4.board import Ar4Board
 
-    if seconds is None and not is_real(name):
-        seconds = _WATCH_S
     if click.get_current_context().get_parameter_source("name") is ParameterSource.DEFAULT:
         click.echo(f"note: no --board: this one is {name}, a program; --board serial:PORT is a board", err=True)
-    with _open_any(name) as board:
+    with open_any(name) as board:
         click.echo(text.welcome_text(board), err=True)
         if isinstance(board, Ar4Board) and not board.homed:
             angles = "these are not the arm's angles (armsight board home)"
@@ -168,6 +166,8 @@ def monitor(name: str, seconds: float | None, every: float, as_json: bool) -> No
         while seconds is None or passed < seconds - 1e-9:
             states = board.receive(every)
             passed += every
+            if not is_real(name):
+                time.sleep(every)  # its time passes at once
             _show(as_json, text.status_json(board, states), text.status_text(board, states))
 
 
@@ -347,7 +347,7 @@ def home(name: str, at_once: str, yes: bool, as_json: bool) -> None:
     from armsight.robot.boards.board import Board
     from armsight.robot.boards.codes import Command, SensorKind
 
-    with _open_any(name) as board:
+    with open_any(name) as board:
         if isinstance(board, Ar4Board):
             question = "the arm will move to the ends of all joints: is everything out of its reach?"
         elif isinstance(board, Board) and SensorKind.QUADRATURE in board.configuration()["joint"]["encoder"]["sensor"]:
@@ -378,7 +378,7 @@ def clear(name: str, as_json: bool) -> None:
     """Reset the emergency stop and the faults whose causes are gone; the drives stay as they are."""
     from armsight.robot.boards.codes import BoardState, Command
 
-    with _open_any(name) as board:
+    with open_any(name) as board:
         if name.startswith("ar4:") or board.status.state is BoardState.STOPPED:
             board.confirm(board.command(Command.CLEAR_STOP))
         board.confirm(board.command(Command.CLEAR_FAULTS))
@@ -395,7 +395,7 @@ def release(name: str, as_json: bool) -> None:
     """Switch the drives off: the arm sinks, support it."""
     from armsight.robot.boards.codes import Command
 
-    with _open_any(name) as board:
+    with open_any(name) as board:
         board.confirm(board.command(Command.DISABLE))
         board.receive(0.05)
         state = board.status.state.name
@@ -471,7 +471,7 @@ def offsets(
             )
         offer(kept.ar4_zeros(Path(file), angles, restore, keep))
     elif name.startswith("feetech:"):
-        with _open_any(name) as board:
+        with open_any(name) as board:
             assert isinstance(board, FeetechBoard)
             kept.offer_release(board, changes=bool(given), yes=yes)
             offer(kept.servo_zeros(board, angles, restore, calibration_of(name)))

@@ -60,7 +60,7 @@ class CalibrateOptions:
     "--folds", type=click.IntRange(min=2), default=FOLDS, show_default=True, help="Parts for the held-out errors."
 )
 @output("RIG.json", "The rig to write.", required=True)
-@click.option("--report", metavar="DIR", type=PATH, help="Write an HTML report with figures.")
+@click.option("--report", metavar="DIR", type=PATH, help="Write an HTML report with figures; needs armsight[report].")
 @click.option("--json", "as_json", is_flag=True, help="Print the result as one JSON object.")
 def command(**given: object) -> int:
     """Calibrate two cameras, and evaluate the calibration on pairs held out of the fit.

@@ -84,8 +84,12 @@ def _open(spec: str, folder: Path, target: str) -> Source:
     if not spec.startswith((*LIVE, SIM)):
         return open_source(spec)
     stored = unused(folder)
-    opened = _SimulatedBoard(spec, target) if spec.startswith(SIM) else open_source(spec)
-    click.echo(f"recording for {_RECORDED_S:g} s into {stored}: move the target; Ctrl-C ends it earlier", err=True)
+    simulated = spec.startswith(SIM)
+    opened = _SimulatedBoard(spec, target) if simulated else open_source(spec)
+    if simulated:
+        click.echo(f"a simulated person shows the target {_SIM_SHOTS} times; the images go to {stored}", err=True)
+    else:
+        click.echo(f"recording for {_RECORDED_S:g} s into {stored}: move the target; Ctrl-C ends it earlier", err=True)
     with contextlib.closing(opened) as live, bar("recording shots", live.count) as advance:
         done = record(live, stored, seconds=_RECORDED_S, on_shot=lambda _: advance())
     if (done.stopped and not done.interrupted) or not done.shots:

@@ -52,7 +52,7 @@ def command() -> None:
 @command.command("evaluate", cls=_Evaluate)
 @click.argument("data", metavar="RUN|POSES.csv", type=PATH)
 @click.option("--closed", is_flag=True, help="Of a run: evaluate the motions with the loop closed on vision.")
-@output("DIR", "Folder for report.html, check.json, figures.")
+@output("DIR", "Folder for report.html, check.json, figures; needs armsight[report].")
 @click.option(
     "--columns", metavar="NAME=COLUMN,...", help="Names of columns in your CSV, such as x_m=X,command_x_m=X0."
 )

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from armsight.app.options import PATH, output
-from armsight.errors import InputError
+from armsight.errors import InputError, noted
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -80,7 +80,7 @@ class Options:
 @click.option("--streams", is_flag=True, help="Both tables are streams (t_s) whose clocks differ: find the offset.")
 @click.option("--scale", is_flag=True, help="The target's size may be wrong: fit it.")
 @click.option("--plan", metavar="N", type=click.IntRange(min=0, max=50), default=0, help="Choose the next N poses.")
-@output("DIR", "Folder for the page and the files.")
+@output("DIR", "Folder for the page and the files; needs armsight[report].")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object, SI units.")
 def command(**given: object) -> int:
     """Calibrate hand and eye from your own data: robot poses, and images or poses of a target.
@@ -169,18 +169,18 @@ def calibrate(options: Options, progress: Callable[[str], None]) -> HandEyeAnswe
     robot = _table(options, "robot", arm) if bag is None else robot_in_recording(bag, said.frames, arm)
     seen = _seen(options, progress)
     offset_s, sigma_s = None, 0.0
-    if options.streams:
-        recording, found, offset_s, sigma_s = _streams(options, robot, seen, arm, progress)
-    else:
-        robot = robot if bag is None else at_shots(robot, seen)
-        recording = paired(robot, seen, options.eye == "in-hand", arm)
-        progress("looking at whether both sides fit")
-        recording = require_plausible(
-            recording, arm, detect_units=_said(options, "robot").detect_units, scale=options.scale
-        )
-        links_at = links_of(recording.robot, arm, np.arange(len(robot.Ts), dtype=float))
-        links = None if links_at is None else links_at(recording.rows.astype(float))
-        found = calibrate_poses(recording.poses, t_s=recording.t_s, links=links, scale=options.scale, progress=progress)
+    with noted((*robot.notes, *seen.notes)):
+        if options.streams:
+            recording, found, offset_s, sigma_s = _streams(options, robot, seen, arm, progress)
+        else:
+            robot = robot if bag is None else at_shots(robot, seen)
+            recording = paired(robot, seen, options.eye == "in-hand", arm)
+            progress("looking at whether both sides fit")
+            units = _said(options, "robot").detect_units
+            recording = require_plausible(recording, arm, detect_units=units, scale=options.scale)
+            links_at = links_of(recording.robot, arm, np.arange(len(robot.Ts), dtype=float))
+            links, t_s = None if links_at is None else links_at(recording.rows.astype(float)), recording.t_s
+            found = calibrate_poses(recording.poses, t_s=t_s, links=links, scale=options.scale, progress=progress)
     progress("choosing poses")
     plan = plan_mounting(found, recording.poses, options.plan) if options.plan else None
     return HandEyeAnswer(recording, found, offset_s, sigma_s, plan)

@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 @click.option(
     "--prior", "priors", multiple=True, metavar="NAME=SIGMA", help="Sigma (m, rad) of a parameter or kind; 0 keeps it."
 )
-@output("DIR", "Folder for the corrected arm and the report.")
+@output("DIR", "Folder for the corrected arm and the report; needs armsight[report].")
 @click.option("-v", "--verbose", is_flag=True, help="Print all numbers, and why the others were not fitted.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object, SI units.")
 @click.pass_context

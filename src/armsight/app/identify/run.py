@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from armsight.data import Array, Record
-from armsight.errors import CalibrationError
+from armsight.errors import CalibrationError, noted
 from armsight.loop.identify.identify import ALIKE, Identified, Validation
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.misread import find_step, without_tool
@@ -52,7 +52,8 @@ def run_identify(
     """
     if other is not None:
         check_other(arm, measured, other, other_name)
-    found = identify_held_out(arm, measured, other=other, priors=priors, progress=progress)
+    with noted(notes):
+        found = identify_held_out(arm, measured, other=other, priors=priors, progress=progress)
     if (held_out := found.held_out) is None:
         raise CalibrationError(f"too few poses to leave a fifth of them out: {len(measured)}; take 10 and more")
     said = _notes(arm, found, measured, lines)

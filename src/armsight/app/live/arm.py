@@ -190,11 +190,7 @@ class ArmStep(PageStep[ArmState]):
             except DeviceError:
                 check_arm(name)
                 raise
-            try:
-                require_joints(board, name, self.model)
-            except InputError:
-                board.close()
-                raise
+            require_joints(board, name, self.model)
             self._board = board
         try:
             self._start = read_motions(self.model, self.shared.motion).start
@@ -659,9 +655,10 @@ class ArmStep(PageStep[ArmState]):
 
     def _command(self) -> str:
         options, measuring = self.shared.options, self._measuring
+        board = options.board or ("serial:PORT" if self._simulated is None else "emulated:")
         motion = f" --motion {self.shared.motion}{' --follow-rig' * options.follow_rig}" if self._logged is None else ""
         return (
-            f"armsight run --source {self.shared.source} --board {options.board or 'serial:PORT'} --rig "
+            f"armsight run --source {self.shared.source} --board {board} --rig "
             f"{measuring.rig_path or 'rig.json'} --target {measuring.target_spec or 'body.toml'} "
             f"--arm {options.arm}{motion} -o run"
         )

@@ -384,11 +384,6 @@ class MeasureStep(PageStep[MeasureState]):
             return "no calibrated rig yet: finish the calibration first, or give --rig"
         return "" if self._body is not None else "no body yet: choose one in the step Body"
 
-    @property
-    def source(self) -> str:
-        """The cameras as the command lines name them."""
-        return "usb:LEFT,RIGHT" if self.shared.simulated is not None else self.shared.source
-
     def now(self) -> MeasureState:
         """Return what is shown, with the newest pose."""
         path, rig, body = self.rig_path, self.rig, self._body
@@ -413,7 +408,10 @@ class MeasureStep(PageStep[MeasureState]):
                 shown = replace(shown, reason=result.reason)
         latency = np.percentile(list(self._latency), (50, 99)).tolist() if self._latency else None
         span = self._times[-1] - self._times[0] if len(self._times) > 2 else 0.0
-        recording = self._recording
+        recording, source = self._recording, self.shared.source
+        command = f"armsight measure {path} --target {body.spec} --source {source} -o poses.csv"
+        if self.shared.simulated is not None:  # no camera: the workcell is measured by a run
+            command = f"armsight run --rig {path} --target {body.spec} --source {source} --board emulated: -o run"
         return replace(
             shown,
             ready=True,
@@ -425,7 +423,7 @@ class MeasureStep(PageStep[MeasureState]):
             pivoting=self._pivot_poses is not None,
             recording=None if recording is None else f"{recording.path.name}: {recording.rows} poses",
             scene=self._scene(rig, p_body),
-            command=f"armsight measure {path} --target {body.spec} --source {self.source} -o poses.csv",
+            command=command,
         )
 
     def _distance(self, pose: PoseEstimate) -> tuple[float, float] | None:

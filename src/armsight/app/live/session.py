@@ -357,8 +357,7 @@ class LiveSession:
                 f"a pose takes {latency[0]:.0f} ms, a shot comes every {1e3 / rate:.0f} ms: this computer is too busy"
             )
             notes.append(Note("warn", f"{text}, or the images are too large"))
-        rig, target = measure.rig or "rig.json", measure.target or "body.toml"
-        command = f"armsight measure {rig} --target {target} --source {self.measuring.source}"
+        command = measure.command
         if (run := self.arm.shown.folder) is not None:
             command = f"armsight check {run}; armsight rig update {run} -o rig2.json"
         slowest_ms, found = 1e3 * self.capture.slowest_s, measure.health

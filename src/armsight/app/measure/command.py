@@ -25,6 +25,7 @@ class MeasureOptions:
     save_rig: Path | None
     output: Path | None
     stream: Sequence[str]
+    board: str | None
     view_dir: Path | None
     as_json: bool
 
@@ -69,6 +70,11 @@ class MeasureOptions:
 )
 @output("POSES.csv", "Write the poses as CSV.")
 @stream_option()
+@click.option(
+    "--board",
+    metavar="BOARD",
+    help="Publish this board's joint readings, too: serial:, feetech: or ar4:PORT, emulated:.",
+)
 @click.option("--view", "view_dir", metavar="DIR", type=PATH, help="Write annotated pictures.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object per shot.")
 def command(**given: object) -> None:

@@ -13,6 +13,7 @@ from pathlib import Path
 import click
 import numpy as np
 
+from armsight.app.board.readings import BoardReadings
 from armsight.app.measure.command import MeasureOptions
 from armsight.app.measure.moving import Requested, requested_shutters
 from armsight.app.measure.picture import SINGULAR
@@ -34,7 +35,7 @@ from armsight.vision.match import gate
 from armsight.vision.pose.shot_pose import ANGLES, CSV_COLUMNS, SHUTTER_COLUMNS, ShotPose, row_of, shot_pose
 from armsight.vision.rig import Shutters, StereoRig
 from armsight.vision.source import LIVE_S
-from armsight.vision.sources import open_rig
+from armsight.vision.sources import LIVE, open_rig
 
 #: Standard deviation of the time between the two exposures of a shot, s: of cameras that nothing synchronises to better.
 _SYNC_S = 1e-3
@@ -74,7 +75,10 @@ def measure_shots(options: MeasureOptions) -> tuple[HealthFinding, ...]:
         if view is not None:
             stack.callback(lambda: view.finish([*run.records]))
         stack.callback(run.close)
-        publisher = stack.enter_context(contextlib.closing(_streams(options.stream, rig, shots.body)))
+        board = None if options.board is None else BoardReadings(options.board)
+        publisher = stack.enter_context(contextlib.closing(_streams(options.stream, rig, shots.body, board)))
+        if board is not None:
+            stack.enter_context(contextlib.closing(board)).start(publisher.put, lambda line: click.echo(line, err=True))
         missed = _Contradicting(rig, shots.body, shots.again)
         try:
             run.measure(_watched(rig, fixed, missed.keeping(shots.results), run.monitor), publisher)
@@ -111,7 +115,9 @@ def _checked_outputs(options: MeasureOptions) -> Path | None:
 
 
 def _check_detections(options: MeasureOptions, requested: Requested | None) -> None:
-    """Reject options that need images where only detections are given."""
+    """Reject options that need images where only detections are given, or live cameras where there are none."""
+    if options.board is not None and not (options.stream and options.source.startswith(LIVE)):
+        raise InputError("--board: joints are published beside live cameras: give --stream, and --source usb: or url:")
     for given, why in (
         (requested is not None, "--skew and --readout need images with times: detections have none"),
         (bool(options.fixed), "--fixed needs images: detections have the markers of the target alone"),
@@ -391,14 +397,14 @@ def _watched(
         yield result
 
 
-def _streams(specs: Sequence[str], rig: StereoRig, body: Body) -> Publisher:
+def _streams(specs: Sequence[str], rig: StereoRig, body: Body, board: BoardReadings | None) -> Publisher:
     if not specs:
         return Fanout()
     from armsight.app.stream.streams import open_streams
 
-    return open_streams(
-        specs, Published(rig, body, properties={"command": "measure"}), lambda line: click.echo(line, err=True)
-    )
+    celsius = None if board is None else board.temperatures_c
+    published = Published(rig, body, properties={"command": "measure"}, temperatures_c=celsius)
+    return open_streams(specs, published, lambda line: click.echo(line, err=True))
 
 
 def _line(record: ShotPose, width: int) -> str:

@@ -225,8 +225,9 @@ class Devices:
 
 
 def require_joints(board: MotionBoard, name: str, arm: Arm) -> None:
-    """Raise an InputError if a board drives another number of joints than the arm has."""
+    """Close a board that drives another number of joints than the arm has, and raise an InputError."""
     if board.abilities.joints != len(arm.a):
+        board.close()
         raise InputError(
             f"--board {name} has {board.abilities.joints} joints, --arm {arm.name} {len(arm.a)}: give the arm that is at"
             " the board (armsight arm list)"

@@ -1,7 +1,8 @@
-"""The file of ``armsight serve``: a table ``measure`` of options by their long names, and a table ``serve``."""
+"""The file of ``armsight serve``: tables ``measure`` of options by their long names, ``board`` and ``serve``."""
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import importlib
 from dataclasses import dataclass
@@ -21,6 +22,7 @@ _OWN = {
     "help": "type it on the command line",
     "save_rig": "it is written when the command ends",
     "view": "pictures of days fill the disk",
+    "board": "it is the port of the table [board]",
 }
 
 
@@ -29,7 +31,7 @@ class ServeConfig:
     """What is kept going, and how.
 
     Attributes:
-        arguments: of `armsight measure`, without --output.
+        arguments: of `armsight measure`, without --output; --board is among them where one is watched.
         folder: where relative paths begin: that of the file.
         http: where /healthz and /metrics are, ``host:port``; empty for nowhere.
         log: file of the log, empty for stderr.
@@ -60,39 +62,46 @@ def read_config(path: Path) -> ServeConfig:
     document = read_toml(path)
     if "run" in document:
         raise InputError(f"{path}: [run] is not served: an arm must not begin to move again by itself after a loss")
-    if unknown := sorted(document.keys() - {"measure", "serve"}):
-        raise InputError(f"{path}: unknown table [{unknown[0]}]; known are [measure] and [serve]")
+    if unknown := sorted(document.keys() - {"measure", "board", "serve"}):
+        raise InputError(f"{path}: unknown table [{unknown[0]}]; known are [measure], [board] and [serve]")
     given = document.get("measure")
     if not isinstance(given, dict):
         raise InputError(
             f"{path}: expected a table [measure], with the options of `armsight measure` by their long names"
         )
-    service = _service(path, document.get("serve", {}))
+    service = _table(path, "serve", document, _TEXTS, _NUMBERS)
+    board = _table(path, "board", document, ("port",))
+    if "board" in document and "port" not in board:
+        raise InputError(f"{path}: [board] has no port, such as feetech:/dev/ttyACM0")
     folder = path.expanduser().resolve().parent
     command: click.Command = importlib.import_module("armsight.app.measure.command").command
-    arguments = _arguments(path, command, given)
+    arguments = _arguments(path, command, given) + tuple(f"--board={each}" for each in board.values())
     try:
         command.make_context("measure", list(arguments)).close()
     except click.UsageError as error:
         raise InputError(f"{path}: [measure]: {error.format_message()}") from None
-    _check(folder, given)
+    with contextlib.chdir(folder):
+        _check(given, board)
     each_start = tuple(each for each in arguments if not each.startswith("--output="))
     return ServeConfig(each_start, folder, **service, output=str(given.get("output", "")))
 
 
-def _service(path: Path, given: Any) -> dict[str, Any]:  # noqa: ANN401 - whatever TOML holds
+def _table(
+    path: Path, name: str, document: dict[str, Any], texts: tuple[str, ...], numbers: tuple[str, ...] = ()
+) -> dict[str, Any]:
+    given = document.get(name, {})
     if not isinstance(given, dict):
-        raise InputError(f"{path}: serve is {given!r}: expected a table [serve]")
+        raise InputError(f"{path}: {name} is {given!r}: expected a table [{name}]")
     found: dict[str, Any] = {}
     for key, value in given.items():
-        if key not in _TEXTS and key not in _NUMBERS:
-            raise InputError(f"{path}: [serve] has an unknown key {key!r}{_near(key, [*_TEXTS, *_NUMBERS])}")
-        if key in _TEXTS and not isinstance(value, str):
-            raise InputError(f"{path}: [serve] {key} is {value!r}: expected a text")
-        if key in _NUMBERS and (isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < 1e6):
-            raise InputError(f"{path}: [serve] {key} is {value!r}: expected a number above 0")
+        if key not in texts and key not in numbers:
+            raise InputError(f"{path}: [{name}] has an unknown key {key!r}{_near(key, [*texts, *numbers])}")
+        if key in texts and not isinstance(value, str):
+            raise InputError(f"{path}: [{name}] {key} is {value!r}: expected a text")
+        if key in numbers and (isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < 1e6):
+            raise InputError(f"{path}: [{name}] {key} is {value!r}: expected a number above 0")
         if key == "log_files" and value != int(value):
-            raise InputError(f"{path}: [serve] log_files is {value!r}: expected a whole number above 0")
+            raise InputError(f"{path}: [{name}] log_files is {value!r}: expected a whole number above 0")
         found[key] = int(value) if key == "log_files" else value
     return found
 
@@ -132,11 +141,13 @@ def _near(key: str, known: list[str]) -> str:
     return f": did you mean {near[0]}?" if near else f"; known are {', '.join(sorted(known))}"
 
 
-def _check(folder: Path, given: dict[str, Any]) -> None:
-    """Open rig and target once: a mistake in them ends the service before it begins."""
+def _check(given: dict[str, Any], board: dict[str, Any]) -> None:
+    """Open rig and target, and look at the port: a mistake in them ends the service before it begins."""
+    from armsight.robot.board_registry import check_board
     from armsight.vision.markers.targets import open_target
     from armsight.vision.sources import open_rig
 
-    target = folder / str(given["target"])
-    open_rig(folder / str(given["rig"]))
-    open_target(str(target) if target.exists() else str(given["target"]))
+    open_rig(str(given["rig"]))
+    open_target(str(given["target"]))
+    for each in board.values():
+        check_board(each)

@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from armsight.app.interrupts import uninterrupted
+from armsight.app.options import BOARD
 from armsight.app.serve.config import ServeConfig
 from armsight.app.show.http import Answer, Pages, metrics_text
 from armsight.errors import InputError
@@ -40,8 +41,8 @@ _PAUSE_S = 0.5
 _LINES = 1000
 #: What is started; the command and its options follow.
 _ARMSIGHT = (sys.executable, "-P", "-m", "armsight")
-#: Lines of the child that only say that it goes on.
-_PROGRESS = re.compile(r"[a-z ]+: \d+( of \d+)?$")
+#: Lines of the child that only say that it goes on, and those that it also publishes.
+_PROGRESS = re.compile(rf"[a-z ]+: \d+( of \d+)?$|{BOARD}")
 #: Metric -> its kind and what it is, as Prometheus shows it.
 METRICS = {
     "up": ("gauge", "1 while shots arrive"),
@@ -52,6 +53,10 @@ METRICS = {
     "latency_seconds": ("gauge", "time from the newest exposure to its pose"),
     "sigma_metres": ("gauge", "standard deviation of the newest position, root sum of squares of its axes"),
     "process_resident_bytes": ("gauge", "memory of the process that measures"),
+    "board_up": ("gauge", "1 while the board's joint readings arrive"),
+    "readings_total": ("counter", "joint readings of the board since the service began"),
+    "board_losses_total": ("counter", "times that the board was lost"),
+    "reading_age_seconds": ("gauge", "time since the newest joint reading arrived"),
 }
 
 
@@ -69,6 +74,11 @@ class Service:
         self._why, self._tries = "starting", 0
         self._counts = {"shots_total": 0.0, "missed_total": 0.0, "losses_total": 0.0}
         self._values: dict[str, float] = {}
+        self._board = any(each.startswith("--board=") for each in config.arguments)
+        self._read = self._began  # when the newest joint readings came
+        self._board_lost: tuple[float, str] | None = None  # since when, and why
+        if self._board:
+            self._counts |= {"readings_total": 0.0, "board_losses_total": 0.0}
 
     def run(self) -> int:
         """Keep the command going until it ends by itself; return its exit code, 0 or 3.
@@ -106,20 +116,31 @@ class Service:
     def state(self) -> dict[str, Any]:
         """Return what /healthz shows."""
         now = time.monotonic()
-        lost = self._lost_since
+        lost, board = self._lost_since, self._board_why(now)
         return {
-            "healthy": lost is None and self._why == "",
-            "why": self._why or None,
+            "healthy": not self._why and board is None,
+            "why": self._why or board,
             "for_s": round(now - (self._began if lost is None else lost), 1),
             "shot_age_s": round(now - self._newest, 2) if self._counts["shots_total"] else None,
             "tries": self._tries,
+            "reading_age_s": round(now - self._read, 2) if self._board else None,
         }
+
+    def _board_why(self, now: float) -> str | None:
+        """Return why no joint readings arrive; None where they do, or no board is watched."""
+        if self._board_lost is not None:
+            return self._board_lost[1]
+        silent = self._board and now - self._read > self._config.stale_s
+        return f"{BOARD}no reading for {self._config.stale_s:g} s" if silent else None
 
     def values(self) -> dict[str, float]:
         """Return what /metrics shows."""
-        found = {"up": float(self.state()["healthy"]), **self._counts, **self._values}
+        found = {"up": float(not self._why), **self._counts, **self._values}
         if self._counts["shots_total"]:
             found["shot_age_seconds"] = time.monotonic() - self._newest
+        if self._board:
+            now = time.monotonic()
+            found |= {"board_up": float(self._board_why(now) is None), "reading_age_seconds": now - self._read}
         if (child := self._child) is not None:
             with suppress(OSError, IndexError):
                 pages = int(Path(f"/proc/{child.pid}/statm").read_text().split()[1])
@@ -174,6 +195,11 @@ class Service:
         """Take one published datum; what is none, from whoever sends to the port, is passed over."""
         try:
             datum = json.loads(datagram)
+            if datum["kind"] == "joints" and self._board:
+                self._read = time.monotonic()
+                self._counts["readings_total"] += len(datum["t_s"])
+            if datum["kind"] == "log" and datum["text"].startswith(BOARD):
+                self._said_of_board(datum["text"], datum["level"])
             if datum["kind"] != "shot":
                 return
             ok, age_s = datum["status"] == "ok", datum["age_s"]
@@ -195,6 +221,19 @@ class Service:
         if self._why:
             self._began, self._lost_since, self._why = self._newest, None, ""
             self._tries = 0
+
+    def _said_of_board(self, text: str, level: str) -> None:
+        """Log what the child says of its board; a loss and the return from it once, whichever child notices them."""
+        if level == "error" and self._board_lost is None:
+            self._board_lost = time.monotonic(), text
+            self._counts["board_losses_total"] += 1
+            self._event("board lost", text, why=text)
+        elif level == "info" and self._board_lost is not None:
+            gone_s = time.monotonic() - self._board_lost[0]
+            self._board_lost = None
+            self._event("board back", f"{BOARD}back after {gone_s:.1f} s", gone_s=round(gone_s, 2))
+        elif level == "warning":
+            self._log.info("%s", text)
 
     def _lost(self, why: str) -> None:
         """Say that the child was lost: once, and again where another reason shows."""

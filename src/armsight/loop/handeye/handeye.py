@@ -29,7 +29,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import chdtri, expit, fdtri
 
 from armsight.data import Array, Record
-from armsight.errors import CalibrationError, InputError, require
+from armsight.errors import CalibrationError, InputError, noted, require
 from armsight.estimate.linear import Linear
 from armsight.estimate.solve import Solved, covariances, left_out, log_density, solve
 from armsight.estimate.variance import SPEAKS, integrate, most_probable, posterior, scores
@@ -398,9 +398,10 @@ def calibrate_handeye(
         each.Ts if isinstance(each, PoseTable) else each if isinstance(each, np.ndarray) else as_transforms(each)
         for each in (Ts_base_flange, Ts_rig_body)
     )
-    poses = checked_poses(A, B, covs, eye, np.zeros(3) if centre is None else centre)
-    require_mounting(poses)
-    return calibrate_poses(poses, quick=quick, progress=progress)
+    with noted([note for each in (Ts_base_flange, Ts_rig_body) if isinstance(each, PoseTable) for note in each.notes]):
+        poses = checked_poses(A, B, covs, eye, np.zeros(3) if centre is None else centre)
+        require_mounting(poses)
+        return calibrate_poses(poses, quick=quick, progress=progress)
 
 
 def calibrate_poses(

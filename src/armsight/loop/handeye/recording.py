@@ -205,7 +205,8 @@ def paired(robot: PoseTable, seen: Seen, in_hand: bool, arm: Arm | None) -> Pair
     _require_moving(robot, rows, B)
     both_clocks = robot.t_s is not None and seen.t_s is not None
     t_s = robot.t_s[rows] if robot.t_s is not None and (both_clocks or seen.t_s is None) else None
-    names = tuple(f"line {robot.lines[r]} ({seen.names[k]})" for r, k in zip(rows, matched, strict=True))
+    lines = tuple(f"line {robot.lines[r]}" for r in rows)
+    names = tuple(n if n == seen.names[k] else f"{n} ({seen.names[k]})" for n, k in zip(lines, matched, strict=True))
     notes += _tcp(robot, arm)
     poses = Poses(A, B, covs, in_hand, seen.centre, common)
     return PairedPoses(poses, rows, names, t_s, robot, seen, matched, tuple(notes))

@@ -214,7 +214,7 @@ class Identified(Record):
         return np.asarray(self.solution.cov[np.ix_(rows, rows)] / np.outer(sigma, sigma))
 
     def correlated(self) -> list[tuple[str, str, float]]:
-        """Return the pairs of fitted parameters whose correlation is over CORRELATED, strongest first."""
+        """Return the pairs of fitted parameters whose correlation is over 0.9, strongest first."""
         rows = np.flatnonzero(self.solution.free)
         C = self.correlation(rows)
         i, j = np.nonzero(np.triu(np.abs(C) > CORRELATED, 1))
@@ -240,17 +240,7 @@ def identify(
     priors: Mapping[str, float] | None = None,
     progress: Callable[[str], None] = lambda line: None,
 ) -> Identified:
-    """Identify an arm from poses.
-
-    Args:
-        arm: the nominal arm; where base and tool are is found from the data.
-        measured: joint angles, and where the tool was measured, as ``read_poses`` returns them.
-        priors: sigma by name of a parameter or a kind, instead of ``fit.SIGMA``; 0 keeps one at its nominal value.
-        progress: called with the name of each step as it begins.
-
-    Returns:
-        Every number with its sigma: ``columns()`` is a table for pandas, ``validate`` says how far off it is on other
-        poses, ``Corrected.of`` makes an arm of it that computes and is saved.
+    """Identify an arm from all poses, as :func:`~armsight.loop.identify.validate.identify_held_out` does from a part.
 
     Raises:
         InputError: too few poses, or data that cannot be of this arm; the message says what would make them fit.

@@ -36,7 +36,7 @@ class Measured(Record):
         approach: (N, n) from which side each joint came to rest: +1 while its angle grew, -1 while it fell, 0 unknown;
             None where nothing is known.
         angles_deg: (N, 3) rx, ry, rz as in the file, degrees, where the rotations came as angles; None else.
-        rotation: the convention that these were read in, one of ROTATIONS; "" else.
+        rotation: the convention that these were read in, such as "zyx"; "" else.
         length_m: (N,) distance of the one point from the rig's origin, m, where only that was measured; ``p_rig`` is
             then unused.
     """

@@ -54,7 +54,7 @@ def read_poses(
         path: the file.
         rotation: the convention of rx_deg, ry_deg, rz_deg, such as "zyx"; None: they are not used; a wrong one: the error
             lists all.
-        columns: a mapping of names of COLUMNS to the file's, as text NAME=THEIRS,... or the names of all in order.
+        columns: a mapping of these names to the file's, as text NAME=THEIRS,... or the names of all in order.
         arm: whose joints they are, where that is known.
 
     Raises:

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from armsight.data import Array
-from armsight.errors import CalibrationError, InputError, require
+from armsight.errors import CalibrationError, InputError, noted, require
 from armsight.estimate.solve import covariances
 from armsight.loop.identify.fit import fit, linear_of, variances_of, with_joint_noise
 from armsight.loop.identify.identify import Errors, Identified, LeftOut, Validation, identify
@@ -49,6 +49,10 @@ def validate(found: Identified, measured: Measured | Read) -> Validation:
     Args:
         found: the identified arm.
         measured: other poses, as ``read_poses`` returns them; points or full poses as it was identified with.
+
+    Returns:
+        How far the nominal and the identified arm are off at these poses, m and rad. Where the poses are of another setup,
+        base and tool are fitted to them first, for both, and it says so.
 
     Raises:
         InputError: another number of points, or points instead of poses.
@@ -115,7 +119,8 @@ def identify_held_out(
         arm: the nominal arm; where base and tool are is found from the data.
         measured: joint angles, and where the tool was measured, as ``read_poses`` returns them.
         other: poses to validate with, instead of those left out.
-        priors: sigma by name of a parameter or a kind, instead of ``fit.SIGMA``; 0 keeps one at its nominal value.
+        priors: sigma, m or rad, by name of a parameter ("a2") or a kind ("alpha"), where it is not 10 mm of a length, 2
+            or 3 degrees of an angle; 0 keeps one at its nominal value.
         progress: called with the name of each step as it begins.
 
     Returns:
@@ -130,11 +135,12 @@ def identify_held_out(
     """
     call = "identify(arm, measured)"
     require(call, "arm", arm, isinstance(arm, Arm), 'open_arm("ur10")')
-    measured = measured_of(call, measured)
+    notes, measured = measured.notes if isinstance(measured, Read) else (), measured_of(call, measured)
     if other is not None:
         other = measured_of(call, other, "other")
         check_other(arm, measured, other, "other")
-    found = identify(arm, measured, priors=priors, progress=progress)
+    with noted(notes):
+        found = identify(arm, measured, priors=priors, progress=progress)
     if other is None:
         try:
             held_out = _left_out(arm, measured.rows(found.solution.used), priors, progress)

@@ -627,19 +627,9 @@ def calibrate_recording(
     at given cameras; with rho its correlation with them an error shrinks by rho^2 each round, so the sigma of both is that
     over sqrt(1 - shrinkage).
 
-    Args:
-        board: the board's drawing and its symmetries.
-        pairs: detections of every shot, in the order of their time.
-        t_s: (N,) times of the shots, s, rising.
-        sizes: image size of the left and of the right camera, px.
-        models: distortion models to choose from by held-out error.
-        flat: hold the board to its drawing.
-        folds: how many parts the pairs are split into for the held-out errors.
-        singles: detections of further images by one camera alone.
-        progress: called with a line about what is being done.
-
     Returns:
         As :func:`calibrate_boards`, with the skew in the rig where there is one; a note says so, or why it was not found.
+        ``pairs`` are in the order of ``t_s``, (N,) the times of the shots, s, rising.
 
     Raises:
         CalibrationError: fewer than three usable pairs, or views that do not determine the cameras.
