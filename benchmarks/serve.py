@@ -115,6 +115,15 @@ class Cable:
         return bool(self.bus.servos.on.all() and np.abs(self.bus.servos.shaft - self.began).max() < np.radians(0.1))
 
 
+def used_s(pid: int | None) -> float:
+    """Return the processor time that a process has used, s; NaN where it is gone."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return float("nan")
+    return sum(map(int, fields[11:13])) / os.sysconf("SC_CLK_TCK")
+
+
 def rss_mb(pid: int) -> float:
     """Return the resident memory of a process, MB."""
     return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
@@ -215,7 +224,7 @@ def campaign(
     slope = np.polyfit(shots[len(shots) // 3 :], memory[len(memory) // 3 :], 1)[0]
     ways = ("gone", "frozen", "killed")
     back: dict[str, list[float]] = {kind: [] for kind in (*ways, "board")}
-    lines, own, never = [], [], 0
+    lines, own, used, never = [], [], [], 0
     arm.began = arm.bus.servos.shaft.copy()
     for k, lost in enumerate(kinds):
         kind, at = rng.choice(ways) if lost == "cameras" else lost, len(served.events)
@@ -241,6 +250,7 @@ def campaign(
         never += found is None
         if found is not None:
             back[kind].append(found[0] - restored)
+            used += [used_s(served.child())] if kind != "board" else []
         lines.append([event["why"] for _, event in served.events[at:] if event["event"].endswith("lost")])
         own.append(rss_mb(served.process.pid))
         time.sleep(rng.uniform(0.5, 2.0))
@@ -258,6 +268,9 @@ def campaign(
     for kind, each in back.items():
         if each:
             print(f"  {kind}: {len(each)}, back after {np.median(each):.1f} s (median), {max(each):.1f} at most")
+    print(
+        f"  processor time of a new child until its first shot {np.nanmedian(used):.1f} s, {np.nanmax(used):.1f} at most"
+    )
     print(f"  service {own[0]:.1f} MB after the first loss, {own[-1]:.1f} after the last, {max(own):.1f} at most")
     print(f"  child {memory[0]:.1f} to {memory[-1]:.1f} MB over {shots[-1]:.0f} shots: {1e3 * slope:.2f} kB a shot")
     print(f"  up {healthy['armsight_up']:.0f}, board {healthy['armsight_board_up']:.0f}, ", end="")
