@@ -220,6 +220,12 @@ class StereoRig(Record):
         return float(np.linalg.norm(self.T_left_right[:3, 3]))
 
     @property
+    def baseline_sigma_m(self) -> float:
+        """Standard deviation of the baseline, m; 0 where the rig's uncertainty is unknown."""
+        along = self.T_left_right[:3, :3].T @ self.T_left_right[:3, 3] / max(self.baseline_m, 1e-12)
+        return float(np.sqrt(max(float(along @ self.cov[-6:-3, -6:-3] @ along), 0.0)))
+
+    @property
     def convergence_deg(self) -> float:
         """Angle between the two optical axes, degrees."""
         return float(np.degrees(np.arccos(np.clip(self.T_left_right[2, 2], -1, 1))))

@@ -112,10 +112,10 @@ def pose_table(rig: StereoRig) -> str:
     ]  # by finite differences
     J = (np.array(ends[0]) - ends[1]).T / (2 * _STEP_RAD)
     cov_t = T[:3, :3] @ cov[:3, :3] @ T[:3, :3].T  # the tangent's translation is along the right camera's axes
-    toward, rotation = T[:3, 3] / max(rig.baseline_m, 1e-12), np.degrees(log_so3(T[:3, :3]))
+    rotation = np.degrees(log_so3(T[:3, :3]))
     sigma_mm, sigma_deg = 1e3 * np.sqrt(np.diag(cov_t)), np.degrees(np.sqrt(np.diag(J @ cov @ J.T)))
     rows = [
-        ("baseline, mm", _with_sigma(1e3 * rig.baseline_m, 1e3 * float(np.sqrt(toward @ cov_t @ toward)))),
+        ("baseline, mm", _with_sigma(1e3 * rig.baseline_m, 1e3 * rig.baseline_sigma_m)),
         *((f"{axis}, mm", _with_sigma(1e3 * T[k, 3], sigma_mm[k])) for k, axis in enumerate("XYZ")),
         ("angle between the optical axes, degrees", f"{rig.convergence_deg:.3f}"),
         *((f"rotation vector {axis}, degrees", _with_sigma(rotation[k], sigma_deg[k])) for k, axis in enumerate("XYZ")),

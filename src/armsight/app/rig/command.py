@@ -143,13 +143,6 @@ def _image_size(text: str) -> tuple[int, int]:
     return int(match[1]), int(match[2])
 
 
-def _baseline_sigma_m(rig: StereoRig) -> float | None:
-    """Return the standard deviation of the baseline, m; None where the rig's uncertainty is unknown."""
-    along = rig.T_left_right[:3, :3].T @ (rig.T_left_right[:3, 3] / rig.baseline_m)  # d|t| by the tangent's translation
-    variance = float(along @ rig.cov[-6:-3, -6:-3] @ along)
-    return math.sqrt(variance) if variance > 0 else None
-
-
 def _sigmas(rig: StereoRig) -> dict[str, float]:
     """Return the standard deviation of each parameter by its name; 0 where it is unknown."""
     variances = rig.cov.diagonal().tolist()
@@ -170,7 +163,7 @@ def _json(path: str, rig: StereoRig) -> dict[str, Any]:
         },
         "T_left_right_m": rig.T_left_right.tolist(),
         "baseline_m": rig.baseline_m,
-        "baseline_sigma_m": _baseline_sigma_m(rig),
+        "baseline_sigma_m": rig.baseline_sigma_m or None,
         "convergence_deg": rig.convergence_deg,
         "sigma_px": rig.sigma_px,
         "sigmas": {name: sigma or None for name, sigma in _sigmas(rig).items()},
@@ -183,15 +176,14 @@ def _json(path: str, rig: StereoRig) -> dict[str, Any]:
 
 
 def _lines(rig: StereoRig) -> list[str]:
-    sigmas, sigma_baseline = _sigmas(rig), _baseline_sigma_m(rig)
-    lines = []
+    sigmas, lines = _sigmas(rig), list[str]()
     for side, camera in zip(("left", "right"), rig.cameras, strict=True):
         names = [name for name in rig.parameter_names if name.startswith(f"{side}.")]
         lines.append(f"{side}: {camera.image_size_px[0]}x{camera.image_size_px[1]} px, distortion {camera.model}")
         for name, value in zip(names, camera.parameters, strict=True):
             sigma = f" +- {sigmas[name]:.2g}" if sigmas[name] > 0 else ""
             lines.append(f"  {name.removeprefix(f'{side}.'):6} {value:.6g}{sigma}")
-    spread = f" +- {sigma_baseline * 1e3:.2g}" if sigma_baseline is not None else ""
+    spread = f" +- {rig.baseline_sigma_m * 1e3:.2g}" if rig.baseline_sigma_m else ""
     x, y, z = rig.T_left_right[:3, 3] * 1e3
     lines += [
         f"baseline: {rig.baseline_m * 1e3:.3f}{spread} mm, right camera at ({x:.3f}, {y:.3f}, {z:.3f}) mm",

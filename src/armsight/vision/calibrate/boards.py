@@ -411,13 +411,11 @@ def calibrate_boards(
 
 def _apart(rig: StereoRig, state: BundleState) -> None:
     """Raise a CalibrationError where both cameras stand at one position, so that nothing can be triangulated."""
-    along = rig.T_left_right[:3, :3].T @ rig.T_left_right[:3, 3] / max(rig.baseline_m, 1e-12)
-    sigma_m = float(np.sqrt(along @ rig.cov[-6:-3, -6:-3] @ along))
     distance_m = float(np.median(np.linalg.norm(state.Ts_left_body[:, :3, 3], axis=1)))
-    if rig.baseline_m < max(_BASELINE_SIGMAS * sigma_m, _BASELINE_SHARE * distance_m):
+    if rig.baseline_m < max(_BASELINE_SIGMAS * rig.baseline_sigma_m, _BASELINE_SHARE * distance_m):
         raise CalibrationError(
-            f"the cameras are {1e3 * rig.baseline_m:.0f} ± {1e3 * sigma_m:.0f} mm apart, which is no baseline: are left "
-            "and right images of one camera, or of different moments?"
+            f"the cameras are {1e3 * rig.baseline_m:.0f} ± {1e3 * rig.baseline_sigma_m:.0f} mm apart, which is no "
+            "baseline: are left and right images of one camera, or of different moments?"
         )
 
 

@@ -91,8 +91,7 @@ class VideoSource(Source):
     @property
     def notes(self) -> tuple[str, ...]:
         """What is odd: different rates, and frames among those read that are damaged, repeat or are mixtures."""
-        said = (text for file in self._files for text in (file.damaged(), file.repeats(), file.interpolated()))
-        return (*self._odd, *(text for text in said if text is not None))
+        return (*self._odd, *(text for file in self._files for text in file.notes()))
 
     @property
     def odd_frames(self) -> dict[str, dict[str, list[int]]]:
@@ -334,55 +333,48 @@ class _File(Film):
     def repeated(self) -> tuple[list[int], float]:
         """Numbers of the frames that repeat the ones before them, and their share; none where they are few."""
         changes = np.array(self._changes)
-        if len(changes) <= 2 * _NEARBY:
-            return [], 0.0
-        nearby = _largest_nearby(changes)
-        changing = nearby > _LEAST_CHANGE
-        return self._said(changing & (changes[_NEARBY:-_NEARBY] < _REPEAT_SHARE * nearby), changing)
+        return self._odd(changes, _LEAST_CHANGE, np.ones(len(changes), bool))
 
     @property
     def mixed(self) -> tuple[list[int], float]:
         """Numbers of the frames that are mixtures of their neighbours, and their share; none where they are few."""
-        if len(self._mixtures) <= 2 * _NEARBY:
-            return [], 0.0
-        left, first = np.array(self._mixtures).T
-        nearby = _largest_nearby(left)
-        moving = np.isfinite(nearby) & np.isfinite(left[_NEARBY:-_NEARBY])
-        between = (np.abs(first - 0.5) < 0.5 - _MIXED)[_NEARBY:-_NEARBY]
-        return self._said(moving & between & (left[_NEARBY:-_NEARBY] < _REPEAT_SHARE * nearby), moving)
+        left, first = np.array(self._mixtures).reshape(-1, 2).T
+        return self._odd(left, -1.0, np.abs(first - 0.5) < 0.5 - _MIXED)
 
-    def _said(self, odd: NDArray[np.bool_], of: NDArray[np.bool_]) -> tuple[list[int], float]:
-        """Return the numbers of odd frames (N,), and their share of others (N,), if it is large enough to be said."""
-        share = float(odd.sum() / max(of.sum(), 1))
+    def _odd(self, values: Array, least: float, may_be: NDArray[np.bool_]) -> tuple[list[int], float]:
+        """Return the numbers of frames of far smaller values (N,) than those nearby, and their share of those that change.
+
+        Nothing changes where those nearby are below ``least`` or infinite; none are returned where the share is too small.
+        """
+        if len(values) <= 2 * _NEARBY:
+            return [], 0.0
+        runs = np.lib.stride_tricks.sliding_window_view(values, _NEARBY).max(axis=1)
+        nearby, own = np.minimum(runs[: -_NEARBY - 1], runs[_NEARBY + 1 :]), values[_NEARBY:-_NEARBY]
+        changing = (nearby > least) & np.isfinite(nearby) & np.isfinite(own)
+        odd = changing & may_be[_NEARBY:-_NEARBY] & (own < _REPEAT_SHARE * nearby)
+        share = float(odd.sum() / max(changing.sum(), 1))
         numbers = np.array(self._numbers)[1 + _NEARBY :][: len(odd)]
         return (numbers[odd].tolist(), share) if share > _REPEATS_SAID else ([], 0.0)
 
-    def damaged(self) -> str | None:
-        """Return what to say where frames could not be decoded."""
-        return f"{self.path}: {self.undecoded} frames are damaged: left out" if self.undecoded else None
-
-    def repeats(self) -> str | None:
-        """Return what to say where frames repeat the ones before them, as a slower camera's do in a faster file."""
+    def notes(self) -> Iterator[str]:
+        """Yield what to say of frames that cannot be decoded, repeat (a slower camera's) or are mixed (another rate's)."""
+        if self.undecoded:
+            yield f"{self.path}: {self.undecoded} frames are damaged: left out"
         numbers, share = self.repeated
-        if not numbers:
-            return None
-        given, rate = (1 - share) / self.period_s, 1 / self.period_s
-        return (
-            f"{self.path}: {100 * share:.0f} % of the frames repeat the one before: the camera gave about {given:.0f} "
-            f"images a second and the file has {rate:.0f}; a repeated image is no new measurement, and its time is late: "
-            f"{_listed(numbers)}"
-        )
-
-    def interpolated(self) -> str | None:
-        """Return what to say where frames are mixtures of their neighbours, as a converted rate's are."""
+        if numbers:
+            given, rate = (1 - share) / self.period_s, 1 / self.period_s
+            yield (
+                f"{self.path}: {100 * share:.0f} % of the frames repeat the one before: the camera gave about {given:.0f} "
+                f"images a second and the file has {rate:.0f}; a repeated image is no new measurement, and its time is "
+                f"late: {_listed(numbers)}"
+            )
         numbers, share = self.mixed
-        if not numbers:
-            return None
-        return (
-            f"{self.path}: {100 * share:.0f} % of the frames are interpolated, mixtures of those before and after: they "
-            "show markers twice, or where they never were; record at the camera's own rate, or leave them out: "
-            f"{_listed(numbers)}"
-        )
+        if numbers:
+            yield (
+                f"{self.path}: {100 * share:.0f} % of the frames are interpolated, mixtures of those before and after: "
+                "they show markers twice, or where they never were; record at the camera's own rate, or leave them out: "
+                f"{_listed(numbers)}"
+            )
 
 
 def _one_clock(first: Film, last: Film) -> tuple[str, ...]:
@@ -404,12 +396,6 @@ def _listed(numbers: Sequence[int]) -> str:
     """Name the first few frames of many."""
     more = f" and {len(numbers) - _LISTED} more" if len(numbers) > _LISTED else ""
     return f"frames {', '.join(map(str, numbers[:_LISTED]))}{more} (from 0)"
-
-
-def _largest_nearby(values: Array) -> Array:
-    """Return the smaller of the largest of a few values before and after each that has so many, (N - 2 NEARBY,)."""
-    runs = np.lib.stride_tricks.sliding_window_view(values, _NEARBY).max(axis=1)
-    return np.asarray(np.minimum(runs[: -_NEARBY - 1], runs[_NEARBY + 1 :]))
 
 
 def _mixture(before: Array, frame: Array, after: Array) -> tuple[float, float]:
