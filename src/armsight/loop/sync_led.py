@@ -30,7 +30,7 @@ import numpy as np
 from armsight.data import Array, Missed, Record, Shot
 from armsight.errors import InputError
 from armsight.loop.estimators import Delay
-from armsight.loop.finding import HealthFinding
+from armsight.loop.finding import HealthFinding, make_finding
 from armsight.vision.blinking import Spot, block_means, candidates, spot, window
 from armsight.vision.rig import Shutters
 
@@ -626,18 +626,7 @@ def led_findings(watch: SyncLedWatch) -> tuple[HealthFinding, ...]:
     found = list[HealthFinding]()
     if watch.apart is not None and abs(watch.apart[0]) > max(_CHANGED * watch.apart[1], _APART_S):
         apart_s, sigma_s, t_s = watch.apart
-        found.append(
-            HealthFinding(
-                "time",
-                f"a sweep of the arm finds the images {abs(1e3 * apart_s):.2f} ms {'later' if apart_s > 0 else 'earlier'} "
-                "against the readings of the joints than the sync LED does against the board's clock, which was used",
-                t_s,
-                1e3 * apart_s,
-                1e3 * sigma_s,
-                "ms",
-                "look for joints that lag or slip (armsight identify), and for a filter of the readings before the board",
-            )
-        )
+        found.append(make_finding("swept apart", (apart_s, sigma_s), t_s))
     if len(watch.estimates) < 2:
         return tuple(found)
     first = watch.estimates[0]
@@ -657,15 +646,5 @@ def led_findings(watch: SyncLedWatch) -> tuple[HealthFinding, ...]:
         if not changed:
             continue
         since_s, (_, size, sigma_s) = changed[0][0], changes[-1]
-        found.append(
-            HealthFinding(
-                "time",
-                f"{what} {abs(1e3 * size):.2f} ms {'later' if size > 0 else 'earlier'} than at first, by the sync LED",
-                since_s,
-                1e3 * size,
-                1e3 * sigma_s,
-                "ms",
-                "trigger both cameras by one signal, and use the cameras' own stamps instead of times of arrival",
-            )
-        )
+        found.append(make_finding("led", (size, sigma_s), since_s, words={"what": what}))
     return tuple(found)

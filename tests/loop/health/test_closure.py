@@ -54,7 +54,7 @@ def watched(seed, kind=None, size=0.0, joint=0, seconds=45.0, lasts_s=np.inf):
             e += column @ np.atleast_1d(size) * ((t_s - AT_S) if kind == "drift" else 1.0)
         none = np.zeros((PARTS.size, 6))
         reference = partial(tuple, (e, H))
-        watch.take(Innovation(t_s, T, e, np.diag(SHOT**2), H, kept, none, Outcome.USED, None, reference))
+        watch.take([Innovation(t_s, T, e, np.diag(SHOT**2), H, kept, none, Outcome.USED, None, reference)])
     return watch
 
 

@@ -15,9 +15,8 @@ def sums_of(rng, tau_px, noise, change, count=12):
     for _ in range(count):
         A, L = rng.normal(size=(ROWS, OTHERS)), 30.0 * rng.normal(size=(ROWS, LENS))
         r = A @ change + L @ rng.normal(0.0, tau_px, LENS) + np.sqrt(noise) * rng.normal(size=ROWS)
-        sums = ResidualSums(OTHERS + LENS, 0.0)
-        sums.take(np.column_stack([r, A, L]), float(ROWS))
-        yield sums
+        rows = np.column_stack([r, A, L])
+        yield ResidualSums(rows.T @ rows, float(ROWS))
 
 
 @pytest.mark.parametrize("tau_px", [0.0, 0.008, 0.03])

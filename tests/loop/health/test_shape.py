@@ -189,9 +189,7 @@ def test_sums_of_what_grows_are_those_of_its_own_columns(begin, end):
     since = np.clip((begins_s - begins_s[begin]) / max(begins_s[end] - begins_s[begin], 1e-9), 0.0, 1.0)
     shares = np.where(begins_s >= begins_s[end], 1.0, since)
     for k, (each, begin_s) in enumerate(zip(rows, begins_s, strict=True)):
-        sums = ResidualSums(5, begin_s)
-        sums.take(each, 9.0)
-        tests.keep(sums, np.inf)
+        tests.keep(ResidualSums(each.T @ each, 9.0, begin_s), np.inf)
         scaled = each * np.append(np.ones(4), np.full(2, shares[k]))
         slow += (k != begin - 1) * scaled.T @ scaled
     found = tests.since(Onset(begins_s[begin], begins_s[end]))
@@ -205,8 +203,8 @@ def test_what_is_no_longer_kept_says_of_the_parameters_what_it_did():
     """Tests of before a change settle, with less weight the older they are, until it began; those after it do not."""
     rng, tests, kept = np.random.default_rng(9), History(3, 5), np.zeros((4, 4))
     for k in range(45):
-        sums = ResidualSums(5, float(k))
-        sums.take(rng.normal(size=(9, 6)), 9.0)
+        rows = rng.normal(size=(9, 6))
+        sums = ResidualSums(rows.T @ rows, 9.0, float(k))
         tests.keep(sums, 12.0)
         if k < 11:  # the eleventh may be of both times
             kept = np.exp(-1.0 / 30.0) * kept + sums.M[:4, :4]

@@ -16,7 +16,7 @@ import numpy as np
 
 from armsight.data import Body, Missed, PoseEstimate
 from armsight.errors import InputError
-from armsight.loop.finding import HealthFinding
+from armsight.loop.finding import HealthFinding, make_finding
 from armsight.vision.pose.shutter import TimedShot, estimate_shutters, measure_moving
 from armsight.vision.rig import Shutters, StereoRig
 
@@ -107,12 +107,5 @@ def skew_finding(
     found = estimate_shutters(rig, body, shots) if shots else Missed("")
     if not isinstance(found, Shutters) or abs(found.skew_s) <= max(_NOTED_SIGMAS * found.sigmas[0], _NOTED_S):
         return None
-    return HealthFinding(
-        "time",
-        f"the cameras do not expose at one time: {found}",
-        shots[0].t_s,
-        1e3 * found.skew_s,
-        1e3 * float(found.sigmas[0]),
-        "ms",
-        "--skew find moves the detections to one time",
-    )
+    evidence = found.skew_s, float(found.sigmas[0])
+    return make_finding("shutters", evidence, shots[0].t_s, words={"shutters": str(found)})

@@ -26,6 +26,7 @@ from armsight.app.stream.datum import Published
 from armsight.data import Body, Dropped, Missed, PoseEstimate, Shot
 from armsight.errors import ArmsightError, InputError
 from armsight.files import RowFile, check_writable
+from armsight.loop.finding import make_finding
 from armsight.loop.health import HealthFinding, HealthMonitor, health_lines, unseen_lines
 from armsight.loop.running.data import Fanout, HealthNotes, Publisher, ShotDatum
 from armsight.vision.follow.follower import measurer
@@ -369,18 +370,8 @@ class _Contradicting:
             return contradiction(self._rig, self._body, self._found, (count, count + self._measured))
         if self._few <= self._measured:
             return None
-        return HealthFinding(
-            "rig",
-            f"in {self._few} of {self._few + self._measured} shots that were measured most points contradict each other, "
-            "and no motion of the cameras explains most of them: one camera has another zoom or focus, or shows a part of "
-            "its image, or left and right images do not belong together",
-            None,
-            float(self._few),
-            0.0,
-            "measurements",
-            "look at the pairs of images; calibrate the rig again with images as they are now",
-            ("lens", "time"),
-        )
+        shots = {"shots": self._few + self._measured}
+        return make_finding("inconsistent", (float(self._few), 0.0), words=shots)
 
 
 def _watched(

@@ -14,7 +14,7 @@ import numpy as np
 from armsight.data import Array, Record
 from armsight.estimate.chance import chi_square_limit
 from armsight.geometry.pose import adjoint, inverse
-from armsight.loop.finding import LEVER_M, Cause, HealthFinding, displacement_m, sized
+from armsight.loop.finding import CAUSES, LEVER_M, Cause, HealthFinding, displacement_m, make_finding, sized
 
 if TYPE_CHECKING:
     from armsight.loop.estimators import PoseMeasurement
@@ -37,18 +37,6 @@ _ALONG = chi_square_limit(5, 0.01)
 FOCAL = "; both focal lengths that changed alike look the same to the pair"
 
 Kind = Literal["rig", "drift", "body", "bend", "joint", "backlash", "time", "rate", "zoom", "shake"]
-_CAUSES: dict[Kind, Cause] = {
-    "rig": "fixed",
-    "drift": "fixed",
-    "body": "body",
-    "bend": "body",
-    "joint": "joint",
-    "backlash": "joint",
-    "time": "time",
-    "rate": "time",
-    "zoom": "lens",
-    "shake": "fixed",
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +119,7 @@ class Suspect:
     @property
     def cause(self) -> Cause:
         """The cause that a record gives."""
-        return _CAUSES[self.kind]
+        return CAUSES[self.kind].cause
 
     @property
     def slow(self) -> bool:
@@ -284,20 +272,6 @@ def widened(measurement: PoseMeasurement, changes: Sequence[Change]) -> PoseMeas
     return measurement if extra is None else replace(measurement, cov_common=measurement.cov_common + extra)
 
 
-#: What else it may be.
-_OTHER: dict[Kind, str] = {
-    "rig": "a rig that moved",
-    "drift": "a rig that drifts",
-    "body": "a body that slipped on the tool",
-    "bend": "a bracket that bends under gravity",
-    "joint": "a sensor of {name} that slipped",
-    "backlash": "more backlash of {name}",
-    "time": "a clock that jumped",
-    "rate": "a clock of another rate",
-    "zoom": "both focal lengths that changed alike",
-}
-
-
 def along_axis(motion: Array, cov: Array, axis: Array) -> bool:
     """Return whether a motion is one along an axis alone, within its sigma.
 
@@ -323,82 +297,29 @@ def finding(changes: Sequence[Change], names: Sequence[str]) -> HealthFinding:
     unsure = ""
     for besides, says in ((False, "cannot be excluded"), (True, "was reported before, and stays")):
         suspected = [each.suspect for each in others if each.besides is besides]
-        named = dict.fromkeys(_OTHER[each.kind].format(name=names[each.joint]) for each in suspected)
+        named = dict.fromkeys(CAUSES[each.kind].name.format(joint=names[each.joint]) for each in suspected)
         unsure += f"; {' or '.join(named)} {says}" if named else ""
     causes = [each.suspect.cause for each in others]
     if (kind, joint) == ("joint", 0):
         causes.append("fixed")
     alternatives = tuple(cause for cause in dict.fromkeys(causes) if cause != best.suspect.cause)
-    if best.suspect.moves:
-        found = _moved_finding(best, unsure)
-    else:
-        found = _clock_finding(best, unsure) if best.suspect.cause == "time" else _joint_finding(best, names, unsure)
-    cost_mm = found.cost_mm
-    if best.suspect.cause != "time":  # which displaces what moves alone
-        cost_mm = cost_mm or 1e3 * float(displacement_m(best.newest[0]))
-    return replace(found, alternatives=alternatives, cost_mm=cost_mm)
-
-
-def _joint_finding(change: Change, names: Sequence[str], unsure: str) -> HealthFinding:
-    kind, joint = change.suspect.kind, change.suspect.joint
-    size, sigma = float(np.degrees(change.size[0])), float(np.degrees(np.sqrt(change.cov[0, 0])))
-    if kind == "backlash":
-        grew = "grew" if size > 0 else "shrank"
-        what, advice = f"the backlash of {names[joint]} {grew} by {abs(size):.2f} deg", "look at the gear of this joint"
-    else:
-        same = ", or the rig rotated about the axis of this joint: the two look alike" if joint == 0 else ""
-        what = f"the sensor of {names[joint]} slipped by {size:.2f} deg against its link{same}"
-        advice = "fasten the potentiometer, or the belt behind a motor's encoder, and set its zero (an AR4: home it)"
-    return HealthFinding("joint", what + unsure, change.begin_s, size, sigma, "deg", advice)
-
-
-def _clock_finding(change: Change, unsure: str) -> HealthFinding:
-    """Return the finding of a clock that is not followed yet."""
-    size, sigma = 1e3 * float(change.size[0]), 1e3 * float(np.sqrt(change.cov[0, 0]))
-    return HealthFinding(
-        "time",
-        f"the images come {abs(size):.2f} ms {'later' if size > 0 else 'earlier'} than at the beginning, against the "
-        f"readings of the joints{unsure}",
-        change.begin_s,
-        size,
-        sigma,
-        "ms",
-        "stamp images and readings by one clock, with the cameras' own stamps instead of times of arrival",
-    )
-
-
-def _moved_finding(change: Change, unsure: str) -> HealthFinding:
-    shift, cov = change.newest
-    size, sigma = sized(shift[:3], cov[:3, :3])
-    so_far = " so far" if change.suspect.slow else ""
-    by = f"displaced by {1e3 * size:.2f} mm and {np.degrees(np.linalg.norm(shift[3:])):.3f} deg{so_far}{unsure}"
-    if change.suspect.kind == "bend":
-        return _bend_finding(change, unsure)
-    if change.suspect.kind == "zoom":
-        share, share_sigma = 100.0 * float(change.size[0]), 100.0 * float(np.sqrt(change.cov[0, 0]))
-        what = f"both focal lengths changed alike by {share:.3f} %: the tool appears {by}"
-        advice = "switch autofocus off, fasten focus and zoom of both lenses, calibrate the rig again"
-        return HealthFinding("lens", what, change.begin_s, share, share_sigma, "%", advice)
-    if change.suspect.kind == "body":
-        what, advice = "the body slipped on the tool: it is ", "fasten the body on the tool, and run again"
-    else:
-        how = "drifts" if change.suspect.slow else "moved"
-        what = f"the rig {how} against the base of the arm: the tool appears "
-        advice = "fasten the rig and the base of the arm, and run again: that repeats the hand-eye calibration"
-    return HealthFinding(change.suspect.cause, what + by, change.begin_s, 1e3 * size, 1e3 * sigma, "mm", advice)
-
-
-def _bend_finding(change: Change, unsure: str) -> HealthFinding:
-    """Return the finding of a body that bends under gravity, by the angle of a beam that is level."""
-    (size, sigma), shift_m = sized(change.size[:3], change.cov[:3, :3]), abs(float(change.size[3]))
-    return HealthFinding(
-        "body",
-        f"what holds the body bends under gravity: by up to {np.degrees(size):.3f} deg and "
-        f"{1e3 * shift_m:.2f} mm{unsure}",
-        change.begin_s,
-        float(np.degrees(size)),
-        float(np.degrees(sigma)),
-        "deg",
-        "stiffen the bracket of the body, fasten its screws, and run again",
-        cost_mm=1e3 * (shift_m + LEVER_M * size),
-    )
+    # A clock displaces what moves alone.
+    cost_m = None if best.suspect.cause == "time" else float(displacement_m(best.newest[0]))
+    shift, cov = best.newest
+    evidence, words = sized(shift[:3], cov[:3, :3]), dict[str, object]()
+    if kind == "bend":  # by the angle of a beam that is level
+        evidence, shift_m = sized(best.size[:3], best.cov[:3, :3]), abs(float(best.size[3]))
+        words, cost_m = {"shift_mm": 1e3 * shift_m}, shift_m + LEVER_M * evidence[0]
+    elif best.suspect.moves:
+        so_far = " so far" if best.suspect.slow else ""
+        words["by"] = (
+            f"displaced by {1e3 * evidence[0]:.2f} mm and {np.degrees(np.linalg.norm(shift[3:])):.3f} deg{so_far}"
+        )
+    if len(best.size) == 1:
+        evidence = float(best.size[0]), float(np.sqrt(best.cov[0, 0]))
+    if best.suspect.cause == "joint":
+        words = {"joint": names[joint], "same": ""}
+        if joint == 0:
+            words["same"] = ", or the rig rotated about the axis of this joint: the two look alike"
+    said = make_finding(kind, evidence, best.begin_s, cost_m=cost_m, also=alternatives, words={"more": "", **words})
+    return replace(said, what=said.what + unsure)

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from armsight.data import Array
-from armsight.loop.estimators import Innovation, Outcome
+from armsight.loop.estimators import Innovation
 from armsight.loop.estimators.armerror import layout
 from armsight.loop.finding import LEVER_M, alarm_limit
 from armsight.loop.health.change import (
@@ -158,7 +158,6 @@ class ClosureWatch:
         self._wide[-2:] = _WIDE[0]
         self._wide[:6] = self._wide[RAMPS : RAMPS + 6] = _WIDE
         self._wide[6] = _WIDE_S
-        self._rejected: list[Innovation] = []
         self._cov, self._unsure = np.diag(_BLOCK_SIGMA**2), _unsure(joints, int(_BLOCKS))
         self._clear()
         self.changes: tuple[Change, ...] = ()
@@ -170,17 +169,11 @@ class ClosureWatch:
         size = len(self._model)
         self._N, self._b, self._square, self._sums = np.eye(size), np.zeros(size), 0.0, _RunningSums()
 
-    def take(self, innovation: Innovation) -> None:
-        """Take what the estimator did with a measurement, in order of time; rejected ones count if later ones agree."""
-        if innovation.outcome is Outcome.OUTLIER:
-            self._rejected.append(innovation)
-            return
-        if innovation.outcome is Outcome.REOPENED:
-            for rejected in self._rejected:
-                self._add(rejected)
-        self._rejected = []
-        self._newest = innovation
-        self._add(innovation)
+    def take(self, agreed: Sequence[Innovation]) -> None:
+        """Take what the estimator did with a measurement, in order of time, and those before it that it accepted now."""
+        self._newest = agreed[-1]
+        for each in agreed:
+            self._add(each)
 
     def _add(self, innovation: Innovation) -> None:
         """Add a measurement to its block; test when the block is full."""

@@ -23,9 +23,7 @@ counts where chance does not explain its variance. Moments of a component of var
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Sequence
-from copy import copy
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -41,6 +39,7 @@ from armsight.loop.finding import (
     HealthFinding,
     alarm_limit,
     displacement_m,
+    make_finding,
 )
 from armsight.loop.health.change import RAMPS, Change, Suspect, changing, ranked, suspects
 
@@ -100,7 +99,6 @@ class FixedWatch:
         ] = []  # since the newest beginning, each so long after the one before, s
         self._newest: Innovation | None = None
         self._last_s = -np.inf
-        self._rejected: list[Innovation] = []
         self.changes: tuple[Change, ...] = ()
         self.reopened: tuple[int, float] = (0, np.inf)
 
@@ -109,22 +107,15 @@ class FixedWatch:
         first = self._steps.shape[1] if suspect.slow else 0
         return first + np.arange(suspect.columns.start, suspect.columns.stop)
 
-    def take(self, innovation: Innovation) -> None:
-        """Take what the estimator did with a measurement, in order of time.
-
-        Measurements that it rejected count only once so many agree that it accepted them: others are mistaken markers.
-        """
-        if innovation.outcome is Outcome.OUTLIER:
-            self._rejected.append(innovation)
-            return
-        if innovation.outcome is Outcome.REOPENED:
-            self.reopened = (self.reopened[0] + 1, min(self.reopened[1], innovation.t_s))
-            if self._rejected:
-                self._begin(self._rejected[0].t_s)
-            for rejected in self._rejected:
-                self._add(rejected)
-        self._rejected = []
-        self._add(innovation)
+    def take(self, agreed: Sequence[Innovation]) -> None:
+        """Take what the estimator did with a measurement, in order of time, and those before it that it accepted now."""
+        newest = agreed[-1]
+        if newest.outcome is Outcome.REOPENED:
+            self.reopened = (self.reopened[0] + 1, min(self.reopened[1], newest.t_s))
+            if len(agreed) > 1:
+                self._begin(agreed[0].t_s)
+        for each in agreed:
+            self._add(each)
 
     def _add(self, innovation: Innovation) -> None:
         """Add an innovation; where a new beginning is due, test with those before it."""
@@ -231,20 +222,11 @@ class FixedWatch:
     def findings(self) -> tuple[HealthFinding, ...]:
         """Return that the estimator dropped what it had learned; nothing where it did not."""
         count, first_s = self.reopened
-        return () if not count else (_reopened_finding(count, first_s),)
-
-
-def _reopened_finding(count: int, first_s: float) -> HealthFinding:
-    """Return the finding of an estimator that dropped what it had learned, without another cause."""
-    return HealthFinding(
-        "estimator",
-        f"measured poses contradicted what had been learned about the arm {count} time{'' if count == 1 else 's'}",
-        first_s,
-        float(count),
-        0.0,
-        "measurements",
-        "check the body on the tool, the joints for slip, and for obstacles that the arm met",
-    )
+        return (
+            ()
+            if not count
+            else (make_finding("reopened", (float(count), 0.0), first_s, words={"plural": "s" * (count != 1)}),)
+        )
 
 
 #: Terms of the polynomial that is removed of each window; half: arms' errors shake, double: below 4 Hz nothing does.
@@ -268,7 +250,7 @@ class Unrest:
     """
 
     def __init__(self, size: int) -> None:
-        self._windows: deque[tuple[Any, ...]] = deque(maxlen=_NEWEST)
+        self._windows = tuple[tuple[Any, ...], ...]()  # replaced, never changed: a copy goes on alone
         self.cov = self.suspected = np.zeros((size, size))
 
     def take(self, t_s: Array, values: Array, covs: Array, excess: float = 1.0) -> None:
@@ -289,7 +271,8 @@ class Unrest:
         sizes = np.trace(np.linalg.solve(covs.mean(axis=0), noise), axis1=1, axis2=2)
         shares = 1.0 / sizes**2
         sums = (left.T * shares) @ left, np.einsum("n,nij->ij", shares, noise), shares.sum(), np.square(shares).sum()
-        self._windows.append((float(np.trace(np.linalg.solve(sums[1], sums[0]))), len(t_s), *sums))
+        window = float(np.trace(np.linalg.solve(sums[1], sums[0]))), len(t_s), *sums
+        self._windows = (*self._windows, window)[-_NEWEST:]
         self.cov = self.suspected = np.zeros_like(self.cov)
         if len(self._windows) >= _FEWEST:
             usual = sorted(self._windows, key=lambda each: each[0])[: -max(round(_ODD * len(self._windows)), 1)]
@@ -308,12 +291,6 @@ class Unrest:
         chances = np.array([chi_square_chance(freedom, freedom * value) for value in values])
         axes = L @ vectors
         return np.asarray((axes * np.where(chances * len(values) < chance, values - 1.0, 0.0)) @ axes.T)
-
-    def copied(self) -> Unrest:
-        """Return a copy that windows can be tried on; this one goes on without them."""
-        other = copy(self)
-        other._windows = self._windows.copy()
-        return other
 
 
 class ShakeWatch:
@@ -352,7 +329,4 @@ class ShakeWatch:
         cost_m = float(displacement_m(np.sqrt(np.diag(self.change.cov))))
         if cost_m < COSTS_M:
             return ()
-        by = f"{1e3 * shift:.2f} mm and {np.degrees(angle):.3f} deg (RMS)"
-        what = f"rig and arm shake against each other: the tool moves by {by} to and fro within a second"
-        advice = "mount the rig and the arm on one stiff base, away from what vibrates; poses have this in their sigma"
-        return (HealthFinding("fixed", what, None, 1e3 * shift, 0.1e3 * shift, "mm", advice, cost_mm=1e3 * cost_m),)
+        return (make_finding("shake", (shift, 0.1 * shift), cost_m=cost_m, words={"angle_deg": np.degrees(angle)}),)

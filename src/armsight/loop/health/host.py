@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from armsight.data import PoseEstimate
-from armsight.loop.finding import HealthFinding
+from armsight.loop.finding import HealthFinding, make_finding
 
 #: So many repeated shots, and this share of all, are reported.
 _LEAST, _SHARE = 3, 0.01
@@ -54,30 +54,12 @@ class HostWatch:
         if self._stalls < max(_STALLS, _STALLED_SHARE * self._periods) and self._longest_s < _LONG_S:
             return ()
         times = "once" if self._stalls == 1 else f"{self._stalls} times"
-        return (
-            HealthFinding(
-                "host",
-                f"the computer stalled {times}, for {1e3 * self._longest_s:.0f} ms at most: commands were late",
-                self._stalled_s,
-                1e3 * self._longest_s,
-                0.0,
-                "ms",
-                "end other programs on this computer, or give the run a higher priority (chrt, nice)",
-            ),
-        )
+        return (make_finding("stalled", (self._longest_s, 0.0), self._stalled_s, words={"times": times}),)
 
     def _repetition(self) -> tuple[HealthFinding, ...]:
         if self._repeated < max(_LEAST, _SHARE * self._shots):
             return ()
         share = self._repeated / self._shots
-        return (
-            HealthFinding(
-                "host",
-                f"{self._repeated} of {self._shots} shots repeat the one before: their images are older than their times",
-                self._first_s,
-                100.0 * share,
-                100.0 * float(np.sqrt(share * (1.0 - share) / self._shots)),
-                "%",
-                "lower the rate of the cameras, or give each its own USB controller",
-            ),
-        )
+        sigma = float(np.sqrt(share * (1.0 - share) / self._shots))
+        counts = {"count": self._repeated, "shots": self._shots}
+        return (make_finding("repeated", (share, sigma), self._first_s, words=counts),)

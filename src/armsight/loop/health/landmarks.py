@@ -21,7 +21,7 @@ import numpy as np
 from armsight.data import Array, PoseEstimate
 from armsight.estimate.chance import chi_square_limit
 from armsight.geometry.pose import adjoint, inverse, log_se3
-from armsight.loop.finding import FALSE_ALARMS_PER_MINUTE, HealthFinding, sized
+from armsight.loop.finding import FALSE_ALARMS_PER_MINUTE, HealthFinding, make_finding, sized
 from armsight.loop.health.change import FOCAL, along_axis
 
 #: Poses of a mean.
@@ -193,19 +193,14 @@ def _agreed(last: tuple[Array, Array] | None, now: tuple[Array, Array] | None) -
 
 def _cameras(common: tuple[Array, Array], marks: Sequence[_Landmark]) -> HealthFinding:
     m, cov = common
-    size, sigma = sized(m[:3], cov[:3, :3])
     lens = along_axis(m, cov, np.array([0.0, 0.0, 1.0]))
     begins = [each.newest[2] for each in marks if each.newest is not None and each.newest[2] is not None]
-    return HealthFinding(
-        "fixed",
-        f"both cameras moved together: by {1e3 * size:.2f} mm and {np.degrees(np.linalg.norm(m[3:])):.3f} deg, as "
-        f"{len(marks)} fixed bodies show{FOCAL if lens else ''}",
+    return make_finding(
+        "together",
+        sized(m[:3], cov[:3, :3]),
         min(begins) if begins else None,
-        1e3 * size,
-        1e3 * sigma,
-        "mm",
-        "fasten the rig, and run again: that repeats the hand-eye calibration",
-        ("lens",) if lens else (),
+        also=("lens",) if lens else (),
+        words={"angle_deg": np.degrees(np.linalg.norm(m[3:])), "count": len(marks), "more": FOCAL if lens else ""},
     )
 
 
@@ -218,6 +213,4 @@ def _finding(mark: _Landmark, what: str) -> HealthFinding:
     """Return a finding that is sized by the motion of a body in view."""
     assert mark.newest is not None
     xi, cov, since_s = mark.newest
-    size, sigma = sized(xi[:3], cov[:3, :3])
-    advice = "fasten what moved, or leave the body out of --fixed; more fixed bodies say more"
-    return HealthFinding("fixed", what, since_s, 1e3 * size, 1e3 * sigma, "mm", advice)
+    return make_finding("not fixed", sized(xi[:3], cov[:3, :3]), since_s, words={"what": what})

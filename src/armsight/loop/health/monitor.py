@@ -11,7 +11,7 @@ import numpy as np
 from armsight.data import Array, Body, PoseEstimate, Shot
 from armsight.geometry.pose import transform
 from armsight.loop.estimators import Outcome
-from armsight.loop.finding import HealthFinding, Trust, displacement_m
+from armsight.loop.finding import HealthFinding, Trust, displacement_m, make_finding
 from armsight.loop.frame_clock import FrameClock
 from armsight.loop.health.change import DATED_S, Change, ToolView, doubtful, finding, happened_besides, suspected
 from armsight.loop.health.fixed import FixedWatch, ShakeWatch
@@ -68,6 +68,7 @@ class HealthMonitor:
         self._newest_s, self._doubted_s = 0.0, -np.inf
         self._poses: list[tuple[PoseEstimate, float | None]] = []
         self._innovations: list[Innovation] = []
+        self._rejected: list[Innovation] = []
         self._clock: ClockFollower | None = None
         self._clock_cost_m = 0.0  # by how much a clock that went wrong displaced the tool at most
         self._names: tuple[str, ...] = ()
@@ -97,14 +98,23 @@ class HealthMonitor:
             self._known = [*_thinned(self._known, self._newest_s), (self._newest_s, self._estimator.remembered())]
         if self._fixed is not None and self._closure is not None and self._measurements is not None:
             for innovation in self._innovations:
-                self._fixed.take(innovation)
-                self._closure.take(innovation)
+                if agreed := self._agreed(innovation):
+                    self._fixed.take(agreed)
+                    self._closure.take(agreed)
                 self._shakes.take(innovation)
                 self._measurements.take(innovation)
             self._innovations.clear()
         if self._rig is not None and self._rig.wrong_at_rest and self._cameras_s == np.inf:
             begins = [each.since_s for each in self._rig.findings() if each.since_s is not None]
             self._cameras_s = min(begins, default=-np.inf) - TEST_S
+
+    def _agreed(self, innovation: Innovation) -> list[Innovation]:
+        """Return a measurement, after rejected ones with which so many agree that they count: else those are mistakes."""
+        if innovation.outcome is Outcome.OUTLIER:
+            self._rejected.append(innovation)
+            return []
+        again, self._rejected = self._rejected if innovation.outcome is Outcome.REOPENED else [], []
+        return [*again, innovation]
 
     def measured(self, pose: PoseEstimate, t_s: float | None) -> PoseEstimate:
         """Take a measured pose, in order of time; return it with what is suspected added to its covariance.
@@ -174,7 +184,7 @@ class HealthMonitor:
 
         self._fixed = FixedWatch(arm.joints)
         self._closure = ClosureWatch(estimator.sigmas, arm.joints, self._seen)
-        self._innovations, self._clock, self._names = [], estimator.clock, arm.joint_names
+        self._innovations, self._rejected, self._clock, self._names = [], [], estimator.clock, arm.joint_names
         estimator.on_innovation = self._note
 
     def _note(self, innovation: Innovation) -> None:
@@ -400,8 +410,7 @@ class HealthMonitor:
         """Return what was found so far; where it ``ends``, the newest second is tested at once."""
         self.work()
         sigma_s = 0.0 if self._estimator is None else self._estimator.settings[1].sigma_s
-        late = () if self._clock is None else _clock_findings(self._clock, self._newest_s, sigma_s)
-        late = tuple(replace(each, cost_mm=1e3 * self._clock_cost_m or None) for each in late)
+        late = () if self._clock is None else _clock_findings(self._clock, self._newest_s, sigma_s, self._clock_cost_m)
         if self.stamps is not None and self.stamps.stepped is not None:
             late = (_stamps_finding(*self.stamps.stepped, self.stamps.rate),)
         now = (
@@ -442,7 +451,7 @@ def _thinned(known: Sequence[tuple[float, Remembered]], now_s: float) -> list[tu
     return kept
 
 
-def _clock_findings(clock: ClockFollower, t_s: float, sigma_s: float) -> tuple[HealthFinding, ...]:
+def _clock_findings(clock: ClockFollower, t_s: float, sigma_s: float, cost_m: float) -> tuple[HealthFinding, ...]:
     """Return what is wrong with the cameras' clock at a time, s; nothing while its delay is as measured, to a sigma, s."""
     if clock.since_s is None:
         return ()
@@ -451,15 +460,12 @@ def _clock_findings(clock: ClockFollower, t_s: float, sigma_s: float) -> tuple[H
     if not drifts and abs(offset_s) < _CLOCK_SIGMAS * sigma_s:  # the delay was known no better
         return ()
     return (
-        HealthFinding(
+        make_finding(
             "time",
-            f"the images come {abs(1e3 * offset_s):.2f} ms {'later' if offset_s > 0 else 'earlier'} than at the beginning, "
-            f"against the readings of the joints{drifts}; it was followed",
+            (offset_s, clock.sigma_s),
             clock.since_s,
-            1e3 * offset_s,
-            1e3 * clock.sigma_s,
-            "ms",
-            "stamp images and readings by one clock, with the cameras' own stamps instead of times of arrival",
+            cost_m=cost_m or None,
+            words={"more": f"{drifts}; it was followed"},
         ),
     )
 
@@ -468,14 +474,6 @@ def _stamps_finding(since_s: float, shifted_s: float, rate: float) -> HealthFind
     """Return the finding of stamps of images that were shifted, s, of a clock that runs fast by a share."""
     runs = f"runs {abs(100.0 * rate):.2f} % {'fast' if rate > 0 else 'slow'}"
     jumped = f"jumped {'back' if shifted_s > 0 else 'ahead'} by {abs(shifted_s):.3f} s"
-    what = " and ".join([*([jumped] if shifted_s else []), *([runs] if rate else [])])
-    size, unit = (1e3 * shifted_s, "ms") if shifted_s else (100.0 * rate, "%")
-    return HealthFinding(
-        "time",
-        f"the clock that stamps the images {what}, against their arrival; stamps were put right, to some milliseconds",
-        since_s,
-        size,
-        0.0,
-        unit,
-        "stamp images by a clock that nothing sets (monotonic), and open the cameras once",
-    )
+    how = " and ".join([*([jumped] if shifted_s else []), *([runs] if rate else [])])
+    size, unit = (shifted_s, "ms") if shifted_s else (rate, "%")
+    return make_finding("stamps", (size, 0.0), since_s, unit=unit, words={"how": how})

@@ -38,8 +38,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from armsight.data import Array
-from armsight.loop.finding import HealthFinding, displacement_m
-from armsight.loop.health.residuals import UNKNOWN_SHARE, ExposedShot, ResidualSums, eliminated
+from armsight.loop.finding import HealthFinding, displacement_m, make_finding
+from armsight.loop.health.residuals import UNKNOWN_SHARE, ExposedShot, ResidualSums, eliminated, evidence_of_scales
 
 #: Standard deviations that are tried of the times that each shot has of its own, s, and that of the times that all share.
 _APART_S, _SHARED_S = (0.0, *(1e-3 * 2.0**k for k in range(-2, 7))), 0.03
@@ -153,20 +153,22 @@ def _apart(apart_s: float, W: Array, b: Array, weights: Array) -> Apart:
     return Apart(apart_s, rms_s, gained, occam, shared_s, information)
 
 
-def eliminate(found: Apart, shots: Sequence[tuple[Array, Array, float]], sums: ResidualSums) -> Array:
-    """Take what times of exposure explain out of sums; return the right sides (4, 1 + K) of the times that all shots share.
+def eliminate(
+    found: Apart, shots: Sequence[tuple[Array, Array, float]], sums: ResidualSums
+) -> tuple[ResidualSums, Array]:
+    """Return sums without what times of exposure explain, and the right sides (4, 1 + K) of the times that all shots share.
 
     ``shots``: whitened rows (n, 1 + K), what times of exposure do to them (n, 10), and weights.
     """
-    shared = np.zeros((len(_TIMES), len(sums.M)))
+    shared, M, freedom = np.zeros((len(_TIMES), len(sums.M))), sums.M.copy(), sums.freedom
     for rows, B, weight in shots:
         G, K = B.T @ rows, np.eye(B.shape[1]) + found.apart_s**2 * (B.T @ B)
         left = np.linalg.solve(K, G)
         shared += weight * left[_TIMES]
-        sums.M -= weight * found.apart_s**2 * (G.T @ left)
-        sums.freedom -= weight * (len(K) - float(np.trace(np.linalg.inv(K))))
-    sums.M -= shared.T @ np.linalg.solve(found.information, shared)
-    return shared
+        M -= weight * found.apart_s**2 * (G.T @ left)
+        freedom -= weight * (len(K) - float(np.trace(np.linalg.inv(K))))
+    M -= shared.T @ np.linalg.solve(found.information, shared)
+    return replace(sums, M=M, freedom=freedom), shared
 
 
 class _Rest(NamedTuple):
@@ -243,9 +245,8 @@ def _without(
 
     A focal length is another in each test, the times that shots share are the same in all.
     """
-    sums, occam, prior = tests[0].every.copied(), 0.0, np.eye(len(_TIMES)) / _SHARED_S**2
-    sums.scale(0.0)
-    information, shared = prior, np.zeros((len(_TIMES), len(sums.M)))
+    occam, prior, summed = 0.0, np.eye(len(_TIMES)) / _SHARED_S**2, np.zeros_like(tests[0].every.M)
+    information, shared = prior, np.zeros((len(_TIMES), len(summed)))
     for each, share in zip(tests, shares, strict=True):
         M = each.every.M
         if cause is not None and each.shows(cause, excess):
@@ -256,12 +257,10 @@ def _without(
                     information + each.times.found.information - prior,
                     shared + share * each.times.shared,
                 )
-        sums.M += M if share.min() == 1.0 else share[:, None] * M * share
-        sums.freedom += each.every.freedom
-    if not shared.any():
-        return sums, occam
-    sums.M -= shared.T @ np.linalg.solve(information, shared)
-    return sums, occam + _occam(information)
+        summed += M if share.min() == 1.0 else share[:, None] * M * share
+    if shared.any():
+        summed, occam = summed - shared.T @ np.linalg.solve(information, shared), occam + _occam(information)
+    return ResidualSums(summed, sum(each.every.freedom for each in tests), tests[0].every.begin_s), occam
 
 
 class _Weighed(NamedTuple):
@@ -326,7 +325,7 @@ class _Weighed(NamedTuple):
 
 def _left(sums: ResidualSums, size: int) -> float:
     """Return the sum of squares that the first parameters leave."""
-    return float(eliminated(sums.M[: 1 + size, : 1 + size], slice(1, 1 + size))[0, 0])
+    return sums.square - sums.gain(np.arange(size))
 
 
 @dataclass
@@ -443,22 +442,22 @@ class Passing:
         passes = self._time_finding(timed=timed) if times >= focals else self._lens_finding(timed=timed)
         return self._once(passes, stays)
 
-    def _once(self, found: HealthFinding, stays: tuple[HealthFinding, ...]) -> tuple[HealthFinding, ...]:
+    def _once(self, seen: HealthFinding, stays: tuple[HealthFinding, ...]) -> tuple[HealthFinding, ...]:
         """Return a finding of what passes with those of what stays: those of its cause are one with it."""
-        same = [each for each in stays if each.cause == found.cause]
-        if found.cause == "lens":  # one that stays is sized better
-            found = next(iter(same), found)
-        found = replace(found, cost_mm=found.cost_mm or 1e3 * self.cost_m or None)
-        begins = [each.since_s for each in (found, *same) if each.since_s is not None]
+        same = [each for each in stays if each.cause == seen.cause]
+        if seen.cause == "lens":  # one that stays is sized better
+            seen = next(iter(same), seen)
+        seen = replace(seen, cost_mm=seen.cost_mm or 1e3 * self.cost_m or None)
+        begins = [each.since_s for each in (seen, *same) if each.since_s is not None]
         since_s = min(begins, default=0.0)
         # What is left of it looks like what stays: that cannot be excluded, but what was found before.
         others = [each for each in stays if each not in same]
         before = [each for each in others if begins and each.since_s is not None and each.since_s < since_s - _DATED_S]
         causes = [*(each.cause for each in others if each not in before), *(("lens",) if self.focal else ())]
-        return (*before, _besides(replace(found, since_s=since_s if begins else None), causes))
+        return (*before, _besides(replace(seen, since_s=since_s if begins else None), causes))
 
     def _time_finding(self, *, timed: bool) -> HealthFinding:
-        since_s, tests = self.apart[0][0], [each for _, each in self.apart]
+        since_s, tests = self.apart[0][0] if timed else None, [each for _, each in self.apart]
         information = np.sum([each.information for each in tests], axis=0)
         mean_s = np.linalg.solve(information, np.sum([each.information @ each.shared_s for each in tests], axis=0))
         sigmas_s = np.sqrt(np.diag(np.linalg.inv(information)))
@@ -467,58 +466,27 @@ class Passing:
         )  # a body that rests shows nothing of it
         own_s = math.sqrt(float(np.average([each.apart_s**2 for each in tests], weights=shown)))
         k = int(np.argmax(np.abs(mean_s[:3])))
-        # What the velocity lacks is lacking in all shots alike.
-        size, sigma = (
-            1e3 * float(mean_s[k]),
-            1e3 * math.hypot(float(sigmas_s[k]), 0.5 * UNKNOWN_SHARE * float(mean_s[k])),
-        )
         if own_s > _CONSTANT * abs(mean_s[k]):
-            size = 1e3 * math.sqrt(float(np.average([each.rms_s**2 for each in tests], weights=shown)))
-            sigma = size / math.sqrt(2.0 * len(tests))
-            what = (
-                f"the two exposures of a shot are about {size:.1f} ms apart, and by another time in each shot: one camera "
-                "has another rate or drops images, or images of different moments are paired"
+            size_s = math.sqrt(float(np.average([each.rms_s**2 for each in tests], weights=shown)))
+            return make_finding("apart", (size_s, size_s / math.sqrt(2.0 * len(tests))), since_s)
+        # What the velocity lacks is lacking in all shots alike.
+        size_s, sigma_s = float(mean_s[k]), math.hypot(float(sigmas_s[k]), 0.5 * UNKNOWN_SHARE * float(mean_s[k]))
+        if k:
+            return make_finding(
+                "rolls", (2.0 * size_s, 2.0 * sigma_s), since_s, words={"side": ("right", "left")[k - 1]}
             )
-        elif k:
-            size, sigma = 2.0 * size, 2.0 * sigma
-            what = (
-                f"the rows of the {('right', 'left')[k - 1]} camera are exposed one after the other, over {abs(size):.1f} "
-                "ms more than is known: a rolling shutter"
-            )
-        else:
-            later = "later" if size > 0 else "earlier"
-            what = f"the right camera exposes {abs(size):.2f} ms {later} than is known, against the left one"
-        return HealthFinding(
-            "time",
-            what,
-            since_s if timed else None,
-            size,
-            sigma,
-            "ms",
-            "trigger both cameras together, with one rate and the same exposure; in a recording --skew find moves the "
-            "detections to one time, and finds rolling shutters",
-        )
+        return make_finding("skewed", (size_s, sigma_s), since_s)
 
     def _lens_finding(self, *, timed: bool) -> HealthFinding:
         since_s, shares = self.focal[0][0], [share for _, share in self.focal]
-        size = 100.0 * math.sqrt(float(np.mean(np.square(shares))))
-        what = f"the focal length of one camera changes against that of the other by {size:.3f} % (RMS), within seconds"
-        return HealthFinding(
-            "lens",
-            what,
-            since_s if timed else None,
-            size,
-            size / math.sqrt(2.0 * len(shares)),
-            "%",
-            "switch autofocus and image stabilisation off, fasten focus and zoom of both lenses, calibrate the rig again",
-            ("rig",),
-        )
+        size = math.sqrt(float(np.mean(np.square(shares))))
+        return make_finding("swings", (size, size / math.sqrt(2.0 * len(shares))), since_s if timed else None)
 
 
-def _besides(found: HealthFinding, causes: Sequence[str]) -> HealthFinding:
+def _besides(seen: HealthFinding, causes: Sequence[str]) -> HealthFinding:
     """Return a finding with other causes that cannot be excluded."""
-    more = [each for each in causes if each != found.cause]
-    return replace(found, alternatives=tuple(dict.fromkeys((*found.alternatives, *more))))  # type: ignore[arg-type]
+    more = [each for each in causes if each != seen.cause]
+    return replace(seen, alternatives=tuple(dict.fromkeys((*seen.alternatives, *more))))  # type: ignore[arg-type]
 
 
 class Leftover:
@@ -551,10 +519,7 @@ class Leftover:
         as_before = np.eye(len(rows))
         as_before[seven, 0], as_before[seven, seven] = self._before
         M = eliminated(as_before.T @ sums.M[np.ix_(rows, rows)] @ as_before / noise, slice(1, first - points))
-        values, V = np.linalg.eigh(M[1:, 1:])
-        variances = np.square(_TAU_PX)[:, None]
-        ratio = 1.0 + variances * np.maximum(values, 0.0)
-        return noise, 0.5 * (variances * np.square(V.T @ M[1:, 0]) / ratio - np.log(ratio)).sum(axis=1)
+        return noise, evidence_of_scales(M, _TAU_PX)
 
     def passed(self, test: ResidualSums) -> None:
         """Take the sums of the newest test, of the parameters and the seven numbers: what it says of these."""
@@ -570,6 +535,6 @@ class Leftover:
     def without(self, sums: ResidualSums, lens: int, noise: float) -> ResidualSums:
         """Return sums without the coefficients, which are eliminated, and over the variance of the noise."""
         first, variance = len(sums.M) - lens, self.tau_px**2 / noise
-        found, across = sums.of(first - 1), sums.M[first:, :first]
-        found.M -= variance * across.T @ np.linalg.solve(variance * sums.M[first:, first:] + np.eye(lens), across)
-        return found.over(noise)
+        across = sums.M[first:, :first]
+        by_lens = variance * across.T @ np.linalg.solve(variance * sums.M[first:, first:] + np.eye(lens), across)
+        return replace(sums, M=(sums.M[:first, :first] - by_lens) / noise)

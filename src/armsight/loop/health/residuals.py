@@ -10,14 +10,14 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Sequence
-from copy import copy
-from functools import cache
+from dataclasses import dataclass, replace
+from functools import cache, reduce
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from armsight.data import Array, Body, PoseEstimate
+from armsight.data import Array, Body, Ids, PoseEstimate
 from armsight.estimate.chance import chi_square_limit
 from armsight.geometry.pose import inverse, pose
 from armsight.loop.health.rows import LENS, differentiated, eliminate_pose
@@ -52,6 +52,10 @@ _AFTER, STEPS = (1, 2, 4, 8, 16), 4
 _BEGINS = 8
 #: The newest test agrees with all together unless chance explains their difference more rarely than this.
 UNLIKE = 0.01
+#: A change matters that moves one of so many newest poses by so many of its claimed sigmas: a skew does so in motion alone.
+MATTERS, POSES = 2.0, 60
+#: One is needed besides others beyond this chance; in so many tests after an alarm it is dated anew.
+NECESSARY, FRESH = 1e-4, 6
 
 
 def velocity(before: Array, after: Array, seconds: float) -> Array:
@@ -269,8 +273,9 @@ class ShotReader:
         return velocity(before, now, now_s - before_s)
 
 
+@dataclass(frozen=True, eq=False)
 class ResidualSums:
-    """What whitened residuals say of K parameters: sums over their rows, degrees of freedom, and when they began.
+    """What whitened residuals say of K parameters, whose priors have variance 1 where they are explained or eliminated.
 
     Attributes:
         M: (1 + K, 1 + K) sum of the outer products of rows [residual; derivatives].
@@ -278,8 +283,9 @@ class ResidualSums:
         begin_s: when the first shot was, s.
     """
 
-    def __init__(self, size: int, begin_s: float) -> None:
-        self.M, self.freedom, self.begin_s = np.zeros((1 + size, 1 + size)), 0.0, begin_s
+    M: Array
+    freedom: float = 0.0
+    begin_s: float = 0.0
 
     @property
     def H(self) -> Array:
@@ -296,62 +302,47 @@ class ResidualSums:
         """Sum of squares of the residuals."""
         return float(self.M[0, 0])
 
-    def add(self, other: ResidualSums, weight: float) -> None:
-        """Add another's."""
-        self.M += other.M if weight == 1.0 else weight * other.M
-        self.freedom += weight * other.freedom
+    def plus(self, other: ResidualSums, weight: float = 1.0) -> ResidualSums:
+        """Return these with another's."""
+        return replace(self, M=self.M + weight * other.M, freedom=self.freedom + weight * other.freedom)
 
-    def take(self, rows: Array, freedom: float) -> None:
-        """Add rows (N, 1 + K)."""
-        self.M += rows.T @ rows
-        self.freedom += freedom
+    def gain(self, rows: Ids | None = None) -> float:
+        """Return what parameters, those of some rows or all, explain of the sum of squares."""
+        H, b = (self.H, self.b) if rows is None else (self.H[np.ix_(rows, rows)], self.b[rows])
+        return float(b @ np.linalg.solve(H + np.eye(len(b)), b))
 
-    def scale(self, weight: float) -> None:
-        """Weigh down what there is."""
-        self.M *= weight
-        self.freedom *= weight
-
-    def copied(self) -> ResidualSums:
-        """Return a copy."""
-        return self.of(len(self.b))
+    def excess(self, gain: float) -> float:
+        """Return by how much the variance of what is left exceeds the noise (Birge ratio), 1 at the least."""
+        return max((self.square - gain) / max(self.freedom, 1.0), 1.0)
 
     def reduced(self, count: int) -> ResidualSums:
-        """Return those of the others, with the first parameters eliminated, which have priors of variance 1."""
-        found = ResidualSums(len(self.b) - count, self.begin_s)
-        found.M, found.freedom = eliminated(self.M, slice(1, 1 + count)), self.freedom
-        return found
+        """Return those of the others, with the first parameters eliminated."""
+        return replace(self, M=eliminated(self.M, slice(1, 1 + count)))
+
+    def among(self, rows: Ids) -> ResidualSums:
+        """Return those of some parameters, the others being zero."""
+        kept = np.append(0, 1 + rows)
+        return replace(self, M=self.M[np.ix_(kept, kept)])
 
     def of(self, size: int) -> ResidualSums:
         """Return those of the first parameters alone."""
-        found = ResidualSums(size, self.begin_s)
-        found.M, found.freedom = self.M[: 1 + size, : 1 + size].copy(), self.freedom
-        return found
+        return replace(self, M=self.M[: 1 + size, : 1 + size].copy())
 
     def by(self, T: Array) -> ResidualSums:
         """Return those of P other parameters, of which these K are T (K, P) times."""
-        found = ResidualSums(T.shape[1], self.begin_s)
-        found.M[0, 0], found.M[0, 1:], found.freedom = self.square, self.b @ T, self.freedom
-        found.M[1:, 0], found.M[1:, 1:] = found.M[0, 1:], T.T @ self.H @ T
-        return found
+        M = np.empty((1 + T.shape[1], 1 + T.shape[1]))
+        M[0, 0], M[0, 1:] = self.square, self.b @ T
+        M[1:, 0], M[1:, 1:] = M[0, 1:], T.T @ self.H @ T
+        return replace(self, M=M)
 
     def over(self, variance: float) -> ResidualSums:
         """Return these of residuals whose noise has a variance."""
-        found = self.of(len(self.b))
-        found.M /= variance
-        return found
+        return replace(self, M=self.M / variance)
 
     def without(self, row: int, variance: float = 1.0) -> ResidualSums:
         """Return these with a parameter eliminated, which has a prior of a variance; its row is of no use."""
-        rest, column = self.of(len(self.b)), self.M[1 + row]
-        rest.M -= np.outer(column, column) * (variance / (1.0 + variance * column[1 + row]))
-        return rest
-
-    def less(self, other: ResidualSums) -> ResidualSums:
-        """Return these sums without another's."""
-        rest = ResidualSums(len(self.b), self.begin_s)
-        rest.add(self, 1.0)
-        rest.add(other, -1.0)
-        return rest
+        column = self.M[1 + row]
+        return replace(self, M=self.M - np.outer(column, column) * (variance / (1.0 + variance * column[1 + row])))
 
 
 def eliminated(M: Array, rows: slice) -> Array:
@@ -362,13 +353,22 @@ def eliminated(M: Array, rows: slice) -> Array:
     return np.asarray(M[np.ix_(kept, kept)] - across.T @ np.linalg.solve(inner, across))
 
 
-def total(tests: Sequence[ResidualSums], size: int) -> ResidualSums:
-    """Return the sums of tests, of so many first parameters."""
-    found = ResidualSums(size, tests[0].begin_s)
-    for each in tests:
-        found.M += each.M[: 1 + size, : 1 + size]
-        found.freedom += each.freedom
-    return found
+def largest_square(effects: Sequence[tuple[Array, Array]], by: Array) -> float:
+    """Return by how much a change of the first parameters moves a pose at most, in its sigmas, squared.
+
+    ``effects``: responses (6, K) of poses to all parameters, and their covariances (6, 6).
+    """
+    responses, covs = map(np.array, zip(*effects, strict=True))
+    shift = responses[..., : len(by)] @ by
+    return float(np.max(np.einsum("ni,ni->n", shift, np.linalg.solve(covs, shift[..., None])[..., 0])))
+
+
+def evidence_of_scales(M: Array, scales: Array) -> Array:
+    """Return (N,) the log-evidence against none of sums M (1 + K, 1 + K) for priors of some standard deviations (N,)."""
+    values, V = np.linalg.eigh(M[1:, 1:])
+    variances = np.square(scales)[:, None]
+    ratio = 1.0 + variances * np.maximum(values, 0.0)
+    return np.asarray(0.5 * (variances * np.square(V.T @ M[1:, 0]) / ratio - np.log(ratio)).sum(axis=1))
 
 
 class Onset(NamedTuple):
@@ -393,12 +393,12 @@ class History:
 
     A change grows from nothing at the time of one test to what it is at another one, and stays; a step does at once. What
     the tests before it say of the first parameters, which do not change, counts with those after it. The test just before
-    it may be of both times: it is left out.
+    it may be of both times: it is left out. What it holds is replaced, never changed: a copy (:mod:`copy`) goes on alone.
     """
 
     def __init__(self, size: int, columns: int) -> None:
-        self._size, self._settled = size, ResidualSums(columns, 0.0)
-        self.kept, self.count = deque[ResidualSums](), 0
+        self._size, self._settled = size, ResidualSums(np.zeros((1 + columns, 1 + columns)))
+        self.kept, self.count = tuple[ResidualSums, ...](), 0
         self._added: tuple[Array, ...] | None = None  # up, since each test that is kept
         self._reduced = dict[Onset, ResidualSums]()
 
@@ -406,28 +406,24 @@ class History:
         """Keep a test, or the newest one ``again``; the oldest settles, unless it or the next is after a change, s."""
         self._added, self._reduced = None, {}
         if again:
-            self.kept[-1] = newest
+            self.kept = (*self.kept[:-1], newest)
             return
-        self.kept.append(newest)
+        self.kept = (*self.kept, newest)
         if not self.count:
-            self._settled.begin_s = newest.begin_s
+            self._settled = replace(self._settled, begin_s=newest.begin_s)
         self.count += 1
         if len(self.kept) > KEPT:
-            oldest = self.kept.popleft()
+            oldest, *_ = self.kept
+            self.kept = self.kept[1:]
             if self.kept[0].begin_s < changed_s:
-                self._settled.scale(math.exp(-1.0 / _SETTLED))
-                self._settled.add(oldest, 1.0)
+                share = math.exp(-1.0 / _SETTLED)
+                faded = replace(self._settled, M=share * self._settled.M, freedom=share * self._settled.freedom)
+                self._settled = faded.plus(oldest)
 
     def forget(self, begins: Sequence[float]) -> None:
         """Forget tests, by when they began, s."""
-        self.kept = deque(each for each in self.kept if each.begin_s not in begins)
+        self.kept = tuple(each for each in self.kept if each.begin_s not in begins)
         self._added, self._reduced = None, {}
-
-    def copied(self) -> History:
-        """Return a copy; this one goes on."""
-        other = copy(self)
-        other.kept, other._settled, other._reduced = self.kept.copy(), self._settled.copied(), self._reduced.copy()
-        return other
 
     def before_s(self, begin_s: float) -> float:
         """Return when the test before that of a time began, s."""
@@ -466,32 +462,32 @@ class History:
         """Return the sums since a change began; all but the first parameters are what they were when it ended."""
         size = self._size + count if count is not None else len(self._settled.b)
         if onset.end_s <= self._settled.begin_s:
-            return total([self._settled, *self.kept], size)
+            parts = [each.of(size) for each in (self._settled, *self.kept)]
+            return reduce(ResidualSums.plus, parts)
         ages_s, plain, once, twice, freedom = self._sums()
         plain, once, twice = plain[:, : 1 + size, : 1 + size], once[:, :count, : 1 + size], twice[:, :count, :count]
         begin, end = np.minimum(np.searchsorted(ages_s, np.array(onset) - self.kept[-1].begin_s), len(ages_s) - 1)
         first, rest = slice(0, 1 + self._size), slice(1 + self._size, None)
-        found = ResidualSums(plain.shape[1] - 1, onset.begin_s)
-        found.M, found.freedom = plain[end].copy(), float(freedom[begin]) + self._settled.freedom
-        found.M[first, first] = self._settled.M[first, first] + plain[0, first, first]
+        found, counted = plain[end].copy(), float(freedom[begin]) + self._settled.freedom
+        found[first, first] = self._settled.M[first, first] + plain[0, first, first]
         if begin:
             mixed = self.kept[begin - 1]
-            found.M[first, first] -= mixed.M[first, first]
-            found.freedom += float(freedom[0] - freedom[begin]) - mixed.freedom
+            found[first, first] -= mixed.M[first, first]
+            counted += float(freedom[0] - freedom[begin]) - mixed.freedom
         if end > begin:
             began_s = onset.begin_s - self.kept[-1].begin_s
             span_s, M = ages_s[end] - began_s, plain[begin, rest] - plain[end, rest]
             by = once[begin] - once[end] - began_s * M
             more = twice[begin] - twice[end] - began_s * (once[begin] - once[end] + by)[:, rest]
-            found.M[rest, first] += by[:, first] / span_s
-            found.M[first, rest] += by[:, first].T / span_s
-            found.M[rest, rest] += more / span_s**2
-        return found
+            found[rest, first] += by[:, first] / span_s
+            found[first, rest] += by[:, first].T / span_s
+            found[rest, rest] += more / span_s**2
+        return ResidualSums(found, counted, onset.begin_s)
 
     def reduced(self, onset: Onset) -> ResidualSums:
         """Return the same of all but the first parameters, which are eliminated."""
         if onset not in self._reduced:
-            self._reduced[onset] = self.since(onset).reduced(self._size)
+            self._reduced = {**self._reduced, onset: self.since(onset).reduced(self._size)}
         return self._reduced[onset]
 
     def dated(self, count: int, oldest_s: float | None = None) -> tuple[float, Onset]:
@@ -513,8 +509,7 @@ class History:
             if begin != end and (end - begin < STEPS or times_s[begin] <= settled_s < times_s[1]):
                 return np.inf, begin, end
             sums = self.since(Onset(times_s[begin], times_s[end]), count).reduced(self._size)
-            gained = float(sums.b @ np.linalg.solve(sums.H + np.eye(count), sums.b))
-            return sums.square - gained + (self.kept[begin - 2].freedom if begin > 1 else 0.0), begin, end
+            return sums.square - sums.gain() + (self.kept[begin - 2].freedom if begin > 1 else 0.0), begin, end
 
         def best(window: Callable[[int], tuple[int, int]]) -> tuple[float, int, int]:
             row = coarse.index(min((*left(*window(k)), k) for k in coarse)[3])

@@ -40,10 +40,23 @@ import numpy as np
 from armsight.data import Array, Body, Ids, PoseEstimate, Record
 from armsight.estimate.chance import chi_square_limit
 from armsight.geometry.pose import adjoint, inverse, log_se3
-from armsight.loop.finding import COSTS_M, SUSPECTED, HealthFinding, alarm_limit, displacement_m, sized
+from armsight.loop.finding import (
+    CAUSES,
+    COSTS_M,
+    SUSPECTED,
+    HealthFinding,
+    alarm_limit,
+    displacement_m,
+    make_finding,
+    sized,
+)
 from armsight.loop.health.fixed import Unrest
 from armsight.loop.health.passing import TOGETHER, Apart, Leftover, Passes, Passing, Times, apart, eliminate, nodding
 from armsight.loop.health.residuals import (
+    FRESH,
+    MATTERS,
+    NECESSARY,
+    POSES,
     STEPS,
     History,
     Onset,
@@ -51,7 +64,8 @@ from armsight.loop.health.residuals import (
     ShotReader,
     ShotResiduals,
     differ,
-    eliminated,
+    evidence_of_scales,
+    largest_square,
     noisier,
 )
 from armsight.loop.health.rows import LENS
@@ -68,30 +82,26 @@ _LEAST_S, _LIKE_S = 0.025, 0.1
 _ODD = 4
 #: The test is made after so long, s, or so many shots.
 TEST_S, TEST_SHOTS = 1.0, 60
-#: In so many tests after an alarm the lenses are tested each time; a test counts for what images leave after so many more.
-_FRESH, _BEFORE = 6, 3
+#: A test counts for what images leave after so many more.
+_BEFORE = 3
 #: A prior so wide that it decides nothing: m, rad, scale, s.
 _WIDE = np.array([0.1, 0.1, 1.0, 1.0, 1.0, 1.0, 0.1])
-#: A change matters that moves a pose by so many of its claimed sigmas, in any direction.
-_MATTERS = 2.0
-#: A part of the seven counts as necessary beyond this chance.
-_NECESSARY = 1e-4
 _ROTATIONS, _SCALED, _SKEWED = slice(2, 5), 5, 6
 #: Shots whose detections are remembered, to know the same images again; half: a shorter loop of images counts as new.
 _IMAGES = 4096
 #: What may be wrong, and its part of the seven numbers.
 _PARTS: dict[Part, slice] = {"rig": slice(0, 5), "body": slice(5, 6), "time": slice(6, 7)}
+#: By how much a part must explain more than the others alone.
+_NEEDED = {part: chi_square_limit(rows.stop - rows.start, NECESSARY) for part, rows in _PARTS.items()}
 #: Chi-square of an alarm: of all seven numbers, and of each part alone, which share the probability of a false one.
 _ALARM, _ALARMS = (
     alarm_limit(len(_WIDE), 1.0 / TEST_S, 4),
     {part: alarm_limit(rows.stop - rows.start, 1.0 / TEST_S, 4) for part, rows in _PARTS.items()},
 )
-#: A change matters or not at so many of the newest poses: a skew does so in motion alone.
-_POSES = 60
 #: Chi-square from which on a change that matters widens the poses.
 _SUSPECTED = chi_square_limit(len(_WIDE), SUSPECTED)
 #: Standard deviations of its prior that are tried: the one of the largest evidence is taken (MacKay, 1992).
-_LENS_SCALES_PX = tuple(2.0**k for k in range(-6, 2))
+_LENS_SCALES_PX = np.array([2.0**k for k in range(-6, 2)])
 #: It is tested in every so many tests, from so many poses that differ; its chi-square of an alarm.
 _LENS_TESTS, _LENS_POSES = 4, 8
 #: It is named where it explains so much more than a change of the seven numbers, as a share of what that explains.
@@ -215,7 +225,7 @@ class RigWatch:
         self._taken_s = -np.inf
         self._began: Array | None = None
         # The response of the newest poses to everything, and the covariances of these poses.
-        self._effects: deque[tuple[Array, Array]] = deque(maxlen=_POSES)
+        self._effects: deque[tuple[Array, Array]] = deque(maxlen=POSES)
         self._full = self._size + LENS
         # Shots of the running test, in stays; sums since the beginning are for what the camera models lack.
         self._stays: list[list[ShotResiduals]] = []
@@ -376,7 +386,7 @@ class RigWatch:
 
     def information(self, estimates: Sequence[PoseEstimate]) -> tuple[ResidualSums, int]:
         """Return the sums of measured poses, and how many of these differ: consecutive ones that are alike count as one."""
-        sums, stays = ResidualSums(self._size, 0.0), list[list[ShotResiduals]]()
+        sums, stays = self._summed([]).of(self._size), list[list[ShotResiduals]]()
         count, began = 0, None
         for k, estimate in enumerate(estimates):
             found = self.reader.read(estimate, float(k))
@@ -384,12 +394,11 @@ class RigWatch:
                 continue
             if began is None or differ(began, estimate.T_left_body):
                 began = estimate.T_left_body
-                sums.add(self._summed(stays).of(self._size), 1.0)
+                sums = sums.plus(self._summed(stays).of(self._size))
                 stays = [[]]
                 count += 1
             stays[-1].append(found)
-        sums.add(self._summed(stays).of(self._size), 1.0)
-        return sums, count
+        return sums.plus(self._summed(stays).of(self._size)), count
 
     def explained(self, estimates: Sequence[PoseEstimate]) -> tuple[StereoRig, Body, HealthFinding]:
         """Return the rig and the body with the change that poses show, which are known to be wrong, and what it is."""
@@ -397,11 +406,11 @@ class RigWatch:
         change = self._estimated(self._in_priors(sums).reduced(self._size))
         more = {part: change.chi_square - change.without[part] for part in ("rig", "body")}
         part: Part = max(("rig", "body"), key=lambda each: (more[each], change.alone[each]))
-        sure = more[part] > chi_square_limit(_PARTS[part].stop - _PARTS[part].start, _NECESSARY)
-        found = _FINDINGS[part](change, None, not sure)
+        sure = more[part] > _NEEDED[part]
+        said = replace(_part_finding(change, part, None, alone=not sure, cost_m=0.0), cost_mm=None)
         rig = self.rig.perturbed(free_directions(self.rig) @ change.f[_PARTS["rig"]])
         body = replace(self._body, points=(1.0 + change.f[_SCALED]) * self._body.points)
-        return rig, body, found if self._poses > 1 else _of_one_pose(found)
+        return rig, body, said if self._poses > 1 else _of_one_pose(said)
 
     def _sum(self, shot: ShotResiduals, estimate: PoseEstimate) -> None:
         T = estimate.T_left_body
@@ -426,7 +435,7 @@ class RigWatch:
         cov: Array | None = None,
     ) -> ResidualSums:
         """Return the sums of stays, each the mean of its shots, without ``own`` times of exposure and what moves."""
-        sums = ResidualSums(self._full, stays[0][0].t_s if stays else 0.0)
+        M, freedom = np.zeros((1 + self._full, 1 + self._full)), 0.0
         for alone in (True, False):  # those of one shot are summed at once
             shots = [
                 (self._unrest_weighed(each.every if every else each.rows, cov=cov), len(stay))
@@ -435,11 +444,11 @@ class RigWatch:
                 if (len(stay) == 1) is alone
             ]
             if shots:
-                rows = [each if alone else each / np.sqrt(count) for each, count in shots]
-                sums.take(np.concatenate(rows), sum((len(each) - 6.0) / count for each, count in shots))
-        if own is not None:
-            eliminate(own, self._weighed_parts(stays, every=every), sums)
-        return sums
+                rows = np.concatenate([each if alone else each / np.sqrt(count) for each, count in shots])
+                M += rows.T @ rows
+                freedom += sum((len(each) - 6.0) / count for each, count in shots)
+        sums = ResidualSums(M, freedom, stays[0][0].t_s if stays else 0.0)
+        return sums if own is None else eliminate(own, self._weighed_parts(stays, every=every), sums)[0]
 
     def _in_units(
         self,
@@ -466,19 +475,19 @@ class RigWatch:
         self._shape.decide(*self._every, ends=ends)
         self._decided(change)
         if self._timed and not newest.passes and self._unrest_began(stays):  # newest sums do not have it in their noise
-            self._take_back([each.begin_s for each in list(self._fits[0].kept)[-TOGETHER:]])
+            self._take_back([each.begin_s for each in self._fits[0].kept[-TOGETHER:]])
         elif self._lens_is_due():
             self.lens = self._lens()
 
     def _lens_is_due(self) -> bool:
         """Return whether the lenses are looked at with the newest test."""
         tests = self._fits[0].count
-        due = 0 < self._alarms <= _FRESH or tests % _LENS_TESTS == 0
+        due = 0 < self._alarms <= FRESH or tests % _LENS_TESTS == 0
         return due and self._poses >= _LENS_POSES
 
     def _keep(self, newest: _Newest, *, again: bool) -> None:
         if newest.every is not newest.fits and self._every is self._fits:
-            self._every = self._fits[0].copied(), self._fits[1].copied()
+            self._every = copy(self._fits[0]), copy(self._fits[1])
         changed_s = min(self._shape.changed_s, self._onset.begin_s if self._alarms else np.inf)
         kept = [(self._fits, newest.fits), (self._every, newest.every)][: 1 if self._every is self._fits else 2]
         for watched, sums in kept:
@@ -508,7 +517,7 @@ class RigWatch:
 
     def _dated(self) -> RigChange:
         """Return the change as all shots show it, dated anew while the alarm is new, and now and then."""
-        tests, fresh = self._fits[0], self._alarms <= _FRESH
+        tests, fresh = self._fits[0], self._alarms <= FRESH
         if fresh or tests.count % STEPS == 0:
             _, self._onset = tests.dated(len(_WIDE), None if fresh else self._onset.begin_s)
         if fresh:
@@ -524,7 +533,7 @@ class RigWatch:
         newest, every = self._newest(stays, None, None)
         self._keep(newest, again=False)
         change = self._doubted()
-        known = self._alarms > _FRESH and self._fits[0].count % STEPS > 0  # what stays did explain some tests
+        known = self._alarms > FRESH and self._fits[0].count % STEPS > 0  # what stays did explain some tests
         if not self.passing.now and (known or change.chi_square <= _SUSPECTED):
             return newest, change
         passes, own = self._passes(stays, every)
@@ -545,7 +554,7 @@ class RigWatch:
         sums = list[tuple[ResidualSums, ResidualSums]]()
         for every in (False, True)[: 1 + left_out]:
             whole = self._in_units(stays, every=every, own=own, cov=cov)
-            usual = whole.less(self._in_units(odd, every=every, own=own, cov=cov)) if odd else whole
+            usual = whole.plus(self._in_units(odd, every=every, own=own, cov=cov), -1.0) if odd else whole
             sums.append((whole, usual))
         (whole, usual), of_every = sums[0], sums[-1]
         fitting = sums[0]
@@ -573,8 +582,7 @@ class RigWatch:
             moving = [(shot.rows[:, 0], self._moving(shot.rows), 1.0 / len(stay)) for stay in stays for shot in stay]
             cov, _, occam = nodding(moving, self._swung if self._swings else None)
             nods = self._summed(stays, cov=cov).by(self._with_lens), occam
-            sums = self._summed(stays)
-            shared = eliminate(found, parts, sums)
+            sums, shared = eliminate(found, parts, self._summed(stays))
             shared = np.hstack([shared[:, :1], shared[:, 1:] @ self._with_lens])
             times = Times(found, shared, sums.by(self._with_lens))
         cause, taken_back = self.passing.decide(every, self._staying, self._size, times, nods)
@@ -588,13 +596,13 @@ class RigWatch:
 
     def _staying(self, sums: ResidualSums, excess: float, skewed: bool) -> float:
         """Return the log-evidence of what stays: cameras, body, or what the camera models lack; 0 where nothing does."""
-        M = np.delete(np.delete(sums.M, rows := slice(1 + self._size, len(sums.M) - LENS), axis=0), rows, axis=1)
-        M = eliminated(M, slice(1, 1 + self._size)) / excess
-        values, V = np.linalg.eigh(M[1:, 1:])
-        variances = np.square(_LENS_SCALES_PX)[:, None]
-        ratio = 1.0 + variances * np.maximum(values, 0.0)
-        lens = 0.5 * (variances * np.square(V.T @ M[1:, 0]) / ratio - np.log(ratio)).sum(axis=1)
-        return max(self._shape.evidence(sums.of(len(sums.b) - LENS), excess, skewed), float(lens.max()))
+        lens = sums.among(self._lens_rows(sums)).reduced(self._size).over(excess)
+        most = float(evidence_of_scales(lens.M, _LENS_SCALES_PX).max())
+        return max(self._shape.evidence(sums.of(len(sums.b) - LENS), excess, skewed), most)
+
+    def _lens_rows(self, sums: ResidualSums) -> Ids:
+        """Return the rows of the parameters and of the coefficients of what the camera models lack."""
+        return np.append(np.arange(self._size), len(sums.b) - LENS + np.arange(LENS))
 
     def _take_back(self, begins: Sequence[float]) -> None:
         """Take back what was found since tests, by when they began, s, which something explains that passes."""
@@ -613,15 +621,13 @@ class RigWatch:
         K, sums, faults = self._size, self._wholes.since(self._wholes.always), len(_WIDE)
         every = np.arange(K + faults + LENS)
         changed, lens = every[K : K + faults], every[K + faults :]
-        rows = np.append(every[: K + faults], len(sums.b) - LENS + np.arange(LENS))
-        H, b = sums.H[np.ix_(rows, rows)] + np.eye(len(rows)), sums.b[rows]
+        tested = sums.among(np.append(every[: K + faults], len(sums.b) - LENS + np.arange(LENS)))
 
         def gained(*without: Ids) -> float:
-            rows = np.setdiff1d(every, np.concatenate([*without, np.zeros(0, int)]))
-            return float(b[rows] @ np.linalg.solve(H[np.ix_(rows, rows)], b[rows]))
+            return tested.gain(np.setdiff1d(every, np.concatenate([*without, np.zeros(0, int)])))
 
         most, by_lens = gained(), gained(changed)
-        excess = max((sums.square - most) / max(sums.freedom, 1.0), 1.0)
+        excess = sums.excess(most)
         if by_lens - gained(lens) < _LENS_ALARM * excess:
             return None
         more = (self._wholes.dated(faults)[0] - (sums.square - by_lens)) / excess  # than a change at any time
@@ -629,31 +635,21 @@ class RigWatch:
         moved = gained(lens) - gained(changed, lens)
         if more < max(_LENS_ALARM, _LENS_SHARE * moved / excess):
             return None
-        needed = tuple(
-            part
-            for part, rows in _PARTS.items()
-            if (most - gained(changed[rows])) / excess > chi_square_limit(rows.stop - rows.start, _NECESSARY)
-        )
+        needed = tuple(part for part, rows in _PARTS.items() if (most - gained(changed[rows])) / excess > _NEEDED[part])
         explained = (by_lens - gained(changed, lens)) / excess
         size = self.reader.noise_px * float(np.sqrt(2.0 * excess * explained / max(sums.freedom, 1.0)))
         sigma = size * float(np.sqrt(LENS / 2.0 + explained)) / explained
-        beta, cov = max((self._of_lens(sums, scale, excess) for scale in _LENS_SCALES_PX), key=lambda each: each[2])[:2]
-        found = LensError(beta, cov, (size, sigma), more, needed)
-        responses, covs = map(np.array, zip(*self._effects, strict=True))
-        shifts = responses[:, :, K:] @ beta
-        squares = np.einsum("ni,ni->n", shifts, np.linalg.solve(covs, shifts[..., None])[..., 0])
-        return found if self.alarm or float(np.max(squares)) > _MATTERS**2 else None
+        found = LensError(*self._of_lens(sums.among(self._lens_rows(sums)).over(excess)), (size, sigma), more, needed)
+        matters = largest_square(self._effects, np.append(np.zeros(K), found.beta)) > MATTERS**2
+        return found if self.alarm or matters else None
 
-    def _of_lens(self, sums: ResidualSums, scale_px: float, excess: float) -> tuple[Array, Array, float]:
-        """Return the coefficients (M,), px, with a prior of some size, their covariance (M, M), and its log-evidence."""
-        rows = np.append(np.arange(self._size), len(sums.b) - LENS + np.arange(LENS))
-        scales = np.append(np.ones(self._size), np.full(LENS, scale_px))
-        inner = sums.H[np.ix_(rows, rows)] * np.outer(scales, scales) / excess + np.eye(len(rows))
-        b, spread = scales * sums.b[rows] / excess, np.asarray(np.linalg.inv(inner), float)
-        found = spread @ b
-        evidence = 0.5 * float(b @ found - np.linalg.slogdet(inner)[1])
-        cov = scale_px**2 * spread[-LENS:, -LENS:]
-        return scale_px * found[-LENS:], cov, evidence
+    def _of_lens(self, sums: ResidualSums) -> tuple[Array, Array]:
+        """Return the coefficients (M,), px, by the prior of the largest evidence, and their covariance (M, M)."""
+        evidence = evidence_of_scales(sums.reduced(self._size).M, _LENS_SCALES_PX)
+        scales = np.append(np.ones(self._size), np.full(LENS, _LENS_SCALES_PX[int(np.argmax(evidence))]))
+        both = np.outer(scales, scales)
+        cov = np.asarray(np.linalg.inv(sums.H * both + np.eye(len(scales))) * both, float)
+        return (cov @ sums.b)[-LENS:], cov[-LENS:, -LENS:]
 
     @property
     def wrong_at_rest(self) -> bool:
@@ -684,10 +680,7 @@ class RigWatch:
 
     def _matters(self, change: RigChange, part: slice) -> bool:
         """Return whether a part of the seven numbers moves one of the newest poses by so many of its sigmas."""
-        responses, cov = map(np.array, zip(*self._effects, strict=True))
-        shift = responses[:, :, : self._size] @ (self._by_fault[:, part] @ change.f[part])
-        squares = np.einsum("ni,ni->n", shift, np.linalg.solve(cov, shift[..., None])[..., 0])
-        return float(np.max(squares)) > _MATTERS**2
+        return largest_square(self._effects, self._by_fault[:, part] @ change.f[part]) > MATTERS**2
 
     def _estimated(self, sums: ResidualSums) -> RigChange:
         """Return the seven numbers from sums of them and the candidates, which are zero."""
@@ -695,14 +688,9 @@ class RigWatch:
         S, s = np.asarray(seven.H + np.eye(len(_WIDE)), float), seven.b
         f = np.linalg.solve(S, s)
         # What the model leaves unexplained widens the noise (Birge ratio); it never narrows it.
-        excess = max((seven.square - float(s @ f)) / max(sums.freedom, 1.0), 1.0)
-
-        def explained(rows: Ids) -> float:
-            return float(s[rows] @ np.linalg.solve(S[np.ix_(rows, rows)], s[rows])) / excess
-
-        every = np.arange(len(_WIDE))
-        alone = {part: explained(every[rows]) for part, rows in _PARTS.items()}
-        without = {part: explained(np.delete(every, rows)) for part, rows in _PARTS.items()}
+        excess, every = seven.excess(float(s @ f)), np.arange(len(_WIDE))
+        alone = {part: seven.gain(every[rows]) / excess for part, rows in _PARTS.items()}
+        without = {part: seven.gain(np.delete(every, rows)) / excess for part, rows in _PARTS.items()}
         cov = excess * np.linalg.inv(S) * np.outer(_WIDE, _WIDE)
         return RigChange(_WIDE * f, cov, float(s @ f) / excess, alone, without, excess)
 
@@ -718,12 +706,16 @@ class RigWatch:
         if shape is not None and shape.chosen == (SMOOTH,) and by_shape < COSTS_M:
             shape = None  # a print as good as any: poses have it in their sigma
         if shape is not None and (lens is None or shape.chi_square > lens.chi_square):
-            found = self._shape.finding(shape, shape.begin_s if self._timed else None)
-            found = replace(found, cost_mm=1e3 * by_shape)
-            return (found, *(self._changed() if self.alarmed and shape.seven_needed else ()))
+            said = self._shape.finding(shape, shape.begin_s if self._timed else None, by_shape)
+            return (said, *(self._changed() if self.alarmed and shape.seven_needed else ()))
         if lens is not None:
             cost_m = self._cost_m(np.append(np.zeros(self._size), lens.beta))
-            return (_lens_finding(lens, cost_m),) if cost_m > COSTS_M else ()
+            unsure = "a change of the cameras, the body or their times" * bool(lens.needed)
+            return (
+                (make_finding("lens", lens.size_px, cost_m=cost_m, unsure=unsure, also=lens.needed),)
+                if cost_m > COSTS_M
+                else ()
+            )
         return (*(self._changed() if self.alarmed else ()), *self._nods())
 
     def _nods(self) -> tuple[HealthFinding, ...]:
@@ -739,22 +731,25 @@ class RigWatch:
         # The one that displaces points in the images by more.
         focal_px = np.array([camera.intrinsics[:2] for camera in self.rig.cameras])
         seen = np.diag(cov) * np.array([1.0, 1.0, 0.0, np.square(self.reader.half_px / focal_px).sum(axis=1).mean()])
-        return (_breathing_finding(cov, cost_m) if seen[3] > seen[:3].sum() else _nod_finding(cov[:3, :3], cost_m),)
+        if seen[3] > seen[:3].sum():
+            size = float(np.sqrt(cov[3, 3]))
+            return (make_finding("breathes", (size, 0.1 * size), cost_m=cost_m),)
+        sigma = 0.1 * float(np.sqrt(np.linalg.eigvalsh(cov[:3, :3])[-1]))
+        return (make_finding("nods", (float(np.sqrt(np.trace(cov[:3, :3]))), sigma), cost_m=cost_m),)
 
     def _changed(self) -> tuple[HealthFinding, ...]:
         """Return what the newest test found of the seven numbers."""
         change, since_s = self._found, self._since_s if self._timed else None
         assert change is not None
         parts = self._to_blame(change)
-        found = (
-            replace(
-                _FINDINGS[part](change, since_s, len(parts) == 1 and not self._needed(change, part)),
-                cost_mm=1e3 * self._cost_m(self._of_part(change, _PARTS[part])),
-            )
-            for part in parts
+        alone = len(parts) == 1 and not self._needed(change, parts[0])
+        said = tuple(self._said(change, part, since_s, alone=alone) for part in parts)
+        return said if self._poses > 1 or (self._timed and self._shots > 1) else tuple(map(_of_one_pose, said))
+
+    def _said(self, change: RigChange, part: Part, since_s: float | None, *, alone: bool) -> HealthFinding:
+        return _part_finding(
+            change, part, since_s, alone=alone, cost_m=self._cost_m(self._of_part(change, _PARTS[part]))
         )
-        several = self._poses > 1 or (self._timed and self._shots > 1)
-        return tuple(found) if several else tuple(map(_of_one_pose, found))
 
     @property
     def _shaped(self) -> bool:
@@ -764,22 +759,16 @@ class RigWatch:
     def copied(self) -> RigWatch:
         """Return a copy that says what was found so far; this one goes on."""
         copied = copy(self)
-        copied._fits, copied._shape = (self._fits[0].copied(), self._fits[1].copied()), self._shape.copied()
-        copied._every = (
-            copied._fits if self._every is self._fits else (self._every[0].copied(), self._every[1].copied())
-        )
-        copied._stays, copied.passing = [stay.copy() for stay in self._stays], copy(self.passing)
-        copied._unrest, copied._wholes, copied._swings = (
-            self._unrest.copied(),
-            self._wholes.copied(),
-            self._swings.copy(),
-        )
+        copied._fits = copy(self._fits[0]), copy(self._fits[1])
+        copied._every = copied._fits if self._every is self._fits else (copy(self._every[0]), copy(self._every[1]))
+        for name in ("_shape", "passing", "_unrest", "_wholes", "_swings", "_leftover"):
+            setattr(copied, name, copy(getattr(self, name)))
+        copied._stays = [stay.copy() for stay in self._stays]
         return copied
 
     def _ended(self) -> RigWatch:
         """Return a copy whose running test was made; this one goes on with it."""
         ended = self.copied()
-        ended._leftover = copy(self._leftover)
         ended._decide(ends=True)
         return ended
 
@@ -798,7 +787,7 @@ class RigWatch:
         """Return whether the other parts do not explain what was found."""
         rows = _PARTS[part]
         more = change.chi_square - change.without[part]
-        return more > chi_square_limit(rows.stop - rows.start, _NECESSARY) and self._matters(change, rows)
+        return more > _NEEDED[part] and self._matters(change, rows)
 
     def _to_blame(self, change: RigChange) -> list[Part]:
         """Return the parts that are needed to explain a change; where none is, the one that explains most alone."""
@@ -841,102 +830,18 @@ def _focal_changes(rig: StereoRig, size: int) -> Array:
     return changes * [0.5, 1.0] * np.where(np.arange(size) < right, 1.0, [[-1.0], [1.0]]).T
 
 
-def _rig_finding(change: RigChange, since_s: float | None, alone: bool) -> HealthFinding:
-    size, sigma = np.degrees(sized(change.f[_ROTATIONS], change.cov[_ROTATIONS, _ROTATIONS])).tolist()
-    unsure = "; a body of another size cannot be excluded" if alone else ""
-    moved_mm = 1e3 * float(np.linalg.norm(change.f[:2]))
-    return HealthFinding(
-        "rig",
-        f"the right camera is rotated by {size:.3f} deg and shifted by {moved_mm:.2f} mm against the left one, "
-        f"compared with the calibration{', and goes on to' * change.slow}{unsure}",
-        since_s,
-        size,
-        sigma,
-        "deg",
-        "fasten the cameras and calibrate the rig again",
-    )
-
-
-def _scale_finding(change: RigChange, since_s: float | None, alone: bool) -> HealthFinding:
-    """Return the finding of a body of another size, or a baseline of another length."""
-    size, sigma = 100.0 * float(change.f[_SCALED]), 100.0 * float(np.sqrt(change.cov[_SCALED, _SCALED]))
-    unsure = "; a rotation of one camera cannot be excluded" if alone else ""
-    return HealthFinding(
-        "body",
-        f"the body looks {abs(size):.2f} % {'larger' if size > 0 else 'smaller'} than its file says: the body file or the "
-        f"baseline of the rig is wrong, and the two cannot be distinguished{unsure}",
-        since_s,
-        size,
-        sigma,
-        "%",
-        "measure the distances on the body with calipers; if they agree with its file, calibrate the rig again",
-    )
-
-
-def _skew_finding(change: RigChange, since_s: float | None, alone: bool) -> HealthFinding:
-    size, sigma = 1e3 * float(change.f[_SKEWED]), 1e3 * float(np.sqrt(change.cov[_SKEWED, _SKEWED]))
-    unsure = "; a rotation of one camera cannot be excluded" if alone else ""
-    return HealthFinding(
-        "time",
-        f"the right camera exposes {abs(size):.2f} ms {'later' if size > 0 else 'earlier'} than is known, against the left "
-        f"one{unsure}",
-        since_s,
-        size,
-        sigma,
-        "ms",
-        "trigger both cameras together; in a recording --skew find moves the detections to one time",
-    )
-
-
-def _nod_finding(cov: Array, cost_m: float) -> HealthFinding:
-    """Return the finding of a camera that nods, of the covariance (3, 3) of its rotation, rad."""
-    size = float(np.degrees(np.sqrt(np.trace(cov))))
-    return HealthFinding(
-        "rig",
-        f"a camera nods: the right one rotates by {size:.3f} deg (RMS) to and fro against the left one; "
-        "which of the two moves cannot be distinguished",
-        None,
-        size,
-        float(np.degrees(np.sqrt(np.linalg.eigvalsh(cov)[-1]))) * 0.1,
-        "deg",
-        "fasten the cameras on one stiff bar, away from what vibrates; poses have this in their sigma",
-        cost_mm=1e3 * cost_m,
-    )
-
-
-def _breathing_finding(cov: Array, cost_m: float) -> HealthFinding:
-    """Return the finding of a lens that breathes, of the covariance (4, 4) of rotation and focal length."""
-    size = 100.0 * float(np.sqrt(cov[3, 3]))
-    return HealthFinding(
-        "lens",
-        f"a lens breathes: within a second the focal length of one camera changes by {size:.3f} % (RMS) to and fro against "
-        "that of the other; which of the two cannot be distinguished",
-        None,
-        size,
-        0.1 * size,
-        "%",
-        "switch autofocus and image stabilisation off, fasten focus and zoom; poses have this in their sigma",
-        ("rig",),
-        cost_mm=1e3 * cost_m,
-    )
-
-
-def _lens_finding(lens: LensError, cost_m: float) -> HealthFinding:
-    size, sigma = lens.size_px
-    besides = "; a change of the cameras, the body or their times cannot be excluded" if lens.needed else ""
-    return HealthFinding(
-        "lens",
-        f"residuals of {size:.3f} px RMS depend on the position in the images alone, which the model of the cameras cannot "
-        f"express{besides}",
-        None,
-        size,
-        sigma,
-        "px",
-        "calibrate again with a richer lens model and with targets over the whole of both images; look for a lens that is "
-        "loose or behind a window",
-        lens.needed,
-        cost_mm=1e3 * cost_m,
-    )
+def _part_finding(change: RigChange, part: Part, since_s: float | None, *, alone: bool, cost_m: float) -> HealthFinding:
+    """Return the finding of a part of the seven numbers; ``alone``: nothing shows that its rival is not the cause."""
+    name, rows = {
+        "rig": ("rotated", _ROTATIONS),
+        "body": ("scaled", _PARTS["body"]),
+        "time": ("skewed", _PARTS["time"]),
+    }[part]
+    size, sigma = sized(change.f[rows], change.cov[rows, rows])
+    size = size if part == "rig" else float(change.f[rows][0])
+    unsure = CAUSES["scaled" if part == "rig" else "rotated"].name if alone else ""
+    words = {"shift_mm": 1e3 * float(np.linalg.norm(change.f[:2])), "more": ", and goes on to" * change.slow}
+    return make_finding(name, (size, sigma), since_s, cost_m=cost_m, unsure=unsure, words=words)
 
 
 def _of_one_pose(found: HealthFinding) -> HealthFinding:
@@ -947,6 +852,3 @@ def _of_one_pose(found: HealthFinding) -> HealthFinding:
     )
     advice = f"measure more poses; if all say so, {found.advice}"
     return replace(found, what=f"{found.what}; {same}", advice=advice, alternatives=("time",))
-
-
-_FINDINGS = {"rig": _rig_finding, "body": _scale_finding, "time": _skew_finding}

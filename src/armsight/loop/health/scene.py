@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from armsight.data import SIDES, Array, Image, Shot
 from armsight.geometry.pose import inverse, transform
 from armsight.geometry.rotation import skew
-from armsight.loop.finding import HealthFinding, alarm_limit, sized
+from armsight.loop.finding import HealthFinding, alarm_limit, make_finding, sized
 from armsight.vision.camera import Camera
 from armsight.vision.image import grey
 from armsight.vision.rig import StereoRig
@@ -81,16 +81,15 @@ class CameraMotion(NamedTuple):
         rotated, cov = self.rotation
         return float(rotated @ np.linalg.solve(cov, rotated))
 
-    def sized(self) -> tuple[float, float, str, str]:
-        """Return size, sigma, unit and words of what explains it: a shift where that does clearly, else a rotation."""
-        size, sigma = np.degrees(sized(*self.rotation)).tolist()
-        how = f"rotated by {size:.3f} deg"
+    def sized(self) -> tuple[tuple[float, float], str, str]:
+        """Return size and sigma (SI), unit and words of a shift where it explains it clearly, else of a rotation."""
+        how = f"rotated by {np.degrees(sized(*self.rotation)[0]):.3f} deg"
         if self.shift is not None and self.favours <= _DISTINCT:
-            shift_mm, sigma_mm = (1e3 * each for each in sized(*self.shift))
+            shifted = f"moved by {1e3 * sized(*self.shift)[0]:.2f} mm"
             if self.favours < -_DISTINCT:
-                return shift_mm, sigma_mm, "mm", f"moved by {shift_mm:.2f} mm"
-            how += f", or moved by {shift_mm:.2f} mm: the two cannot be distinguished"
-        return size, sigma, "deg", how
+                return sized(*self.shift), "mm", shifted
+            how += f", or {shifted}: the two cannot be distinguished"
+        return sized(*self.rotation), "deg", how
 
 
 class _Spots:
@@ -337,22 +336,20 @@ class SceneWatch:
             return self._found
         side = max(moved, key=lambda each: moved[each].chi_square)
         together = len(moved) == 2 and self._alike(moved[0], moved[1])
-        size, sigma, unit, how = moved[side].sized()
+        evidence, unit, how = moved[side].sized()
         who = f"the {SIDES[side]} camera {how}"
         if len(moved) == 2:
             who = f"both cameras moved{'' if together else ', not'} together: {who}"
         elif motions[1 - side] is not None:
             who += f", the {SIDES[1 - side]} one did not"
         return (
-            HealthFinding(
-                "fixed" if together else "rig",
-                f"{who}, as {moved[side].seen} spots of the background show",
+            make_finding(
+                "scene together" if together else "scene",
+                evidence,
                 min((since for each in moved if (since := self._since[each]) is not None), default=None),
-                size,
-                sigma,
-                unit,
-                "fasten the rig, and run again" if together else "fasten the cameras and calibrate the rig again",
-                cost_mm=1e3 * self._cost_m(moved, p_left, together=together),
+                cost_m=self._cost_m(moved, p_left, together=together),
+                unit=unit,
+                words={"who": who, "count": moved[side].seen},
             ),
         )
 

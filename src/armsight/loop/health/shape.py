@@ -25,9 +25,7 @@ together, seen from directions that differ.
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Sequence
-from copy import copy
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -36,8 +34,21 @@ import numpy as np
 from armsight.data import Array, Ids, Record
 from armsight.estimate.chance import chi_square_limit
 from armsight.geometry.rotation import skew
-from armsight.loop.finding import HealthFinding, alarm_limit, sized
-from armsight.loop.health.residuals import FURTHEST_M, STEPS, UNLIKE, History, Onset, ResidualSums, eliminated
+from armsight.loop.finding import HealthFinding, alarm_limit, make_finding, sized
+from armsight.loop.health.residuals import (
+    FRESH,
+    FURTHEST_M,
+    MATTERS,
+    NECESSARY,
+    POSES,
+    STEPS,
+    UNLIKE,
+    History,
+    Onset,
+    ResidualSums,
+    eliminated,
+    largest_square,
+)
 
 #: A focal length may change so much, as a share.
 _FOCAL = 0.05
@@ -49,13 +60,11 @@ _AGREE = (0.5, 2.0)
 _ASKED, _LEAST_SHOTS, _LEAST_POSES = 30, 8, 6
 #: The directions from which the body was seen must differ from their mean by so much, rad.
 _VIEWS_RAD = 0.05
-#: In so many tests after an alarm it is dated anew; directions that are remembered.
-_FRESH, _VIEWS = 6, 1000
-#: A displacement matters that moves a pose by so many of its claimed sigmas, of so many newest poses.
-_MATTERS, _POSES = 2.0, 60
-#: Explanations whose chi-squares differ by less are not distinguished; one is needed besides another beyond this chance.
-_ALIKE, _NECESSARY = 12.0, 1e-4
-_BESIDES = chi_square_limit(3, _NECESSARY)
+#: Directions that are remembered.
+_VIEWS = 1000
+#: Explanations whose chi-squares differ by less are not distinguished.
+_ALIKE = 12.0
+_BESIDES = chi_square_limit(3, NECESSARY)
 #: Probability, before a test, that it is the first one after any change; that a body is strained or bent as a print is.
 _RARE, _PRINTED = 1e-4, 0.1
 #: A smooth deformation is said from this log-evidence on: one of a thousand bodies by chance (Markov).
@@ -99,7 +108,7 @@ class ShapeError(Record):
     @property
     def seven_needed(self) -> bool:
         """Whether a change of the seven numbers is needed besides."""
-        return bool(self.seven > chi_square_limit(7, _NECESSARY))
+        return bool(self.seven > chi_square_limit(7, NECESSARY))
 
     def is_of(self, other: ShapeError | None) -> bool:
         """Whether both name the same candidate first."""
@@ -112,36 +121,11 @@ FOCAL, SMOOTH = -1, -2
 _SEVEN = slice(1, 8)
 
 
-class _ShapeSums(NamedTuple):
-    """Sums with everything but the candidates eliminated: G (C, C), r (C,), and the sum of squares and freedom."""
-
-    G: Array
-    r: Array
-    square: float
-    freedom: float
-
-    def gain(self, columns: Ids) -> float:
-        """Return what candidates explain of the sum of squares."""
-        r = self.r[columns]
-        return float(r @ np.linalg.solve(self.G[np.ix_(columns, columns)], r))
-
-    def gains(self, points: Sequence[int]) -> Array:
-        """Return what each of some points (P,) explains alone, as :meth:`gain` does."""
-        rows = 2 + 3 * np.array(points, int)[:, None] + np.arange(3)
-        r = self.r[rows]
-        solved = np.linalg.solve(self.G[rows[:, :, None], rows[:, None, :]], r[..., None])[..., 0]
-        return np.asarray(np.einsum("pi,pi->p", r, solved))
-
-    def excess(self, gain: float) -> float:
-        """Return by how much the variance of what is left exceeds the noise (Birge ratio), 1 at the least."""
-        return max((self.square - gain) / max(self.freedom, 1.0), 1.0)
-
-
 class _Reduced(NamedTuple):
     """What sums say of the candidates: with the seven numbers eliminated, and with these zero."""
 
-    whole: _ShapeSums
-    without: _ShapeSums
+    whole: ResidualSums
+    without: ResidualSums
 
 
 class _Hypotheses(NamedTuple):
@@ -166,6 +150,8 @@ class _Explained(NamedTuple):
 
 class ShapeWatch:
     """Watches the shape of the body, and the focal lengths of the cameras against each other.
+
+    What it holds is replaced, never changed: a copy (:mod:`copy`) goes on alone.
 
     Args:
         focal: (K, 2) what relative changes of the focal lengths change of these: of the left one by a half and of the right
@@ -213,10 +199,10 @@ class ShapeWatch:
         self._hypotheses = _hypotheses(len(self._candidates), 3 * n, strained=strained)
         self._limit_focal, self._limit = (alarm_limit(size, 1.0 / test_s, 2 * (n + 1)) for size in (1, 3))
         self._view: Array | None = None  # the newest direction that differs from the one before
-        self._views: deque[tuple[float, Array]] = deque(maxlen=_VIEWS)  # and of what time, s
-        self._shots: deque[Array] = deque(maxlen=_ASKED)  # rows, as they were taken
+        self._views = tuple[tuple[float, Array], ...]()  # and of what time, s
+        self._shots = tuple[Array, ...]()  # rows, as they were taken
         # The response of the newest poses to the parameters, and the covariances of these poses.
-        self._effects: deque[tuple[Array, Array]] = deque(maxlen=_POSES)
+        self._effects = tuple[tuple[Array, Array], ...]()
         self.changed_s = np.inf  # since when something may have changed
         self._alarms = 0  # in a row
         self._suspect: ShapeError | None = None
@@ -235,14 +221,14 @@ class ShapeWatch:
             cov: (6, 6) covariance of the pose.
             moved: whether its pose differs from the one before; single shots are asked only then.
         """
-        self._effects.append((response, cov))
+        self._effects = (*self._effects, (response, cov))[-POSES:]
         if not moved:
             return
-        self._shots.append(rows)
+        self._shots = (*self._shots, rows)[-_ASKED:]
         view = T[:3, :3].T @ T[:3, 3]
         view /= np.sqrt(view @ view)
         if self._view is None or np.linalg.norm(view - self._view) > _VIEWS_RAD / _LEAST_POSES:  # else it rests
-            self._views.append((t_s, view))
+            self._views = (*self._views, (t_s, view))[-_VIEWS:]
             self._view = view
 
     def decide(self, tests: History, usual: History, *, ends: bool) -> None:
@@ -270,9 +256,9 @@ class ShapeWatch:
         tests = self._tests
         windows = tests.windows(every=True) if before is None else [before.onset]
         shown = next(filter(None, map(self._shown, windows)), None)
-        if shown is not None and (self._alarms < _FRESH or tests.count % STEPS == 0):
+        if shown is not None and (self._alarms < FRESH or tests.count % STEPS == 0):
             return self._shown(
-                tests.dated(9 + 3 * len(self._candidates), None if self._alarms < _FRESH else shown.begin_s)[1]
+                tests.dated(9 + 3 * len(self._candidates), None if self._alarms < FRESH else shown.begin_s)[1]
             )
         return shown
 
@@ -334,12 +320,10 @@ class ShapeWatch:
 
     def _whole(self, sums: ResidualSums) -> tuple[Array | None, float]:
         """Return sums of everything that may have changed, and the Birge ratio they leave; None where too little."""
-        M = sums.M
-        gain = float(M[0, 1:] @ np.linalg.solve(M[1:, 1:] + np.eye(len(M) - 1), M[1:, 0]))
+        gain = sums.gain()
         if gain < 2.0:
             return None, 1.0
-        excess = max((float(M[0, 0]) - gain) / max(sums.freedom, 1.0), 1.0)  # what all together do not explain is noise
-        return self._with_smooth.T @ M @ self._with_smooth, excess
+        return self._with_smooth.T @ sums.M @ self._with_smooth, sums.excess(gain)  # what all do not explain is noise
 
     def _shown(self, onset: Onset) -> ShapeError | None:
         """Return what the tests show for certain of a change that began at some time; None where that is nothing."""
@@ -376,10 +360,10 @@ class ShapeWatch:
             return None
         return ShapeError((SMOOTH,), value, cov, 2.0 * max(most), 0.0, (), onset)
 
-    def _displaced(self, found: _Reduced, newest: _ShapeSums, onset: Onset) -> ShapeError | None:
+    def _displaced(self, found: _Reduced, newest: ResidualSums, onset: Onset) -> ShapeError | None:
         """Return the points that are displaced by what all tests together say, and the newest; None where none is."""
         whole = found.whole
-        if not self._candidates or not (whole.gains(self._candidates) > self._limit).any():
+        if not any(whole.gain(_columns([each])) > self._limit for each in self._candidates):
             return None
         steady = [each for each in self._candidates if self._steady(whole, newest, each)]
         chosen = list[int]()
@@ -426,21 +410,21 @@ class ShapeWatch:
         alike = tuple(each for each, score in scores.items() if each != best and score > scores[best] - _ALIKE)
         return ShapeError(chosen, value, excess * cov, scores[best], seven, alike, onset)
 
-    def _values(self, whole: _ShapeSums, columns: Ids, others_m: float) -> tuple[Array, Array]:
+    def _values(self, whole: ResidualSums, columns: Ids, others_m: float) -> tuple[Array, Array]:
         """Return the displacements (C,) of columns, and of all other points if these have a prior, and cov (C, C)."""
         wide = self._wide.copy()
         free = columns if others_m == 0.0 else np.arange(2, len(wide))
         wide[np.setdiff1d(free, columns)] = others_m
-        G = whole.G - np.eye(len(wide))
+        G = whole.H
         narrow = wide / self._wide
-        G, r = G * np.outer(narrow, narrow) + np.eye(len(wide)), whole.r * narrow
+        G, r = G * np.outer(narrow, narrow) + np.eye(len(wide)), whole.b * narrow
         value, cov = np.zeros(len(wide)), np.zeros((len(wide), len(wide)))
         inverse = np.linalg.inv(G[np.ix_(free, free)])
         value[free] = wide[free] * (inverse @ r[free])
         cov[np.ix_(free, free)] = inverse * np.outer(wide[free], wide[free])
         return value, cov
 
-    def _steady(self, whole: _ShapeSums, newest: _ShapeSums, which: int) -> bool:
+    def _steady(self, whole: ResidualSums, newest: ResidualSums, which: int) -> bool:
         """Return whether the newest test, and the median of single shots, agree on a point with all tests together."""
         columns = _columns([which])
         (d, cov), (now, cov_now) = (self._values(each, columns, 0.0) for each in (whole, newest))
@@ -462,14 +446,11 @@ class ShapeWatch:
 
     def _matters(self, value: Array) -> bool:
         """Return whether a displacement moves a new pose by so many of its sigmas, were it measured with that point."""
-        return self._displaces(value) > _MATTERS**2
+        return self._displaces(value) > MATTERS**2
 
     def _displaces(self, value: Array) -> float:
         """Return by how much a displacement moves one of the newest poses at most, in its sigmas, squared."""
-        responses, covs = map(np.array, zip(*self._effects, strict=True))
-        shift = responses @ (self._by_candidate @ value)
-        squares = np.einsum("ni,ni->n", shift, np.linalg.solve(covs, shift[..., None])[..., 0])
-        return float(np.max(squares))
+        return largest_square(self._effects, self._by_candidate @ value)
 
     def added(self, response: Array) -> Array:
         """Return the covariance (6, 6) of what was found, of a pose with a response (6, K) to the parameters."""
@@ -484,72 +465,48 @@ class ShapeWatch:
         """Return the change of the parameters (K,) that was found."""
         return np.asarray(self._by_candidate @ error.value)
 
-    def copied(self) -> ShapeWatch:
-        """Return a copy that says what was found so far; this one goes on."""
-        other = copy(self)
-        other._views, other._shots, other._effects = self._views.copy(), self._shots.copy(), self._effects.copy()
-        return other
-
-    def finding(self, error: ShapeError, since_s: float | None) -> HealthFinding:
-        """Return the finding of what was found."""
+    def finding(self, error: ShapeError, since_s: float | None, cost_m: float) -> HealthFinding:
+        """Return the finding of what was found, which displaces poses by so much, m."""
+        if error.chosen[0] == FOCAL:
+            share, goes_on = float(error.value[0]), " so far, and it goes on" * error.onset.goes_on
+            longer, shorter = ("left", "right") if share > 0 else ("right", "left")
+            words = {"longer": longer, "shorter": shorter, "more": goes_on}
+            return make_finding(
+                "focal", (abs(share), float(np.sqrt(error.cov[0, 0]))), since_s, cost_m=cost_m, words=words
+            )
         if error.chosen[0] == SMOOTH:
-            return self._smooth_finding(error, since_s)
-        return _focal_finding(error, since_s) if error.chosen[0] == FOCAL else self._points_finding(error, since_s)
+            return self._smooth_finding(error, since_s, cost_m)
+        points = [(each, _columns([each])) for each in error.chosen]
+        largest = max((rows for _, rows in points), key=lambda rows: float(np.linalg.norm(error.value[rows])))
+        moved = [f"{self._names[each]} by {1e3 * np.linalg.norm(error.value[rows]):.2f} mm" for each, rows in points]
+        others = " or ".join(self._names[each] for each in error.alike)
+        words = {"points": ", ".join(moved), "point": self._names[error.chosen[0]]}
+        words["more"] = f"; it may be {others} instead" if others else ""
+        name, evidence = (
+            "points" if len(points) > 1 else "point",
+            sized(error.value[largest], error.cov[np.ix_(largest, largest)]),
+        )
+        return make_finding(name, evidence, since_s, cost_m=cost_m, words=words)
 
-    def _smooth_finding(self, error: ShapeError, since_s: float | None) -> HealthFinding:
+    def _smooth_finding(self, error: ShapeError, since_s: float | None, cost_m: float) -> HealthFinding:
         """Return the finding of a body that is strained or bent: how far a point is displaced at most, motions apart."""
         basis, value = self._smooth[:, :9], error.value[2:]
         rigid = np.linalg.lstsq(basis, value, rcond=1e-9)[0].reshape(3, 3)
         spin = (basis @ (0.5 * (rigid - rigid.T)).ravel()).reshape(-1, 3)
         shifts = value.reshape(-1, 3) - spin
         shifts -= shifts.mean(axis=0)
-        sizes = np.linalg.norm(shifts, axis=1)
-        k = int(sizes.argmax())
+        k = int(np.linalg.norm(shifts, axis=1).argmax())
         rows = slice(2 + 3 * k, 5 + 3 * k)
         strain = 50.0 * float(np.ptp(np.linalg.eigvalsh(rigid + rigid.T)))
-        return HealthFinding(
-            "body",
-            f"the body is elongated, sheared or bent against its file: its lengths differ by {strain:.2f} % from one "
-            f"direction to another, {self._names[k]} is displaced by {1e3 * sizes[k]:.2f} mm",
-            since_s,
-            1e3 * float(sizes[k]),
-            1e3 * sized(shifts[k], error.cov[rows, rows])[1],
-            "mm",
-            "measure the body along two directions and both diagonals with calipers, or take its shape from images "
-            "(armsight body); printers are off along one axis",
-        )
-
-    def _points_finding(self, error: ShapeError, since_s: float | None) -> HealthFinding:
-        points = [(each, _columns([each])) for each in error.chosen]
-        largest = max((rows for _, rows in points), key=lambda rows: float(np.linalg.norm(error.value[rows])))
-        size, sigma = sized(error.value[largest], error.cov[np.ix_(largest, largest)])
-        names = ", ".join(
-            f"{self._names[each]} by {1e3 * np.linalg.norm(error.value[rows]):.2f} mm" for each, rows in points
-        )
-        others = [self._names[each] for each in error.alike]
-        unsure = f"; it may be {' or '.join(others)} instead" if others and len(points) == 1 else ""
-        what = (
-            f"the body is bent, or points of it moved: against the others {names} are not where its file says"
-            if len(points) > 1
-            else f"{self._names[error.chosen[0]]} is displaced by {1e3 * size:.2f} mm on the body against its file: it "
-            f"moved, or is partly covered{unsure}"
-        )
-        return HealthFinding(
-            "body",
-            what,
-            since_s,
-            1e3 * size,
-            1e3 * sigma,
-            "mm",
-            "look at these points; clean or fasten them, and measure the body again (armsight body)",
+        evidence = sized(shifts[k], error.cov[rows, rows])
+        return make_finding(
+            "strained", evidence, since_s, cost_m=cost_m, words={"strain": strain, "point": self._names[k]}
         )
 
 
 def _reduced(sums: ResidualSums) -> _Reduced:
     """Return what sums of the seven numbers and the candidates say of the latter."""
-    whole, candidates = eliminated(sums.M, _SEVEN), np.delete(np.arange(len(sums.M)), _SEVEN)
-    both = whole, sums.M[np.ix_(candidates, candidates)]
-    return _Reduced(*(_ShapeSums(M[1:, 1:] + np.eye(len(M) - 1), M[1:, 0], float(M[0, 0]), sums.freedom) for M in both))
+    return _Reduced(sums.reduced(7), sums.among(np.arange(7, len(sums.b))))
 
 
 def _smooth(points: Array) -> Array:
@@ -607,20 +564,3 @@ def _differ(views: Array) -> bool:
     """Return whether directions (N, 3) differ enough from their mean."""
     mean = views.mean(axis=0)
     return bool(np.min(views @ mean) < np.cos(_VIEWS_RAD) * np.linalg.norm(mean))
-
-
-def _focal_finding(error: ShapeError, since_s: float | None) -> HealthFinding:
-    share, sigma = 100.0 * float(error.value[0]), 100.0 * float(np.sqrt(error.cov[0, 0]))
-    goes_on = " so far, and it goes on" if error.onset.goes_on else ""
-    longer, shorter = ("left", "right") if share > 0 else ("right", "left")
-    return HealthFinding(
-        "lens",
-        f"the focal length of the {longer} camera is {abs(share):.3f} % longer against that of the {shorter} one than "
-        f"calibrated{goes_on}; which of the two changed cannot be distinguished",
-        since_s,
-        abs(share),
-        sigma,
-        "%",
-        "fasten focus and zoom of both lenses, let the cameras warm up, and calibrate the rig again",
-        ("rig",),
-    )

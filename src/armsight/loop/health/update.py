@@ -24,7 +24,7 @@ import numpy as np
 
 from armsight.data import Array, Body, Correspondences, Missed, PoseEstimate, Record
 from armsight.geometry.pose import inverse, log_se3
-from armsight.loop.finding import HealthFinding
+from armsight.loop.finding import HealthFinding, make_finding
 from armsight.loop.health.residuals import ResidualSums
 from armsight.loop.health.rig import RigWatch, free_directions
 from armsight.vision.detections import SeenShot
@@ -161,17 +161,7 @@ def contradiction(rig: StereoRig, body: Body, missed: Sequence[PoseEstimate], sh
     if right >= _EXPLAINED * len(missed):
         question = "did the cameras move? " if found.cause == "rig" else ""
         return replace(found, what=f"{question}{shown}; {right} of {len(missed)} fit if {found.what}")
-    return HealthFinding(
-        "rig",
-        f"{shown}, and no one change of the cameras explains them: did they move again and again, or do left and right "
-        "images not belong together?",
-        None,
-        float(off_px),
-        float(high - low) / 2.0,
-        "px",
-        "look at the pairs of images; fasten the cameras and calibrate the rig again",
-        ("time",),
-    )
+    return make_finding("contradicted", (float(off_px), float(high - low) / 2.0), words={"shown": shown})
 
 
 @dataclass(frozen=True, eq=False)
