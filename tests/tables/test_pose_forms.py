@@ -188,7 +188,35 @@ FORMS = {
     "Universal Robots RTDE actual_TCP_pose_0 .. 5 (rtde 2.4 csv)": (
         "r.csv",
         csv(" ".join(["timestamp", *(f"actual_TCP_pose_{k}" for k in range(6))]), np.arange(N), P, VECTOR, mark=" "),
+        {},
+    ),
+    "ur_rtde 1.6.5 startFileRecording, named in order": (
+        "r.csv",
+        csv(",".join(["timestamp", *(f"actual_TCP_pose_{k}" for k in range(6))]), np.arange(N), P, VECTOR),
         {"columns": "t_s,x_m,y_m,z_m,rx_rad,ry_rad,rz_rad"},
+    ),
+    "PlotJuggler 3 CSV, with the angles that it adds": (
+        "p.csv",
+        csv(
+            "__time,/p/position/x,/p/position/y,/p/position/z,/p/orientation/roll,"
+            "/p/orientation/x,/p/orientation/y,/p/orientation/z,/p/orientation/w",
+            1690000000.5 + np.arange(N),
+            P,
+            VECTOR[:, :1],
+            XYZW,
+        ),
+        {},
+    ),
+    "ros2 topic echo --csv of a PoseStamped": (
+        "e.csv",
+        rows("1690000000,5000000,base_link,{},{},{},{},{},{},{}", P, XYZW),
+        {"columns": "_,_,_,x_m,y_m,z_m,qx,qy,qz,qw"},
+    ),
+    "pandas' names of columns without names": ("n.csv", csv("0,1,2,3,4,5,6", P, XYZW), {"rotation": "xyzw"}),
+    "pandas' names and index of columns without names": (
+        "i.csv",
+        csv(",0,1,2,3,4,5,6", np.arange(N), P, XYZW),
+        {"rotation": "xyzw"},
     ),
     "Yaskawa .JBI, RECTAN (DX100 manual 4.3.1)": (
         "p.JBI",

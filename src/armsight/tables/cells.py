@@ -200,7 +200,10 @@ def _delimited(path: Path, text: str, written: list[tuple[int, str]]) -> Cells:
     if not rows:
         raise InputError(f"{path}: no rows; one line a pose is needed")
     head = rows[0][1]
-    if number(head[0]) is None or any(re.fullmatch(r"[A-Za-z_]\w*", cell) and number(cell) is None for cell in head):
+    numbered = [str(k) for k in range(len(head))]
+    if len(rows) > 1 and head in (numbered, ["", *numbered[:-1]]):  # pandas' names of none, with its index or without
+        return _without_names(path, [(line, row[head[0] == "" :]) for line, row in rows[1:]])
+    if 2 * sum(number(cell) is not None for cell in head) < len(head):
         twice = next((name for name in head if name and head.count(name) > 1), None)
         if twice is not None:
             raise InputError(f"{path}: line {rows[0][0]} names a column twice: {twice}")

@@ -43,7 +43,11 @@ LOOSE = 2e-3  # how far a matrix may be from a rotation: what six digits leave
 LEROBOT = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll")
 _LEROBOT_POSITION, _LEROBOT_GRIPPER, _MOST_PERCENT = ".pos", "gripper", 100.001
 #: ROS's messages as columns, in metres (REP 103): pose.position.x, field.pose.orientation.w, transform.translation.x ...
-_ROS = re.compile(r"(?:.*[./_])?(?:(position|translation)|orientation|rotation)[._]([xyzw])")
+_ROS = re.compile(r"(?:.*[./_])?(?:(position|translation)|orientation|rotation)[./_]([xyzw])")
+#: Names of recorders: PlotJuggler's time, and of Universal Robots' RTDE the TCP's pose, a rotation vector, and joints.
+_RECORDED = {"__time": "t_s"} | {f"actual_q_{k}": f"q{k + 1}_rad" for k in range(6)}
+_RTDE = ("x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad")
+_RECORDED |= {f"actual_tcp_pose_{k}": name for k, name in enumerate(_RTDE)}
 #: Names of others for ours, in small letters; roll, pitch and yaw rotate about the fixed x, y and z.
 _THEIRS = {"tx": "x", "ty": "y", "tz": "z", "roll": "rx", "pitch": "ry", "yaw": "rz"}
 #: Angles of robots' makers: the columns beside X, Y and Z, mm, whose rotations they are, degrees, and about which axes.
@@ -54,7 +58,7 @@ _MAKERS = {
     "Doosan": ("a", "b", "c", "ZYZ"),
 }
 _OF_A_MAKER = re.compile(r"(?:([xyz])(?:_(m|mm))?|([abcoprtw])(?:_(deg|rad))?)")  # a column of theirs, in small letters
-_UNITLESS = re.compile(r"(?:q|j|joint)_?([1-7])")  # a joint without a unit
+UNITLESS = re.compile(r"(?:q|j|joint)_?([1-7])")  # a joint without a unit
 _JOINT = re.compile(r"q(\d+)_(rad|deg)")
 #: Numbers that are read of one table; half: half an hour of a run at 1 kHz is rejected, double: 800 MB.
 _MOST_NUMBERS = 50_000_000
@@ -98,7 +102,7 @@ def _of_ros(bare: Sequence[str], joint_names: Sequence[str], unit: str) -> list[
     """Return our names for those of ROS, of an arm's joints and of spreadsheets; others as they are."""
     ros = [_ROS.fullmatch(name) for name in bare]
     parts = {found[2] for found in ros if found and not found[1]}  # without w they are no quaternion
-    links = {name.lower(): f"q{k}_rad" for k, name in enumerate(joint_names, 1)}
+    links = _RECORDED | {name.lower(): f"q{k}_rad" for k, name in enumerate(joint_names, 1)}
     out = []
     for name, found in zip(bare, ros, strict=True):
         axis, mark, rest = name.partition("_")
@@ -107,11 +111,6 @@ def _of_ros(bare: Sequence[str], joint_names: Sequence[str], unit: str) -> list[
         else:
             out.append(links.get(re.sub(r"_joint$", "", name), _THEIRS.get(axis, axis) + mark + rest))
     return out
-
-
-def is_unitless(name: str) -> bool:
-    """Return whether a column is of a joint whose unit is not said."""
-    return bool(_UNITLESS.fullmatch(name.lower()))
 
 
 def _of_a_maker(bare: list[str], ours: list[str], unit: str, rotation: str | None) -> tuple[dict[int, str], str, str]:
@@ -246,10 +245,6 @@ class Columns:
     def line(self, row: int | np.integer[Any]) -> int:
         """Return which line of the file, or record, a row is."""
         return self.rows[int(row)][0]
-
-    def has_position(self) -> bool:
-        """Return whether there are positions."""
-        return any(name in self.at for name in ("x", "x_m", "x_mm"))
 
     def require(self, *names: str) -> None:
         """Raise an InputError where a column is missing; those that are there count as used."""

@@ -23,7 +23,7 @@ from armsight.errors import InputError, nearest
 from armsight.files import columns_unused
 from armsight.geometry.pose import pose
 from armsight.tables.cells import Cells, Renames, Rows, read_cells, read_columns
-from armsight.tables.columns import COLUMNS, Columns, degree_columns, is_unitless, understood
+from armsight.tables.columns import COLUMNS, UNITLESS, Columns, degree_columns, understood
 from armsight.tables.lengths import REACH, UNITS_M
 from armsight.tables.rotations import CONVENTIONS
 
@@ -112,7 +112,7 @@ def read_pose_table(
         )
     nothing = np.zeros((len(table.rows), 0))
     numbers, written, convention, unit_m, of_joints = nothing, nothing, "", 1.0, False
-    if q is None or (table.has_position() and not (only_joints and arm is not None)):
+    if q is None or (table.at.keys() & {"x", "x_m", "x_mm"} and not (only_joints and arm is not None)):
         p, unit_m, found_out = _positions(table, unit, detect_units, side)
         notes = (*notes, *found_out)
         R, numbers, convention, written = table.rotations(rotation)
@@ -232,7 +232,7 @@ def _suffix(table: Columns) -> str:
     suffix = next((s for s in ("_m", "_mm", "") if f"x{s}" in table.at), None)
     if suffix is not None:
         return suffix
-    if any(is_unitless(name) for name in table.at):
+    if any(UNITLESS.fullmatch(name.lower()) for name in table.at):
         raise InputError(
             f"{table.path}: line 1: joints without a unit: name them q1_deg .. or q1_rad .., and give --model"
         )
