@@ -20,6 +20,7 @@ import tempfile
 import textwrap
 import time
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -182,7 +183,7 @@ def measured(
     plan: RigPlan, groups: int, shots: int, seed: int, given: Conditions | None = None
 ) -> tuple[Array, list[Budget], int, float]:
     """Return errors (N, 6) along the left camera's axes, the budget of each, how many were missed, the share predicted."""
-    rng, given = np.random.default_rng(seed), given or plan.conditions()
+    rng, given = np.random.default_rng(seed), given or plan.conditions
     body, marker, normals = plan.layout, plan.marker_of, plan.layout.normals
     points, first = body.body.points, np.unique(marker, return_index=True)[1]
     errors, predicted, kept, height = [], [], [], plan.stereo_rig.left.image_size_px[1]
@@ -289,7 +290,7 @@ def ratios(errors: Array, predicted: list[Budget]) -> tuple[list[float], list[fl
 def causes(options: argparse.Namespace) -> None:
     """Print predicted over measured RMS of each cause alone."""
     for number, name, plan in rigs(options):
-        every = plan.conditions()
+        every = plan.conditions
         for cause in NEEDS if not options.cause else [options.cause]:
             one = alone(every, cause)
             if not all(np.any(getattr(one, key)) for key in NEEDS[cause] if key != "rotation_rad_s"):
@@ -331,16 +332,18 @@ def buying_page() -> str:
     return "\n".join([*lines, *kits]) + "\n"
 
 
+@cache
+def both_rms(plan: RigPlan, groups: int, shots: int, seed: int) -> tuple[float, float]:
+    """Return the RMS position error of a plan, m, predicted and measured."""
+    errors, predicted, _, _ = measured(plan, groups, shots, seed)
+    cov = np.array([each.cov()[0] for each in predicted])
+    return np.trace(cov[:, :3, :3], axis1=1, axis2=2).mean() ** 0.5, (errors[:, :3] ** 2).sum(axis=1).mean() ** 0.5
+
+
 def gained(before: RigPlan, after: RigPlan, options: argparse.Namespace, seed: int) -> tuple[float, float]:
     """Return the RMS position error of a plan over that of another, predicted and measured with the same draws."""
-    rms = []
-    for plan in (before, after):
-        errors, predicted, _, _ = measured(plan, options.groups, options.shots, seed)
-        cov = np.array([each.cov()[0] for each in predicted])
-        rms.append(
-            (np.trace(cov[:, :3, :3], axis1=1, axis2=2).mean() ** 0.5, (errors[:, :3] ** 2).sum(axis=1).mean() ** 0.5)
-        )
-    return float(rms[0][0] / rms[1][0]), float(rms[0][1] / rms[1][1])
+    first, second = (both_rms(plan, options.groups, options.shots, seed) for plan in (before, after))
+    return float(first[0] / second[0]), float(first[1] / second[1])
 
 
 def changes_done(options: argparse.Namespace) -> None:
@@ -414,7 +417,7 @@ def optimiser(options: argparse.Namespace) -> None:
 
 def drawn(plan: RigPlan, count: int, rng: np.random.Generator) -> Array:
     """Return errors (count, 3), m, of a plain Monte Carlo: all causes drawn, the pose by the fit that `measure` uses."""
-    given, points, normals, errors = plan.conditions(), plan.layout.body.points, plan.layout.normals, []
+    given, points, normals, errors = plan.conditions, plan.layout.body.points, plan.layout.normals, []
     root = np.linalg.cholesky(given.cov_calibration + 1e-18 * np.eye(len(given.cov_calibration)))
     noise = float(np.sqrt(sum(each**2 for each in given.noise_px.values())))
     rig, height = plan.stereo_rig, plan.image_size_px[1]
@@ -472,7 +475,7 @@ def real(options: argparse.Namespace) -> None:
                        pairs=pairs, body=spec, focal_widths=catalogue()[kind].focal_widths)  # fmt: skip
         rig, drawing = plan.stereo_rig, open_board(spec).body.points
         marker, size_px = plan.marker(plan.distance_m)
-        cov, square_m = plan.conditions().cov_calibration, size_px * plan.distance_m / plan.focal_px
+        cov, square_m = plan.conditions.cov_calibration, size_px * plan.distance_m / plan.focal_px
         counts = (int(n) for n in np.rint(np.ptp(drawing, axis=0)[:2] / square_m) + 1)
         Ts = board_poses(rng, rig, chessboard(*counts, square_m), 200)
         px = square_m * plan.focal_px / float(np.median(Ts[:, 2, 3]))

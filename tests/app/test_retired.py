@@ -42,6 +42,7 @@ from cli_runs import assert_rejected
         ("hub keys s --host b", "hub keys s --hub b:7447"),
         ("board offsets --ar4-offsets m.yaml", "board offsets --board ar4:m.yaml"),
         ("budget --run r", "budget --rig r"),
+        ("budget --baseline 80mm --json", "budget --json baseline=80mm"),
         ("batch check * --scheduler tcp://a:1", "batch check * --workers tcp://a:1"),
         ("", ""),
     ],

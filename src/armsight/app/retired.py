@@ -96,6 +96,12 @@ def _nothing(why: str) -> Rule:
     return lambda arguments, value: ("", why)
 
 
+def _key(arguments: list[str], value: str) -> tuple[str, str]:
+    """Put the baseline among the keys of a plan."""
+    arguments.append(f"baseline={value}")
+    return "", f"write {arguments[-1]}"
+
+
 _SEEN_BY_TWO = ("calibrate", "measure", "handeye")
 #: All of them.
 RETIRED = (
@@ -118,6 +124,7 @@ RETIRED = (
     Retired("--frames", ("handeye",), _into("--columns", "frames={}")),
     Retired("--scheduler", ("batch",), _into("--workers", many=False)),
     Retired("--run", ("budget",), _into("--rig", many=False)),
+    Retired("--baseline", ("budget",), _key),
     Retired("--ar4-offsets", ("board",), _into("--board", "ar4:{}", many=False)),
     Retired("--follow-rig", ("demo",), _nothing("in the demo no rig moves"), is_flag=True),
     Retired("--rectified", ("dense",), _nothing("a pair without a RIG.json is rectified"), is_flag=True),

@@ -1,13 +1,14 @@
 """``armsight budget``: what a small plan says, its page, and what is rejected."""
 
 import json
+import re
 
 import numpy as np
 import pytest
 
 from armsight.sim.budget import result
 from armsight.sim.budget.plan import RigPlan
-from armsight.sim.workcell.body import body_target
+from armsight.sim.workcell.body import body_target, body_text
 from armsight.vision.markers.targets import read_layout
 from armsight.vision.rig import StereoRig
 from cli_runs import assert_rejected
@@ -39,10 +40,34 @@ def test_answer_table_and_page(armsight, tmp_path, monkeypatch):
 
 def test_a_wish_that_is_not_reached_is_exit_code_1(armsight, monkeypatch):
     monkeypatch.setattr(result, "CHANGES", {})
-    said = armsight("budget", *SMALL, "--want", "0.02mm")
+    said = armsight("budget", *SMALL, "--want", "0.18mm")
     assert said.code == 1
-    assert "0.02 mm requested: not reached" in said.out
+    assert "0.18 mm requested: not reached" in said.out
     assert armsight("budget", *SMALL, "--want", "5mm").code == 0
+
+
+def test_a_wish_below_the_print_is_rejected_with_the_nearest(armsight):
+    said = armsight("budget", *SMALL, "--want", "0.02mm")
+    assert_rejected(said, "the print of the body alone costs", "can be had")
+    nearest = re.search(r"([0-9.]+mm) can be had", said.err)[1]
+    assert armsight("budget", *SMALL, "--want", nearest).code == 1  # the print allows it, the cameras do not
+    assert_rejected(armsight("budget", *SMALL, "--want", "5mm,0.001deg"), "deg, no camera reaches 0.001")
+
+
+def test_a_body_of_its_own_and_keys_behind_the_plan(armsight, tmp_path, monkeypatch):
+    monkeypatch.setattr(result, "CHANGES", {})
+    (tmp_path / "plan.toml").write_text('camera = "machine-vision-2mp"\nbaseline = "90mm"\npairs = 9\nspeed = "0m/s"\n')
+    given = (tmp_path / "plan.toml", "pairs=30", "baseline=150mm", "--volume", "0.1x0.1x0.1m", "--distance", "0.7m")
+    said = armsight("budget", *given, "--body", "chessboard:9x6:10mm", "-o", tmp_path / "out", "--json")
+    plan = json.loads(said.out)["plan"]
+    assert (plan["body"], plan["pairs"], plan["baseline"]) == ("chessboard:9x6:10mm", 30, "150mm")
+    assert (tmp_path / "out" / "body.pdf").read_bytes().startswith(b"%PDF")
+    (tmp_path / "plate.toml").write_text(body_text(0.8))
+    (tmp_path / "plan.toml").write_text('body = "plate.toml"\ncamera = "machine-vision-2mp"\n')  # beside the plan
+    assert armsight("budget", *given).code == 0
+    assert_rejected(armsight("budget", *given, "pairs=many"), "pairs=many: expected a number")
+    assert_rejected(armsight("budget", *given, "pears=3"), "did you mean pairs")
+    assert_rejected(armsight("budget", *given, "other.toml"), "expected one PLAN.toml")
 
 
 @pytest.mark.parametrize(("speed", "code"), [("0.3m/s", 0), ("1m/s", 1)])
@@ -64,7 +89,7 @@ def test_what_loses_shots_is_not_reached(armsight, speed, code):
 
 def test_the_best_of_a_class_with_what_to_build(armsight, tmp_path, monkeypatch):
     monkeypatch.setattr(result, "CHANGES", {})
-    given = ("--volume", "0.1x0.1x0.1m", "--camera", "machine-vision-2mp", "--baseline", "150mm")
+    given = ("--volume", "0.1x0.1x0.1m", "--camera", "machine-vision-2mp", "baseline=150mm")
     plain = json.loads(armsight("budget", *given, "--json").out)
     said = armsight("budget", *given, "--best", "-o", tmp_path / "out", "--json")
     found = json.loads(said.out)

@@ -83,7 +83,7 @@ def test_blur_is_of_the_speed_of_each_shot(run, monkeypatch):
     for speed in ("0.1m/s", "0.2m/s"):
         plan = run_plan(run, camera="webcam-720p", speed=speed, exposure_ms=20.0)
         found[speed] = against_run(run, plan)[0].cov(of="exposure blur")
-        px = plan.conditions().noise_px["exposure blur"] / plan.speeds[0]
+        px = plan.conditions.noise_px["exposure blur"] / plan.speeds[0]
         found[speed] = np.sqrt(np.trace(found[speed][:, :3, :3], axis1=1, axis2=2)) / px
         assert found[speed].max() > 0
     np.testing.assert_allclose(found["0.1m/s"], found["0.2m/s"], rtol=1e-9)

@@ -133,7 +133,7 @@ def test_the_best_is_at_a_minimum_and_alternatives_are_grouped(monkeypatch):
 
 def test_a_rig_that_there_is_has_its_own_calibration(tmp_path):
     plan = RigPlan(volume="0.1x0.1x0.1m", speed="0m/s")
-    cov = plan.conditions().cov_calibration
+    cov = plan.conditions.cov_calibration
     StereoRig(*plan.stereo_rig.cameras, plan.stereo_rig.T_left_right, 4 * cov, 0.0).save(tmp_path / "rig.json")
     (tmp_path / "plan.toml").write_text('volume = "0.1x0.1x0.1m"\nspeed = "0m/s"\nrig = "rig.json"\n')
     twice, once = armsight.budget(str(tmp_path / "plan.toml")), planned(plan)

@@ -8,20 +8,24 @@ import numpy as np
 import pytest
 
 from armsight.data import Array
-from armsight.geometry.pose import exp_se3, inverse, log_se3
+from armsight.geometry.pose import exp_se3, inverse, log_se3, pose
 from armsight.sim.workcell.body import body_target
 from armsight.vision.calibrate.budget import (
     Budget,
     Conditions,
+    Gates,
     calibration_covariance,
+    gates,
     of_three,
     pose_budget,
     radius,
     volume_views,
 )
+from armsight.vision.markers.tag import Tag, TagTarget
+from armsight.vision.markers.targets import Composite
 from armsight.vision.match import epipolar_distances
 from armsight.vision.pose.posefit import PixelObservations, fit_pose
-from armsight.vision.pose.predict import plain_rig
+from armsight.vision.pose.predict import plain_rig, view
 
 RIG = plain_rig(1000.0, 0.25)
 DISCS = body_target().discs
@@ -61,8 +65,17 @@ def measured(given: Conditions, rng: np.random.Generator, cameras: int = 2) -> A
                 late = k * (given.skew_s + start) + given.readout_s * rows
         both = np.intersect1d(row[side == 0], row[side == 1])
         pairs = [uv[side == k][np.isin(row[side == k], both)] for k in (0, 1)]
-        if cameras == 2 and epipolar_distances(RIG, *pairs).mean() > given.gate_px:
-            continue  # lost
+        if cameras == 2:
+            still = body[both] @ T[:3, :3].T + T[:3, 3]
+            across_px, along_px = (
+                epipolar_distances(RIG, *pairs).mean(),
+                (pairs[1] - RIG.project(still)[1])[:, 0].mean(),
+            )
+            if (
+                across_px > 1000 * given.gate.across_rad
+                or abs(along_px) * still[:, 2].mean() / 1000 > given.gate.along_m
+            ):
+                continue  # lost
         sigma = float(np.sqrt(sum(s**2 for s in given.noise_px.values())))
         uv += sigma * rng.standard_normal(uv.shape)
         found = fit_pose(
@@ -86,7 +99,8 @@ CASES = {
     "readout": Conditions(readout_s=0.02, speed_m_s=0.2, rotation_rad_s=0.2),
     "print of the body": Conditions(body_sigma_m=(1e-4, 3e-4), body_scale=1e-3),
     "warming of the lenses": Conditions(lens_share=2e-4),
-    "a gate": Conditions(skew_s=0.004, speed_m_s=0.3, gate_px=0.8),
+    "a gate": Conditions(skew_s=0.004, speed_m_s=0.3, gate=Gates(across_rad=8e-4)),
+    "a gate along the baseline": Conditions(skew_s=0.004, speed_m_s=0.3, gate=Gates(along_m=6e-4)),
     "skew and readout": Conditions(skew_s=0.004, readout_s=-0.006, speed_m_s=0.3),
 }
 
@@ -114,14 +128,14 @@ def test_one_camera_is_as_good_as_its_fit_shows(case: str) -> None:
 
 def test_three_cameras_are_the_sum_of_what_each_knows() -> None:
     # The oracle: three pinholes at the corners of the triangle, rows of all in one least-squares problem; the same to the
-    # finite differences' 1e-6.
-    size, given = np.array([0.2, 0.1, 0.1]), Conditions({"pixel noise": 0.1})
+    # finite differences' 1e-6. A larger board moves all three away from the first: to the 2 % of a pair's own lateral part.
+    size, given = np.array([0.2, 0.1, 0.1]), Conditions({"pixel noise": 0.1}, board_scale=1e-3)
     pairs = [volume_views(RIG, POINTS, NORMALS, 0.8, size, pair) for pair in range(3)]
-    found = of_three([pose_budget(RIG, POINTS, NORMALS, views, given) for views in pairs])
-    b, errors = RIG.baseline_m, []
+    found = of_three([pose_budget(RIG, POINTS, NORMALS, views, given) for views in pairs], RIG, given.board_scale)
+    b, errors, larger = RIG.baseline_m, [], []
     for seen in pairs[0]:
         T = seen.T_left_body
-        rows = []
+        rows, moved = [], []
         for at in np.array([[0.0, 0.0, 0.0], [b, 0.0, 0.0], [b / 2, b * np.sqrt(3) / 2, 0.0]]):
 
             def uv(x: Array, T: Array = T, at: Array = at) -> Array:
@@ -129,9 +143,12 @@ def test_three_cameras_are_the_sum_of_what_each_knows() -> None:
                 return np.asarray((1000.0 * p[:, :2] / p[:, 2:]).ravel())
 
             rows.append(np.column_stack([(uv(h) - uv(-h)) / 2e-5 for h in 1e-5 * np.eye(6)]))
+            moved.append(uv(np.zeros(6), at=at * 1.001) - uv(np.zeros(6)))
         A, R = np.concatenate(rows), np.kron(np.eye(2), T[:3, :3])
         errors.append(R @ np.linalg.inv(A.T @ A) @ R.T * 0.01)
-    np.testing.assert_allclose(found.rms(found.cov()), found.rms(np.array(errors)), rtol=1e-5)
+        larger.append(-(R @ np.linalg.lstsq(A, np.concatenate(moved))[0])[:3])
+    np.testing.assert_allclose(found.rms(found.cov(of="pixel noise")), found.rms(np.array(errors)), rtol=1e-5)
+    np.testing.assert_allclose(found.factors["print of the board"][:, :3, 0], larger, atol=2e-2 * np.abs(larger).max())
 
 
 def test_shared_velocity_adds_before_it_is_squared() -> None:
@@ -140,16 +157,33 @@ def test_shared_velocity_adds_before_it_is_squared() -> None:
     assert abs(np.trace(both.cov()[0]) / np.trace(apart[0]) - 1) > 0.02
 
 
-def test_shots_beyond_the_gate_are_lost() -> None:
+@pytest.mark.parametrize("case", ["a gate", "a gate along the baseline"])
+def test_shots_beyond_the_gate_are_lost(case: str) -> None:
     # A share of 600 shots near 0.35 is known to 0.019: three sigmas.
-    found = pose_budget(RIG, POINTS, NORMALS, VIEWS, CASES["a gate"])
-    shots = measured(CASES["a gate"], np.random.default_rng(9))
+    found = pose_budget(RIG, POINTS, NORMALS, VIEWS, CASES[case])
+    shots = measured(CASES[case], np.random.default_rng(9))
     assert 0.2 < found.lost.mean() < 0.5
     assert 1 - len(shots) / SHOTS == pytest.approx(found.lost.mean(), abs=0.06)
     assert not pose_budget(RIG, POINTS, NORMALS, VIEWS, CASES["skew"]).lost.any()
     # Without what is lost the others are better.
     skew = pose_budget(RIG, POINTS, NORMALS, VIEWS, CASES["skew"])
     assert found.rms(found.cov())[0] < skew.rms(skew.cov())[0]
+
+
+def test_gates_are_those_of_measure() -> None:
+    # Of tags of 40 px or more: 2 px from the epipolar line, and 2 % of the size, which is the baseline's; known to 1/64
+    # of what four sigmas reach, and a ray is up to 1.05 times as long as its depth.
+    tags = [
+        Tag(f"t{k}", "tag36h11", k, 0.05, pose(np.eye(3), np.array([0.07 * k, 0.05 * (k % 2), 0.0]))) for k in range(4)
+    ]
+    body = Composite("tags", (TagTarget("tags", tuple(tags)),))
+    seen = view(RIG, body.body.points, body.normals, 0.8)
+    across, along, together = gates(RIG, body, seen, 0.02, 0.003)
+    assert not together  # two tests, one after the other
+    assert across == pytest.approx(2e-3, rel=0.15)
+    assert along == pytest.approx(0.02 * RIG.baseline_m, rel=0.1)
+    assert gates(RIG, body, seen, 0.02, 3e-4) == Gates()  # no motion reaches them
+    assert gates(RIG, body, seen, 0.02, 0.0) == Gates()
 
 
 def test_points_of_one_marker_move_together() -> None:

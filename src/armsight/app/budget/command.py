@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import click
@@ -10,13 +11,13 @@ from armsight.errors import InputError
 
 
 @click.command("budget")
-@click.argument("path", required=False, default="", metavar="[PLAN.toml]")
+@click.argument("plan", nargs=-1, metavar="[PLAN.toml] [KEY=VALUE]...")
 @click.option("--volume", metavar="WxHxD|MOTION.toml", help="Seen by the cameras: 0.4x0.4x0.3m; or a motion file.")
 @click.option("--distance", metavar="LENGTH", help="From the cameras to the volume's middle: 0.8m.")
 @click.option("--speed", metavar="SPEED", help="Of the body: 0.3m/s, or 0.3m/s,20deg/s.")
 @click.option("--want", metavar="ERROR", help="What 95 % of the errors are to be within: 0.1mm, or 0.1mm,0.05deg.")
 @click.option("--camera", metavar="CLASS", help="A class of the catalogue, such as webcam-720p.")
-@click.option("--baseline", metavar="LENGTH", help="Between the cameras: 200mm.")
+@click.option("--body", metavar="FILE|BOARD", help="What is measured: a body file, or chessboard:9x6:25mm.")
 @click.option(
     "--rig",
     metavar="RIG.json|RUN",
@@ -28,11 +29,11 @@ from armsight.errors import InputError
 )
 @click.option("-o", "--output", metavar="DIR", help="Write report.html, budget.json, the rig and the body to print.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
-def command(path: str, optimise: bool, output: str | None, as_json: bool, **given: str | None) -> int:
+def command(plan: Sequence[str], optimise: bool, output: str | None, as_json: bool, **options: str | None) -> int:
     """Say before a rig is bought what it will measure, what limits it, and what would make it better.
 
-    What is left out is chosen, and said. PLAN.toml has the same keys and more: docs/howto/budget.md. Exit code 1: what
-    --want asks for is not reached.
+    What is left out is chosen, and said. PLAN.toml has the same keys and more (docs/howto/budget.md); KEY=VALUE replaces
+    one: baseline=150mm. Exit code 1: what --want asks for is not reached.
     """
     from armsight.app.budget.report import REPORT_FILES, budget_report, to_build
     from armsight.app.progress import steps
@@ -40,9 +41,13 @@ def command(path: str, optimise: bool, output: str | None, as_json: bool, **give
     from armsight.sim.budget.plan import RigPlan, planned
     from armsight.sim.budget.result import RigBudget, best, chosen
 
+    path, *more = [each for each in plan if "=" not in each] or [""]
+    if more:
+        raise InputError(f"{more[0]}: {path} is the plan already: expected one PLAN.toml, and KEY=VALUE")
+    given = options | RigPlan.of_text(each for each in plan if "=" in each)
     if output is not None:
         check_folder(
-            output, holding=REPORT_FILES, apart_from=(path, *(given[key] for key in ("rig", "arm") if given[key]))
+            output, holding=REPORT_FILES, apart_from=(path, *filter(None, map(given.get, ("rig", "arm", "body"))))
         )
     run = given.pop("rig") if Path(given["rig"] or "rig.json").is_dir() else None
     if run is not None and optimise:
@@ -55,21 +60,20 @@ def command(path: str, optimise: bool, output: str | None, as_json: bool, **give
         given |= motion_volume(Path(motion), given["arm"]) | ({"speed": given["speed"]} if given["speed"] else {})
     with steps() as progress:
         if run is None:
-            plan = RigPlan.read(path, **given)
+            asked = RigPlan.read(path, **given)
         else:
             from armsight.app.budget.run import run_plan
 
-            plan = run_plan(Path(run), path, **given)
-        alternatives = best(plan, progress) if optimise else ()
-        found = chosen(alternatives) if alternatives else RigBudget(plan, planned(plan))
+            asked = run_plan(Path(run), path, **given)
+        alternatives = best(asked, progress) if optimise else ()
+        found = chosen(alternatives) if alternatives else RigBudget(asked, planned(asked))
+        found.check()
         progress("what would change it")
         report = budget_report(found, alternatives, Path(run) if run else None)
     written = None
     if output is not None:
-        files = to_build(found)
-        written = str(report.write(Path(output), {"budget.json": report.json_text(), **files}))
-        if "body.toml" in files:
-            from armsight.app.body.draw import draw_body
+        from armsight.app.body.draw import draw_body
 
-            draw_body([Path(output) / "body.toml"], Path(output) / "body.pdf", split=True)
+        written = str(report.write(Path(output), {"budget.json": report.json_text(), **to_build(found)}))
+        draw_body([found.plan.body or Path(output) / "body.toml"], Path(output) / "body.pdf", split=True)
     return report.echo(as_json=as_json, written=written) or int(not found.reached(found.moving))

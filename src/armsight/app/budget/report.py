@@ -47,6 +47,11 @@ def budget_report(found: RigBudget, alternatives: Sequence[Alternative] = (), ru
         beside.append(table)
     states = found.states
     others = f"one camera at rest {states['one_camera']}; two {states['at_rest']}; three {states['three_cameras']}"
+    levels = [each.level_m for each in (states["one_camera"], found.at_rest, states["three_cameras"])]
+    if levels != sorted(levels, reverse=True):
+        others += (
+            ": two and three take the distance from the size of the calibration's board, one from that of the body"
+        )
     rows = tuple(
         (each.cause, f"{1e3 * each.rms_m:.2g}", f"{math.degrees(each.rms_rad):.2g}")
         + (("loop", "") if each.loop else (f"{100 * each.share:.0f} %", f"{1e3 * each.halved_level_m:.2g} mm"))
@@ -76,7 +81,7 @@ def to_build(found: RigBudget) -> dict[str, str]:
     plan, source = found.plan, {"source": "armsight budget: planned, not calibrated"}
     if plan.rig:
         return {}
-    rig = replace(plan.stereo_rig, cov=plan.conditions().cov_calibration, provenance=source)
+    rig = replace(plan.stereo_rig, cov=plan.conditions.cov_calibration, provenance=source)
     body = {} if plan.body else {"body.toml": body_text(plan.body_scale, plan.body_depth)}
     return {"rig.json": rig.to_text()} | body
 
@@ -129,10 +134,8 @@ def _answer(found: RigBudget) -> tuple[Grade, str]:
         return "fair", f"{said}.{costs}."
     asked = f"{1e3 * requested[0]:g} mm" + (f", {math.degrees(requested[1]):g} deg" if requested[1] else "")
     grade: Grade = "good" if found.reached(move) else "fair" if found.reached(rest) else "poor"
-    body_m = found.worst_m("print of the body")
-    floor = f" The print of the body alone costs {1e3 * body_m:.2g} mm: no camera reaches less."
     reached = {"good": "reached", "fair": "reached at rest only", "poor": "not reached"}[grade]
-    return grade, f"{asked} requested: {reached}. {said}.{costs}.{floor if body_m > requested[0] else ''}"
+    return grade, f"{asked} requested: {reached}. {said}.{costs}."
 
 
 def _chosen(plan: RigPlan) -> str:

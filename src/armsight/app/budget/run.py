@@ -23,7 +23,7 @@ from armsight.geometry.pose import inverse, log_se3
 from armsight.robot.arm_file import open_arm
 from armsight.sim.budget.plan import RigPlan
 from armsight.sim.budget.result import PREDICTED
-from armsight.vision.calibrate.budget import CAUSES, Budget, pose_budget
+from armsight.vision.calibrate.budget import CAUSES, Budget, Gates, pose_budget
 from armsight.vision.pose.predict import view, view_at
 from armsight.vision.rig import StereoRig
 
@@ -49,7 +49,7 @@ def against_run(folder: Path, plan: RigPlan) -> tuple[TextTable, list[dict[str, 
     rig, points, normals = plan.stereo_rig, plan.layout.body.points, plan.layout.normals
     views = [view_at(rig, points, normals, each) for each in T]
     per_speed = float(np.median(rotation / np.maximum(speed, _SLOW)))
-    given = replace(plan.conditions(), gate_px=np.inf, speed_m_s=1.0, rotation_rad_s=per_speed)
+    given = replace(plan.conditions, gate=Gates(), speed_m_s=1.0, rotation_rad_s=per_speed)
     found = pose_budget(rig, points, normals, views, given)
     of_plan = plan.speeds[0]  # which its blur in px is of; all else that moves is of 1 m/s
     faster = {name: speed for name, kind in CAUSES.items() if kind.moving} | {"exposure blur": speed / (of_plan or 1.0)}

@@ -33,10 +33,9 @@ from armsight.vision.markers.tag import Tag, TagTarget
 #: Detections that a chart needs: its sigma is then known to 5 %; half: 7 %, double: 4 % in twice the time.
 LEAST_DETECTIONS = 100
 _MOST_IMAGES, _MOST_SPOTS = 3, 200
-#: Size of a chart's image, px; half: vignetting and flicker are twice as steep, double: four times the time; and its focal
-#: length, px, which changes nothing.
-_SIZE_PX, _FOCAL_PX = (960, 540), 800.0
-_CAMERA = Camera(_SIZE_PX, "none", np.array([_FOCAL_PX, _FOCAL_PX, *((n - 1) / 2 for n in _SIZE_PX)]), np.zeros(0))
+#: Size of a chart's image, and of one that a board of squares of up to so many px fits into, px; half: vignetting and
+#: flicker are twice as steep, double: four times the time; and its focal length, px, which changes nothing.
+_SIZE_PX, _BOARD_PX, _SQUARE_PX, _FOCAL_PX = (960, 540), (480, 400), 32.0, 800.0
 #: Images of a still scene until what a camera mixes of earlier ones has settled.
 _SETTLED = 3
 #: Charts are of sizes of this ratio up to a largest, px (larger markers are taken to be no better), and of these ways,
@@ -86,16 +85,17 @@ def marker_noise(pipeline: CameraPipeline, kind: str, size_px: float, moved_px: 
 @lru_cache(maxsize=512)
 def _noise(pipeline: CameraPipeline, kind: str, size_px: float, moved_px: float) -> tuple[float, int, int]:
     """Render and detect charts until there are enough; return sigma, 0 where most are not found, the found and all."""
-    imager = SimulatedCamera(pipeline, _SIZE_PX, seed=0)
+    size = _BOARD_PX if kind == "square" and size_px <= _SQUARE_PX else _SIZE_PX
+    imager = _imager(pipeline, size)
     rng, off, asked = np.random.default_rng(42), list[Array](), 0
     for number in range(_MOST_IMAGES):
-        chart, light, true = _shown(kind, size_px, number, pipeline.psf_sigma_px)
+        chart, light, true = _shown(kind, size_px, number, pipeline.psf_sigma_px, size)
         if moved_px > 0:
             light = _smeared(light, moved_px, rng.uniform(0, np.pi))
         imager.forget()
         for k in range(_SETTLED if pipeline.temporal_denoise and not moved_px else 1):
             image = imager.expose(light, number=_SETTLED * number + k)
-        inside = ((true > 2 * size_px) & (true < np.array(_SIZE_PX) - 2 * size_px)).all(axis=1)
+        inside = ((true > 1.5 * size_px) & (true < np.array(size) - 1.5 * size_px)).all(axis=1)
         asked += max(int(inside.sum()), 1)
         found = chart.find(np.asarray(image))
         if len(found):
@@ -113,14 +113,23 @@ def _noise(pipeline: CameraPipeline, kind: str, size_px: float, moved_px: float)
     return float(np.sqrt(chart.points * (near**2).mean())), len(every), asked
 
 
+@lru_cache(maxsize=1)
+def _imager(pipeline: CameraPipeline, size: tuple[int, int]) -> SimulatedCamera:
+    """Return the camera; its noise follows from the number of an image."""
+    return SimulatedCamera(pipeline, size, seed=0)
+
+
 @lru_cache(maxsize=12)  # 2 MB each
-def _shown(kind: str, size_px: float, number: int, psf_sigma_px: float) -> tuple[Chart, Radiance, Array]:
+def _shown(
+    kind: str, size_px: float, number: int, psf_sigma_px: float, size: tuple[int, int]
+) -> tuple[Chart, Radiance, Array]:
     """Return a chart, its light, and its markers in the image (N, 2), px."""
     rng = np.random.default_rng((42, number))
     chart = _CHARTS[kind](size_px / _FOCAL_PX, rng)
     T = pose(exp_so3(np.array([0.0, 0.0, rng.uniform(-0.3, 0.3)])), np.array([0.0, 0.0, 1.0]))
-    light = radiance(_CAMERA, [PosedBody(chart.patterns, T)], psf_sigma_px=psf_sigma_px)
-    return chart, light, _CAMERA.project(transform(T, np.column_stack([chart.spots, np.zeros(len(chart.spots))])))
+    camera = Camera(size, "none", np.array([_FOCAL_PX, _FOCAL_PX, *((n - 1) / 2 for n in size)]), np.zeros(0))
+    light = radiance(camera, [PosedBody(chart.patterns, T)], psf_sigma_px=psf_sigma_px)
+    return chart, light, camera.project(transform(T, np.column_stack([chart.spots, np.zeros(len(chart.spots))])))
 
 
 def _smeared(light: Radiance, way_px: float, direction: float) -> Radiance:
@@ -148,7 +157,7 @@ def _spots(grid: Array, rng: np.random.Generator) -> Array:
 
 def _discs(size_m: float, rng: np.random.Generator) -> Chart:
     """Return bright discs on dark faces."""
-    faces, grid = _faces(2.8 * size_m, 2.2 * size_m, BLACK)
+    faces, grid = _faces(2.4 * size_m, 2.2 * size_m, BLACK)
     spots = _spots(grid, rng)
     target = DiscTarget(Body("chart", ("a",), np.zeros((1, 3))), np.ones(1), np.ones(1, bool), np.full((1, 3), np.nan))
     discs = np.column_stack([spots, np.tile([size_m / 2, WHITE], (len(spots), 1))])

@@ -10,6 +10,7 @@ import difflib
 import math
 import os
 import re
+from collections.abc import Iterable
 from dataclasses import Field, dataclass, field, fields, replace
 from functools import cache, cached_property, lru_cache
 from pathlib import Path
@@ -30,8 +31,9 @@ from armsight.sim.workcell.body import body_target
 from armsight.vision.calibrate.budget import (
     Budget,
     Conditions,
+    Gates,
     calibration_covariance,
-    gate_px,
+    gates,
     of_three,
     pose_budget,
     volume_views,
@@ -46,6 +48,7 @@ from armsight.vision.markers.chessboard import Chessboard
 from armsight.vision.markers.marker import CalibrationBoard
 from armsight.vision.markers.targets import Composite, read_layout
 from armsight.vision.pose.predict import PredictedView
+from armsight.vision.pose.shutter import LOOSE_PX
 from armsight.vision.rig import StereoRig
 
 #: A disc's diameter, a tag's and a square's side in the image below which detection is left to luck, px; half: half of them
@@ -117,7 +120,12 @@ def length_m(text: str, what: str) -> float:
     return float(found[1]) * _UNITS[found[2]]
 
 
-def _up(value: float) -> str:
+def is_board(body: str) -> bool:
+    """Whether a body is a board's spec."""
+    return body.partition(":")[0] in BOARDS
+
+
+def up(value: float) -> str:
     """Return a number with two digits that is not below it."""
     unit = 10 ** (math.floor(math.log10(value)) - 1)
     return f"{math.ceil(value / unit - 1e-9) * unit:.2g}"
@@ -131,73 +139,39 @@ def _plain(value: object) -> object:
 
 @dataclass(frozen=True)
 class RigPlan:
-    """A rig that is not built yet, and what it is to measure. Lengths m, angles and shares as the names say.
+    """A rig that is not built yet, and what it is to measure. Lengths m, angles and shares as the names say."""
 
-    Attributes:
-        volume: width x height x depth, as the cameras see it.
-        distance: from the cameras to its middle.
-        speed: of the body, and its rate of rotation: 0.3m/s or 0.3m/s,20deg/s.
-        want: what 95 % of the errors are to be within: 0.1mm or 0.1mm,0.05deg; empty: nothing is asked.
-        camera: a class of the catalogue.
-        image: width x height, px; by default the class's.
-        rig: a rig file, for a rig that there is: its lenses, baseline, calibration and, where known, shutters.
-        baseline: between the cameras.
-        verging_deg: angle between their axes; by default both look at the middle of the volume.
-        focal_widths: focal length over the image's width; by default the class's.
-        body: a body file, or a board such as chessboard:9x6:25mm; by default the body of `armsight demo` with nine
-            discs.
-        body_scale: by how much the default body is larger; discs grow with it.
-        body_depth: by how much further its wings stand behind its plate; beyond 2 the plate hides them.
-        board: the calibration board.
-        pairs: of the board.
-        board_print: standard deviation of its size, as a share.
-        board_bent: of its corners from the drawing.
-        body_print: of the body's markers from its file along their faces.
-        body_bent: out of their faces.
-        body_size: standard deviation of its size, as a share.
-        warming_k: change of temperature since the calibration.
-        mount_um_per_k: of the cameras' distance.
-        lens_ppm_per_k: of the focal length.
-        skew_ms: by how much the right exposures are later, uncorrected; by default the preset's.
-        start_ms: how far the two exposures begin apart by chance; by default the preset's.
-        exposure_ms: by default the preset's.
-        rate_hz: by default the preset's.
-        arm: for the closed loop; empty: none.
-        backlash_deg: standard deviation of each of its joints.
-        handeye: of the hand-eye calibration: 0.1mm,0.02deg.
-    """
-
-    volume: str = "0.4x0.4x0.3m"
-    distance: str = "0.8m"
-    speed: str = "0.3m/s"
-    want: str = ""
-    camera: str = "webcam-720p"
-    image: str = ""
-    rig: str = ""
-    baseline: str = "200mm"
-    verging_deg: float = -1.0
-    focal_widths: float = 0.0
+    volume: str = "0.4x0.4x0.3m"  #: width x height x depth, as the cameras see it.
+    distance: str = "0.8m"  #: from the cameras to its middle.
+    speed: str = "0.3m/s"  #: of the body, and its rate of rotation: 0.3m/s or 0.3m/s,20deg/s.
+    want: str = ""  #: what 95 % of the errors are to be within: 0.1mm or 0.1mm,0.05deg; empty: nothing is asked.
+    camera: str = "webcam-720p"  #: a class of the catalogue.
+    image: str = ""  #: width x height, px; by default the class's.
+    rig: str = ""  #: a rig file, for a rig that there is: its lenses, baseline, calibration and, where known, shutters.
+    baseline: str = "200mm"  #: between the cameras.
+    verging_deg: float = -1.0  #: angle between their axes; by default both look at the middle of the volume.
+    focal_widths: float = 0.0  #: focal length over the image's width; by default the class's.
+    #: a body file, or a board such as chessboard:9x6:25mm; by default the body of `armsight demo` with nine discs.
     body: str = ""
-    body_scale: float = 1.0
-    body_depth: float = 1.0
-    board: str = "chessboard:9x6:25mm"
-    pairs: int = 20
-    board_print: float = 3e-4
-    board_bent: str = "0.1mm"
-    body_print: str = "0.03mm"
-    body_bent: str = "0.05mm"
-    body_size: float = 3e-4
-    warming_k: float = 3.0
-    mount_um_per_k: float = 5.0
-    lens_ppm_per_k: float = 20.0
-    skew_ms: float = -1.0
-    start_ms: float = -1.0
-    exposure_ms: float = -1.0
-    rate_hz: float = -1.0
-    arm: str = ""
-    backlash_deg: float = 0.03
-    handeye: str = "0.1mm,0.02deg"
-    folder: str = field(default=".", repr=False)
+    body_scale: float = 1.0  #: by how much the default body is larger; discs grow with it.
+    body_depth: float = 1.0  #: by how much further its wings stand behind its plate; beyond 2 the plate hides them.
+    board: str = "chessboard:9x6:25mm"  #: the calibration board.
+    pairs: int = 20  #: of the board.
+    board_print: float = 3e-4  #: standard deviation of its size, as a share.
+    board_bent: str = "0.1mm"  #: of its corners from the drawing.
+    body_print: str = "0.03mm"  #: of the body's markers from its file along their faces.
+    body_bent: str = "0.05mm"  #: out of their faces.
+    body_size: float = 3e-4  #: standard deviation of its size, as a share.
+    warming_k: float = 3.0  #: change of temperature since the calibration.
+    mount_um_per_k: float = 5.0  #: of the cameras' distance.
+    lens_ppm_per_k: float = 20.0  #: of the focal length.
+    skew_ms: float = -1.0  #: by how much the right exposures are later, uncorrected; by default the preset's.
+    start_ms: float = -1.0  #: how far the two exposures begin apart by chance; by default the preset's.
+    exposure_ms: float = -1.0  #: by default the preset's.
+    rate_hz: float = -1.0  #: by default the preset's.
+    arm: str = ""  #: for the closed loop; empty: none.
+    backlash_deg: float = 0.03  #: standard deviation of each of its joints.
+    handeye: str = "0.1mm,0.02deg"  #: of the hand-eye calibration: 0.1mm,0.02deg.
     named: tuple[str, ...] = field(default=(), repr=False)  #: keys that were given
 
     @staticmethod
@@ -209,6 +183,9 @@ class RigPlan:
         """
         known = {each.name: type(each.default) for each in RigPlan.settings()}
         values = read_toml(path) if path else {}
+        for key in {"rig", "body"} & values.keys():
+            if isinstance(values[key], str) and not is_board(values[key]):
+                values[key] = str(Path(path).parent / values[key])
         given = values | {key: _plain(value) for key, value in given.items() if value is not None}
         for key, value in given.items():
             of = f"{path}: " if key in values else ""
@@ -220,12 +197,23 @@ class RigPlan:
             if not isinstance(value, (int, float) if known[key] is float else known[key]) or isinstance(value, bool):
                 kind = {str: "a text", int: "a whole number", float: "a number"}[known[key]]
                 raise InputError(f"{of}{key} must be {kind}, got {value!r}")
-        return RigPlan(**given, folder=str(Path(path).parent) if path else ".", named=tuple(given))
+        return RigPlan(**given, named=tuple(given))
+
+    @staticmethod
+    def of_text(pairs: Iterable[str]) -> dict[str, Any]:
+        """Return what KEY=VALUE say, a number where the key has one."""
+        kinds, found = {each.name: type(each.default) for each in RigPlan.settings()}, dict[str, Any]()
+        for key, _, value in (pair.partition("=") for pair in pairs):
+            try:
+                found[key] = value if kinds.get(key, str) is str else float(value)
+            except ValueError:
+                raise InputError(f"{key}={value}: expected a number") from None
+        return found
 
     @staticmethod
     def settings() -> tuple[Field[Any], ...]:
         """Return what a plan may say."""
-        return tuple(each for each in fields(RigPlan) if each.name not in ("folder", "named"))
+        return tuple(each for each in fields(RigPlan) if each.name != "named")
 
     @cached_property
     def size_m(self) -> Array:
@@ -236,15 +224,14 @@ class RigPlan:
                 f"volume {self.volume!r}: expected width x height x depth with a unit, such as 0.4x0.4x0.3m"
             )
         size = np.array([float(n) for n in found.groups()[:3]]) * _UNITS[found[4]]
-        if size.max() > _MOST_M:
-            raise InputError(f"volume {self.volume}: {size.max():g} m is no table-top cell: is it in mm?")
-        if not size.min() > 0:
-            raise InputError(f"volume {self.volume}: each side must be above zero")
-        if not self.distance_m - size[2] / 2 > 0:
-            raise InputError(
-                f"volume {self.volume} at {self.distance}: it reaches behind the cameras; a distance above "
-                f"{size[2] / 2:g} m is needed"
-            )
+        for wrong, text in (
+            (size.max() > _MOST_M, f": {size.max():g} m is no table-top cell: is it in mm?"),
+            (not size.min() > 0, ": each side must be above zero"),
+            (self.distance_m <= size[2] / 2,
+             f" at {self.distance}: it reaches behind the cameras; a distance above {size[2] / 2:g} m is needed"),
+        ):  # fmt: skip
+            if wrong:
+                raise InputError(f"volume {self.volume}{text}")
         return size
 
     def _reach_m(self, key: str) -> float:
@@ -262,7 +249,7 @@ class RigPlan:
     @cached_property
     def existing(self) -> StereoRig | None:
         """The rig that there is."""
-        return StereoRig.load(Path(self.folder) / self.rig) if self.rig else None
+        return StereoRig.load(self.rig) if self.rig else None
 
     @cached_property
     def of_rig(self) -> tuple[str, ...]:
@@ -383,11 +370,11 @@ class RigPlan:
     @cached_property
     def layout(self) -> Composite:
         """The body."""
-        if self.body.partition(":")[0] in BOARDS:
+        if is_board(self.body):
             board = MountedBoard("board", open_board(self.body), np.eye(4), np.array([0.0, 0.0, -1.0]))
             return Composite(self.body, (BoardTarget(self.body, (board,)),))
         if self.body:
-            return read_layout(Path(self.folder) / self.body)
+            return read_layout(self.body)
         return Composite("tool_body", (), body_target(self.body_scale, self.body_depth).discs)
 
     @cached_property
@@ -464,52 +451,40 @@ class RigPlan:
         self._check_numbers()
         c, size, t, _, _, _ = self.cameras, self.size_m, self.timing, self.speeds, self.requested, self.handeye_errors
         near, far = self.distance_m - size[2] / 2, self.distance_m + size[2] / 2
-        for name in ("board_bent", "body_print", "body_bent"):
-            if length_m(getattr(self, name), name) > _MOST_OFF_M:
-                raise InputError(
-                    f"{name} is {getattr(self, name)}: no print is off by more than {1e3 * _MOST_OFF_M:g} mm"
-                )
-        if near < c.least_focus_m:
-            raise InputError(
-                f"the lens of {c.name} does not focus nearer than {c.least_focus_m:g} m, the volume begins at {near:.2g} m"
-                f": a distance of {_up(c.least_focus_m + size[2] / 2)} m can be had"
-            )
-        if t["exposure"] > 1 / t["rate"]:
-            raise InputError(
-                f"an exposure of {1e3 * t['exposure']:g} ms is longer than a frame at {t['rate']:g} Hz: at most "
-                f"{1e3 / t['rate']:.3g} ms, or {1 / t['exposure']:.3g} Hz"
-            )
-        width, height = self.image_size_px
-        if t["rate"] > 1.001 * self._most_hz:
-            raise InputError(
-                f"one USB controller carries two {c.name} at {self._most_hz:.3g} Hz at most, {t['rate']:g} Hz were asked: "
-                "a lower rate_hz, or a controller each"
-            )
-        if self.baseline_m > (most := 2 * self.distance_m):
-            raise InputError(f"a baseline of {self.baseline_m:g} m: the arm would cross it; at most {most:g} m")
-        body = np.ptp(self.layout.body.points, axis=0).max()
-        for what, extent, pixels in () if self.existing else (("wide", size[0], width), ("high", size[1], height)):
-            seen = near * pixels / self.focal_px
-            if (needed := extent + body) > seen:
-                least = needed * self.focal_px / pixels + size[2] / 2
-                raise InputError(
-                    f"the field of view is {seen:.2g} m {what} at {near:.2g} m, volume and body are {needed:.2g} m: "
-                    f"a distance of {_up(least)} m, or focal_widths = {near / needed * pixels / width:.2g}"
-                )
-        kind, px = self.marker(far)
-        least_px = _LEAST_PX[kind]
-        if px < least_px:
-            scale = "" if self.body else f" (body_scale = {_up(self.body_scale * least_px / px)})"
-            raise InputError(
-                f"a {kind} is {px:.1f} px at {far:.2g} m, at least {least_px:g} are needed: markers {_up(least_px / px)} "
-                f"times as large{scale}"
-            )
-        lost = sum(len(one.paired) < 3 for one in self.views)
-        if lost:
-            raise InputError(
-                f"at {lost} of {len(self.views)} positions the cameras do not both see the body, they look past each other"
-                f": verging_deg = {math.degrees(2 * math.atan(self.baseline_m / 2 / self.distance_m)):.3g} or less baseline"
-            )
+        (width, height), body = self.image_size_px, np.ptp(self.layout.body.points, axis=0).max()
+        (kind, px), lost = self.marker(far), sum(len(one.paired) < 3 for one in self.views)
+        larger = up(_LEAST_PX[kind] / px)
+        scaled = "" if self.body else f" (body_scale = {up(self.body_scale * _LEAST_PX[kind] / px)})"
+        needed, seen = size[:2] + body, near * np.array([width, height]) / self.focal_px
+        k = int(np.argmax(needed / seen))  # across or up
+        for wrong, text in (
+            *((length_m(getattr(self, name), name) > _MOST_OFF_M,
+               f"{name} is {getattr(self, name)}: no print is off by more than {1e3 * _MOST_OFF_M:g} mm")
+              for name in ("board_bent", "body_print", "body_bent")),
+            (near < c.least_focus_m,
+             f"the lens of {c.name} does not focus nearer than {c.least_focus_m:g} m, the volume begins at {near:.2g} m: "
+             f"a distance of {up(c.least_focus_m + size[2] / 2)} m can be had"),
+            (t["exposure"] > 1 / t["rate"],
+             f"an exposure of {1e3 * t['exposure']:g} ms is longer than a frame at {t['rate']:g} Hz: at most "
+             f"{1e3 / t['rate']:.3g} ms, or {1 / t['exposure']:.3g} Hz"),
+            (t["rate"] > 1.001 * self._most_hz,
+             f"one USB controller carries two {c.name} at {self._most_hz:.3g} Hz at most, {t['rate']:g} Hz were asked: "
+             "a lower rate_hz, or a controller each"),
+            (self.baseline_m > 2 * self.distance_m,
+             f"a baseline of {self.baseline_m:g} m: the arm would cross it; at most {2 * self.distance_m:g} m"),
+            (self.existing is None and needed[k] > seen[k],
+             f"the field of view is {seen[k]:.2g} m {('wide', 'high')[k]} at {near:.2g} m, volume and body are "
+             f"{needed[k]:.2g} m: a distance of {up(needed[k] / seen[k] * near + size[2] / 2)} m, or focal_widths = "
+             f"{seen[k] / needed[k] * self.focal_px / width:.2g}"),
+            (px < _LEAST_PX[kind],
+             f"a {kind} is {px:.1f} px at {far:.2g} m, at least {_LEAST_PX[kind]:g} are needed: markers {larger} times as "
+             f"large{scaled}"),
+            (lost > 0,
+             f"at {lost} of {len(self.views)} positions the cameras do not both see the body, they look past each other: "
+             f"verging_deg = {math.degrees(2 * math.atan(self.baseline_m / 2 / self.distance_m)):.3g} or less baseline"),
+        ):  # fmt: skip
+            if wrong:
+                raise InputError(text)
 
     def _noise_px(self) -> dict[str, float]:
         """Return what pixel noise and blur add to a marker's position in the middle, and defocus at both ends, RMS."""
@@ -524,6 +499,7 @@ class RigPlan:
         moved = max(marker_noise(self.pipeline, kind, px, way) ** 2 - sharp, 0.0)
         return {"pixel noise": math.sqrt(sharp), "defocus": math.sqrt(soft), "exposure blur": math.sqrt(moved)}
 
+    @cached_property
     def conditions(self) -> Conditions:
         """Return what is not known."""
         t, (speed, rotation) = self.timing, self.speeds
@@ -536,13 +512,21 @@ class RigPlan:
             arm = tuple(sigma * float(np.sqrt((part**2).sum() / 3)) for part in (J[:3], J[3:]))  # type: ignore[assignment]
         bent = length_m(self.body_print, "body_print"), length_m(self.body_bent, "body_bent")
         mount, lens = (1e-6 * each * self.warming_k for each in (self.mount_um_per_k, self.lens_ppm_per_k))
-        noise = self._noise_px()
+        noise, cov = self._noise_px(), self._cov_calibration()
         return Conditions(
-            noise, self._cov_calibration(), self.board_print, self.marker_of, bent, self.body_size, mount, lens,
+            noise, cov, self.board_print, self.marker_of, bent, self.body_size, mount, lens,
             t["skew"], t["start"], t["readout"], t["stamp"], speed, rotation,
-            gate_px(self.layout, self.focal_px / self.distance_m, math.hypot(*noise.values()), apart=self.apart),
+            self._gates(math.hypot(*noise.values()), cov),
             self.handeye_errors if self.arm else (0.0, 0.0), arm,
         )  # fmt: skip
+
+    def _gates(self, noise_px: float, cov: Array) -> Gates:
+        """Return the gates of `run` and `live` where the exposures are apart."""
+        if not self.apart:
+            return Gates()
+        rig, moved_s = replace(self.stereo_rig, cov=cov, sigma_px=LOOSE_PX), (self.timing["skew"], self.timing["start"])
+        moved_m = self.speeds[0] / math.sqrt(3) * math.hypot(*moved_s)
+        return gates(rig, self.layout, self.views[len(self.views) // 2], noise_px, moved_m)
 
     def _cov_calibration(self) -> Array:
         """Return the covariance (P, P) of the rig's parameters."""
@@ -583,11 +567,11 @@ def _calibrated(plan: RigPlan) -> Array:
 def planned(plan: RigPlan, cameras: int = 2) -> Budget:
     """Return the budget of a plan: of its two cameras, of the left one alone, or of three in an equilateral triangle."""
     plan.check()
-    layout, given, rig = plan.layout, plan.conditions(), plan.stereo_rig
+    layout, given, rig = plan.layout, plan.conditions, plan.stereo_rig
     points, normals = layout.body.points, layout.normals
 
     def of(pair: int | None) -> Budget:
         views = plan.views if pair is None else volume_views(rig, points, normals, plan.distance_m, plan.size_m, pair)
         return pose_budget(rig, points, normals, [replace(one, seen=one.seen[:, :cameras]) for one in views], given)
 
-    return of_three([of(pair) for pair in range(3)]) if cameras == 3 else of(None)
+    return of_three([of(pair) for pair in range(3)], rig, given.board_scale) if cameras == 3 else of(None)

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from armsight.data import Array, Record
 from armsight.errors import InputError
-from armsight.sim.budget.plan import RigPlan, catalogue, planned
+from armsight.sim.budget.plan import RigPlan, catalogue, planned, up
 from armsight.vision.calibrate.budget import CAUSES, LEVEL, Budget
 
 #: A change that gains less than this share is not worth a line; half: lines that nobody buys, double: cheap gains lack.
@@ -179,6 +179,18 @@ class RigBudget(Record):
         """Return whether a state is within what was requested; true where nothing was."""
         return self.plan.requested is None or state.over(*self.plan.requested) <= 1
 
+    def check(self) -> None:
+        """Raise an InputError where the print of the body alone costs more than what was requested: no camera helps."""
+        floor = self.found.at_level(self.found.cov(of="print of the body"))
+        units = ("mm", 1e3), ("deg", 180 / math.pi)
+        for least, most, (unit, scale) in zip(floor, self.plan.requested or (0.0, 0.0), units, strict=True):
+            if 0 < most < least.max():
+                raise InputError(
+                    f"want {self.plan.want}: the print of the body alone costs {scale * least.max():.2g} {unit}, no "
+                    f"camera reaches {scale * most:g}: {up(scale * least.max())}{unit} can be had, or less with its "
+                    "markers measured after printing: body_print, body_bent, body_size"
+                )
+
     def worst_m(self, cause: str) -> float:
         """Return what 95 % would be within at the worst position if a cause were alone."""
         return float(self.found.at_level(self.found.cov(of=cause))[0].max())
@@ -232,7 +244,9 @@ def budget(path: str = "", **plan: Any) -> RigBudget:  # noqa: ANN401
         InputError: an unknown key, a value that cannot be read, or a rig that cannot be built, with the nearest that can.
     """
     given = RigPlan.read(path, **plan)
-    return RigBudget(given, planned(given))
+    found = RigBudget(given, planned(given))
+    found.check()
+    return found
 
 
 class Alternative(NamedTuple):

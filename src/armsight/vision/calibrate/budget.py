@@ -11,29 +11,38 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
-from scipy.special import erf, gammaincinv
+from scipy.special import gammaincinv
 
-from armsight.data import Array, Ids, Record
+from armsight.data import Array, Correspondences, Discs, Ids, PoseEstimate, Record
 from armsight.errors import InputError
-from armsight.estimate.chance import chi_square_limit
-from armsight.geometry.pose import transform
-from armsight.geometry.rotation import exp_so3
+from armsight.geometry.pose import pose, transform
+from armsight.geometry.rotation import exp_so3, skew
 from armsight.vision.calibrate.boards import printed_board, rigid_board
-from armsight.vision.discs.assign import GATE_QUANTILE
-from armsight.vision.discs.pairing import GATE_SIGMAS as PLANE_SIGMAS
-from armsight.vision.discs.pairing import UNMODELLED_PX, UNMODELLED_SHARE
+from armsight.vision.discs.bias import expect
+from armsight.vision.discs.hypothesis import hypothesis
+from armsight.vision.discs.pairing import DiscView, pair
 from armsight.vision.markers.targets import Composite
-from armsight.vision.match import GATE_PX, GATE_SIGMAS
-from armsight.vision.pose.bundle import BundleState, Observations, minimise
+from armsight.vision.match import gate
+from armsight.vision.pose.bundle import BundleModel, BundleState, Observations, minimise
+from armsight.vision.pose.locate import locate
+from armsight.vision.pose.measure import locate_discs
 from armsight.vision.pose.predict import PoseDerivatives, PredictedView, pose_derivatives, view
-from armsight.vision.pose.shutter import LOOSE_PX
 from armsight.vision.rig import StereoRig
+from armsight.vision.triangulate import triangulate
 
 #: Share of errors that a figure "at 95 %" covers.
 LEVEL = 0.95
 _THIRD = 2 * np.pi / 3  # rad; between the pairs of three cameras
+#: A gate is found by so many halvings of what so many standard deviations of the motion reach; half: known to half a
+#: sigma, double: twice the time. Half of the sigmas: 5 % lost are none, double: half as fine.
+_HALVED, _SURELY = 6, 4.0
+#: Two gates that are found at this share of both at once do not add (0.71 would be on the circle, 1 in the corner); and
+#: points of the normal distribution that they cut, along each side; half: 2 % off, double: four times the time.
+_CORNER, _GRID = 0.85, 65
 
 
 @dataclass(frozen=True)
@@ -65,27 +74,17 @@ CAUSES: dict[str, CauseKind] = {
 }
 
 
+class Gates(NamedTuple):
+    """How far a body may move between the two exposures until ``measure`` finds none."""
+
+    across_rad: float = np.inf  #: across the epipolar planes, over the distance.
+    along_m: float = np.inf  #: along the baseline.
+    together: bool = True  #: whether their squares add, as in a chi-square, or each is a limit of its own.
+
+
 @dataclass(frozen=True, eq=False)
 class Conditions(Record):
-    """What is not known when a body is measured; zero where nothing is given.
-
-    Attributes:
-        noise_px: cause -> standard deviation that it adds to a marker's position, px: pixel noise, defocus, exposure blur.
-        cov_calibration: (P, P) covariance of the rig's parameters by its calibration, or (0, 0).
-        board_scale: standard deviation of the board's size, as a share.
-        body_sigma_m: of each point of the body from its file, along its face and out of it, m.
-        body_scale: of the body's size, as a share.
-        mount_m: of the right camera's position along each axis since the calibration, m.
-        lens_share: of each focal length since the calibration, as a share.
-        skew_s: by how much the right exposures are later, uncorrected, s.
-        start_s: standard deviation of what differs from shot to shot, s.
-        readout_s: from the first row to the last, uncorrected, s.
-        stamp_s: standard deviation of a time stamp, s.
-        speed_m_s: of the body, in any direction.
-        rotation_rad_s: its rate of rotation, about any axis.
-        handeye: standard deviations of position along each axis, m, and of rotation about each, rad.
-        arm: the same of how near the arm comes to where it is sent.
-    """
+    """What is not known when a body is measured; zero where nothing is given."""
 
     #: cause -> standard deviation that it adds to a marker's position, px: pixel noise, defocus, exposure blur.
     noise_px: Mapping[str, float] = field(default_factory=dict)
@@ -105,8 +104,7 @@ class Conditions(Record):
     stamp_s: float = 0.0  #: standard deviation of a time stamp, s.
     speed_m_s: float = 0.0  #: of the body, in any direction.
     rotation_rad_s: float = 0.0  #: its rate of rotation, about any axis.
-    #: distance from the epipolar line beyond which a shot's points are not matched: the shot is lost.
-    gate_px: float = np.inf
+    gate: Gates = field(default_factory=Gates)  #: shots that move further between the exposures are lost.
     #: standard deviations of position along each axis, m, and of rotation about each, rad.
     handeye: tuple[float, float] = (0.0, 0.0)
     arm: tuple[float, float] = (0.0, 0.0)  #: the same of how near the arm comes to where it is sent.
@@ -114,19 +112,12 @@ class Conditions(Record):
 
 @dataclass(frozen=True, eq=False)
 class Budget(Record):
-    """The error of a body's pose, [translation m; rotation rad] along the left camera's axes, at G points of a volume.
-
-    Attributes:
-        p_left: (G, 3) the points, m, left camera's frame.
-        forward: (3,) direction of depth.
-        factors: cause -> (G, 6, K) what its K sources of variance one do to the pose.
-        shared: causes that multiply the same sources, which add before they are squared.
-    """
+    """The error of a body's pose, [translation m; rotation rad] along the left camera's axes, at G points of a volume."""
 
     p_left: Array  #: (G, 3) the points, m, left camera's frame.
     forward: Array  #: (3,) direction of depth.
     factors: Mapping[str, Array]  #: cause -> (G, 6, K) what its K sources of variance one do to the pose.
-    lost: Array  #: (G,) share of the shots in motion that the epipolar gate loses; the errors are those of the others.
+    lost: Array  #: (G,) share of the shots in motion that are lost; the errors are those of the others.
     #: causes that multiply the same sources, which add before they are squared.
     shared: tuple[str, ...] = ("skew", "readout")
 
@@ -260,72 +251,113 @@ def pose_budget(rig: StereoRig, points: Array, normals: Array, views: list[Predi
     return Budget(np.array(at), forward / np.linalg.norm(forward), factors, np.array(lost))
 
 
-def gate_px(layout: Composite, per_m: float, noise_px: float, *, apart: bool) -> float:
-    """Return how far a body's markers may be off their epipolar lines, px; ``per_m``: pixels of a metre there.
+def gates(rig: StereoRig, target: Composite, seen: PredictedView, noise_px: float, sigma_m: float) -> Gates:
+    """Ask ``measure``, by bisection, with what both cameras would detect; ``sigma_m``: of the motion along each axis."""
+    limits, distance_m, most_m = [np.inf, np.inf], 1.0, _SURELY * sigma_m
+    if sigma_m and len(seen.paired) >= 3:
+        p = transform(seen.T_left_body, target.body.points[seen.paired]).mean(axis=0)
+        axes, distance_m = _between_exposures(rig, p), float(np.linalg.norm(p))
+        for k, axis in enumerate(axes):
+            if _found(rig, target, seen, noise_px, most_m * axis) or not _found(rig, target, seen, noise_px, 0 * axis):
+                continue
+            low, high = 0.0, most_m
+            for _ in range(_HALVED):
+                middle = (low + high) / 2
+                low, high = (middle, high) if _found(rig, target, seen, noise_px, middle * axis) else (low, middle)
+            limits[k] = (low + high) / 2
+        if np.isfinite(limits).all():
+            both = _found(rig, target, seen, noise_px, _CORNER * np.array(limits) @ axes)
+            return Gates(limits[0] / distance_m, limits[1], together=not both)
+    return Gates(limits[0] / distance_m, limits[1])
 
-    Where the exposures are ``apart``, `run` and `live` search with a wider gate.
-    """
-    noise_px = math.hypot(noise_px, LOOSE_PX if apart else noise_px)
-    if not (count := layout.disc_count):
-        return max(GATE_PX, GATE_SIGMAS * math.sqrt(2) * noise_px)
-    # One pair by its planes, and all of them by the chi-square of the pose, half of the distance in each image.
-    variance, size_m = noise_px**2 + UNMODELLED_PX**2, float(np.linalg.norm(np.ptp(layout.body.points, axis=0)))
-    made = (UNMODELLED_SHARE * size_m * per_m) ** 2
-    whole = 2 * (variance + made) * chi_square_limit(4 * count - 6, 1 - GATE_QUANTILE) / count
-    return math.sqrt(min(2 * PLANE_SIGMAS**2 * variance, whole))
+
+def _between_exposures(rig: StereoRig, p_left: Array) -> Array:
+    """Return (2, 3) across the epipolar plane of a point (3,), and in it across the right camera's ray, left frame."""
+    along, ray = rig.T_left_right[:3, 3], p_left - rig.T_left_right[:3, 3]
+    across = np.cross(along, p_left)
+    both = np.stack([across, np.cross(across, ray)])
+    return np.asarray(both / np.linalg.norm(both, axis=1, keepdims=True))
+
+
+def _found(rig: StereoRig, target: Composite, seen: PredictedView, noise_px: float, moved_m: Array) -> bool:
+    """Whether ``measure`` finds a body that moved by (3,), m, left frame, before the right camera saw it."""
+    points, first, T_left_body = target.body.points, len(target.body.points) - target.disc_count, seen.T_left_body
+    cov, uv, discs = noise_px**2 * np.eye(2), np.full((len(points), 2, 2), np.nan), []
+    rows = np.full((target.disc_count, 2), -1)
+    for side, T in enumerate((T_left_body, pose(np.eye(3), moved_m) @ T_left_body)):
+        there = seen.seen[:, side]
+        uv[there, side] = rig.project(transform(T, points[there]))[side]
+        if target.discs is not None:
+            at, there = expect(rig, target.discs, T), there[first:]
+            rows[there, side] = np.arange(there.sum())
+            covs = np.tile(cov, (int(there.sum()), 1, 1))
+            discs.append(Discs(at.uv[there, side], covs, at.shape[there, side], target.discs.bright[there]))
+    if first or target.discs is None:  # coded parts name the discs
+        ids = np.flatnonzero(seen.seen[:first].any(axis=1))
+        named = Correspondences(ids, uv[ids], np.where(np.isfinite(uv[ids])[..., None], cov, 0.0))
+        found = locate(rig, target.body, triangulate(rig, target.body, gate(rig, target.body, named)))
+    else:
+        view = DiscView.of(rig, target.discs, *discs)
+        pairs = pair(view)
+        if pairs is None or len(pairs.left) < 3:
+            return False
+        by_body = hypothesis(view, pairs, T_left_body, rows)
+        if isinstance(by_body, str):
+            return False
+        nothing = Correspondences(np.zeros(0, np.int64), np.zeros((0, 2, 2)), np.zeros((0, 2, 2, 2)))
+        found = locate_discs(rig, target.body, target.discs, nothing, by_body.seen, by_body.T_left_body)
+    return isinstance(found, PoseEstimate)
 
 
 def _gated(
-    rig: StereoRig,
-    points: Array,
-    seen: PredictedView,
-    d: PoseDerivatives,
-    given: Conditions,
-    late: Array,
-    velocity: Array,
-) -> tuple[float, Array]:
-    """Return the share of shots whose points the exposures move beyond the gate, and V (6, 6) of the others' velocities.
+    rig: StereoRig, points: Array, seen: PredictedView, d: PoseDerivatives, given: Conditions, late: Array, velocity: Array
+) -> tuple[float, Array]:  # fmt: skip
+    """Return the share of shots that move beyond the gates between the exposures, and V (6, 6) of the others' velocities.
 
-    A velocity of independent parts (6,) moves the points off their epipolar lines; of the shots within the gate that part
-    of it has the variance of a truncated normal distribution, all else of it is as it was. ``late`` (N,), s.
+    Of a velocity of independent parts (6,), the two that the gates limit have the second moments of the normal
+    distribution within them; all else of it is as it was. ``late`` (N,), s.
     """
-    pairs, V = seen.paired, np.diag(velocity)
-    if not np.isfinite(given.gate_px) or (not late.any() and not given.start_s) or seen.seen.shape[1] == 1:
-        return 0.0, V
-    p = transform(seen.T_left_body, points[pairs])
-    line = rig.project(1.001 * p)[1] - rig.project(p)[1]  # along it
-    across = np.column_stack([-line[:, 1], line[:, 0]]) / np.linalg.norm(line, axis=1, keepdims=True)
-    rows = [np.flatnonzero((d.side == side) & np.isin(d.point, pairs)) for side in (0, 1)]
-    by_velocity = np.einsum("nc,ncj->nj", across, d.uv_by_pose[rows[1]]) * velocity
-    a = ((late[rows[1]] - late[rows[0]])[:, None] * by_velocity).mean(axis=0)
-    off = float(np.hypot(np.linalg.norm(a), given.start_s * np.linalg.norm(by_velocity.mean(axis=0))))
-    t = given.gate_px / max(off, 1e-12)
-    inside = erf(t / np.sqrt(2))
-    left = (
-        1 - t * np.sqrt(2 / np.pi) * np.exp(-(t**2) / 2) / inside
-    )  # variance of what is within, Johnson and Kotz 1970
-    unit = by_velocity.mean(axis=0) / max(np.linalg.norm(by_velocity.mean(axis=0)), 1e-12)
-    return float(1 - inside), V @ (np.eye(6) - (1 - np.sqrt(max(left, 0.0))) * np.outer(unit, unit))
+    pairs, (across_rad, along_m, together) = seen.paired, given.gate
+    if not np.isfinite((across_rad, along_m)).any() or not (late.any() or given.start_s) or seen.seen.shape[1] == 1:
+        return 0.0, np.diag(velocity)
+    left, right = (late[(d.side == side) & np.isin(d.point, pairs)] for side in (0, 1))
+    R, p = seen.T_left_body[:3, :3], transform(seen.T_left_body, points[pairs]).mean(axis=0)
+    apart_s = math.hypot(float((right - left).mean()), given.start_s)
+    moved = apart_s * _between_exposures(rig, p) @ np.hstack([R, -R @ skew(points[pairs].mean(axis=0))]) * velocity
+    Q, L = np.linalg.qr((moved / np.array([[across_rad * np.linalg.norm(p)], [along_m]])).T)
+    z = np.linspace(-_SURELY, _SURELY, _GRID)
+    grid = np.stack(np.meshgrid(z, z), axis=-1).reshape(-1, 2)
+    used = np.abs(grid @ L)
+    inside = np.exp(-(grid**2).sum(axis=1) / 2)
+    total = inside.sum()
+    inside[(np.linalg.norm(used, axis=1) if together else used.max(axis=1)) > 1] = 0.0
+    root = np.linalg.cholesky((grid.T * inside) @ grid / max(inside.sum(), 1e-300) + 1e-9 * np.eye(2))
+    return float(1 - inside.sum() / total), np.diag(velocity) @ (np.eye(6) + Q @ (root - np.eye(2)) @ Q.T)
 
 
-def of_three(pairs: Sequence[Budget]) -> Budget:
+def of_three(pairs: Sequence[Budget], rig: StereoRig, board_scale: float = 0.0) -> Budget:
     """Return the budget of three cameras from those of their three pairs.
 
     The least-squares pose of three cameras is the mean of the pairs' poses, weighted by their information: each camera is
     in two of them. What is each camera's own is independent, and counts twice for that; all else is the same in all pairs.
 
     ``pairs`` are those of :func:`volume_views`, 0, 1 and 2; axes are those of the first one's left camera.
+    ``board_scale``: of the board's size, as a share: the distances of all three cameras grow with it.
     """
     first = pairs[0]
+    # A larger board moves each pair's own left camera away from the triangle's middle.
+    down = np.cross(first.forward, aside := rig.T_left_right[:3, 3])
+    middle = np.append(aside / 2 + down / (2 * np.sqrt(3.0)), np.zeros(3))
     back = [np.kron(np.eye(2), exp_so3(-_THIRD * k * first.forward)) for k in range(3)]
     informations = [R @ np.linalg.inv(each.cov(of="pixel noise")) @ R.T for R, each in zip(back, pairs, strict=True)]
     whole = np.linalg.inv(np.sum(informations, axis=0))
     weighed = [whole @ each for each in informations]
     factors = {}
     for name in first.factors:
-        parts = [W @ R @ each.factors[name] for W, R, each in zip(weighed, back, pairs, strict=True)]
+        larger = board_scale * middle[:, None] if name == "print of the board" else 0.0
+        parts = [W @ R @ (each.factors[name] - larger) for W, R, each in zip(weighed, back, pairs, strict=True)]
         own = CAUSES[name].camera
-        factors[name] = np.sqrt(2.0) * np.concatenate(parts, axis=2) if own else np.sum(parts, axis=0)
+        factors[name] = np.sqrt(2.0) * np.concatenate(parts, axis=2) if own else np.sum(parts, axis=0) + larger
     return replace(first, factors=factors, shared=())
 
 
@@ -361,6 +393,12 @@ def _lenses(rig: StereoRig, share: float) -> Array:
     return by
 
 
+@lru_cache(maxsize=4)
+def _printed(board: bytes) -> BundleModel:
+    """Return the model of a board's corners (M, 3), m, as bytes; its shape takes a tenth of a second."""
+    return printed_board(np.frombuffer(board).reshape(-1, 3))
+
+
 def calibration_covariance(
     rig: StereoRig, board: Array, Ts_left_board: Array, sigma_px: float, bent_m: float = 0.0
 ) -> Array:
@@ -375,7 +413,7 @@ def calibration_covariance(
     """
     model, (S, M) = rigid_board(board), (len(Ts_left_board), len(board))
     if bent_m > 0:
-        model = printed_board(board)
+        model = _printed(np.asarray(board, np.float64).tobytes())
         model = replace(model, shape_sigma_m=bent_m * np.sqrt(3.0 / len(model.modes)))
     state = BundleState(rig.cameras, rig.T_left_right, Ts_left_board, np.zeros(len(model.modes)))
     shot, side = np.repeat(np.arange(S), 2 * M), np.tile(np.repeat([0, 1], M), S)
