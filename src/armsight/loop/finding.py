@@ -26,6 +26,9 @@ SUSPECTED = 0.02
 #: What displaces the tool by less, m, forbids no result. Half: webcams' processing is said, double: a stand's shaking
 #: not.
 COSTS_M = 1e-4
+#: Explanations whose chi-squares differ by less are not distinguished. Half: the wrong one alone is named, double: more
+#: alternatives stand beside it.
+ALIKE = 12.0
 #: A rotation counts by what it does at this distance from the body's origin, m.
 LEVER_M = 0.1
 
@@ -346,7 +349,7 @@ def make_finding(
     """
     row = CAUSES[name]
     unit = unit or row.unit
-    size, sigma = (_TO_UNIT[unit] * each for each in evidence)
+    size, sigma = (_TO_UNIT[unit] * float(each) for each in evidence)
     what = row.what.format(size=abs(size), signed=size, way=row.ways[size <= 0.0], **(words or {}))
     what += f"; {unsure} cannot be excluded" if unsure else ""
     cost_mm = None if cost_m is None else 1e3 * cost_m

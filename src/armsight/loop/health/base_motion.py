@@ -23,12 +23,12 @@ from armsight.data import Array
 from armsight.geometry.pose import adjoint, inverse
 from armsight.loop.estimators import Innovation, KalmanEstimator, Outcome, Remembered
 from armsight.loop.estimators.errormodel import NOTHING
-from armsight.loop.health.change import DATED_S
+from armsight.loop.health.change import DATED_S, WIDE
 
 #: A measurement is kept every so often, s, and so many: those between say nearly the same of the arm.
 _EVERY_S, _KEPT = 1.0 / 15.0, 900
-#: Priors so wide that they decide nothing: of a motion, and of its speed in a second (m, rad).
-_WIDE, _SPEED = np.repeat([0.05, 0.1], 3), np.repeat([5e-4, 1e-3], 3)
+#: A prior so wide that it decides nothing, of the speed of a motion in a second (m, rad).
+_SPEED = np.repeat([5e-4, 1e-3], 3)
 #: Of the poses that the arm visited at most so many are looked at.
 _VISITED = 30
 
@@ -143,7 +143,7 @@ class BaseMotion:
         since_s = seen.t_s - self.begin_s
         if since_s > 0.0 and not self._moves:
             self._moves = True
-            self._P[d, d] = np.diag(_WIDE**2)
+            self._P[d, d] = np.diag(WIDE**2)
             if self.slow:
                 self._P[n + 6 :, n + 6 :] = np.diag(_SPEED**2)
         self._Ts.append(seen.T_base_tool)

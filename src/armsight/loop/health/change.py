@@ -14,14 +14,12 @@ import numpy as np
 from armsight.data import Array, Record
 from armsight.estimate.chance import chi_square_limit
 from armsight.geometry.pose import adjoint, inverse
-from armsight.loop.finding import CAUSES, LEVER_M, Cause, HealthFinding, displacement_m, make_finding, sized
+from armsight.loop.finding import ALIKE, CAUSES, LEVER_M, Cause, HealthFinding, displacement_m, make_finding, sized
 
 if TYPE_CHECKING:
     from armsight.loop.estimators import PoseMeasurement
     from armsight.loop.estimators.armerror import ErrorLayout
 
-#: Hypotheses whose scores differ by less than this from the best cannot be distinguished from it.
-ALIKE = 12.0
 #: A change that begins so much later than another is not the same one, s: beginnings are known to about a second.
 LATER_S = 3.0
 #: A change is dated to about so much, s: so close to its beginning a measurement may be from before or after it.
@@ -33,6 +31,8 @@ _OTHERWISE = 0.08
 #: Chi-square (5) below which a motion of the cameras may be one along their optical axis alone, but for one in a
 #: hundred.
 _ALONG = chi_square_limit(5, 0.01)
+#: Priors so wide that they decide nothing: of a motion (m, rad), of a time, s, and of an angle, rad.
+WIDE, _WIDE_S, _WIDE_RAD = np.repeat([0.05, 0.1], 3), 0.05, 0.1
 #: What the pair alone cannot distinguish from that.
 FOCAL = "; both focal lengths that changed alike look the same to the pair"
 
@@ -98,6 +98,24 @@ def bending(down: Array) -> Array:
 
 #: Of these columns those that may change slowly; and how many there are without the backlash, of n joints.
 RAMPS = 7
+
+
+def widths(joints: int) -> Array:
+    """Return (18 + 2 n - 1,) standard deviations of the priors of what may change."""
+    wide = np.full(RAMPS + 10 + 2 * joints, _WIDE_RAD)
+    wide[:6] = wide[RAMPS : RAMPS + 6] = WIDE
+    wide[6], wide[-2:] = _WIDE_S, WIDE[0]
+    return wide
+
+
+def thinned(times_s: Sequence[float], now_s: float, all_s: float, ratio: float) -> list[int]:
+    """Return the rows of rising times, s, that are kept: all of the newest seconds, older ones each older by a ratio."""
+    rows = list[int]()
+    for k, t_s in enumerate(times_s):
+        age_s = now_s - t_s
+        if not rows or age_s <= all_s or now_s - times_s[rows[-1]] >= ratio * age_s:
+            rows.append(k)
+    return rows
 
 
 @dataclass(frozen=True)

@@ -31,6 +31,7 @@ from armsight.loop.health.change import (
     happened_besides,
     ranked,
     suspects,
+    widths,
 )
 
 #: A block lasts so long, s, and until all joints have travelled so far, rad, but at most so long, s.
@@ -45,8 +46,6 @@ _BEGINS = 12
 _MOST_KEPT = 160
 #: Errors of a block before any is seen (m, rad), and how many blocks that counts.
 _BLOCK_SIGMA, _BLOCKS = np.repeat([1.2e-4, np.radians(0.012)], 3), 8.0
-#: Priors so wide that they decide nothing: of a motion (m, rad), of a time, s, and of an angle, rad.
-_WIDE, _WIDE_S, _WIDE_RAD = np.repeat([0.05, 0.1], 3), 0.05, 0.1
 #: A motion that displaces the tool by less, m, is not reported, nor a smaller angle, rad: links in their backlash.
 _LEAST_M, _LEAST_RAD = 2e-4, float(np.radians(0.3))
 #: By so much the chi-square of a drift must exceed that of a jump.
@@ -154,10 +153,7 @@ class ClosureWatch:
         self._clock_s: list[float] = []
         self._merged: list[int] = []  # how many blocks each one is of
         self._newest: Innovation | None = None
-        self._wide = np.full(RAMPS + 10 + 2 * joints, _WIDE_RAD)
-        self._wide[-2:] = _WIDE[0]
-        self._wide[:6] = self._wide[RAMPS : RAMPS + 6] = _WIDE
-        self._wide[6] = _WIDE_S
+        self._wide = widths(joints)
         self._cov, self._unsure = np.diag(_BLOCK_SIGMA**2), _unsure(joints, int(_BLOCKS))
         self._clear()
         self.changes: tuple[Change, ...] = ()

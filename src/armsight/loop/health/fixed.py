@@ -41,19 +41,17 @@ from armsight.loop.finding import (
     displacement_m,
     make_finding,
 )
-from armsight.loop.health.change import RAMPS, Change, Suspect, changing, ranked, suspects
+from armsight.loop.health.change import RAMPS, Change, Suspect, changing, ranked, suspects, thinned, widths
 
 #: A beginning is tried every so often, s; older than this many seconds their distances grow with their age.
 EVERY_S, _FINE_S, _RATIO = 0.2, 1.0, 1.4
-#: At most so many beginnings, and how often they are tested, Hz.
-MOST, _TESTS_HZ = 20, 5.0
+#: At most so many beginnings; half: old ones are dated half as well, double: twice the time.
+MOST = 20
 #: Errors of the arm's model last about so long, s: innovations closer than that count as one.
 CORRELATED_S = 0.1
-#: Priors so wide that they decide nothing: m, rad, s; for a drift, of that much in a second.
-_WIDE_M, _WIDE_RAD, _WIDE_S = 0.05, 0.1, 0.05
 #: A drift must explain so much more than a jump to be preferred.
 _RARER = 10.0
-_LIMITS = {freedom: alarm_limit(freedom, _TESTS_HZ, 2 * MOST) for freedom in (1, 6)}
+_LIMITS = {freedom: alarm_limit(freedom, 1.0 / EVERY_S, 2 * MOST) for freedom in (1, 6)}
 
 
 class _Fitted(NamedTuple):
@@ -83,9 +81,7 @@ class FixedWatch:
         rows = [*range(6), at.delay, *range(6 * at.joints, 6 * at.joints + 6), *at.zeros[1:]]
         self._steps = np.zeros((at.size, len(rows)))
         self._steps[rows, np.arange(len(rows))] = 1.0
-        wide = np.full(len(rows), _WIDE_RAD)
-        wide[:3] = wide[RAMPS : RAMPS + 3] = _WIDE_M
-        wide[6] = _WIDE_S
+        wide = widths(joints)[: len(rows)]
         self._wide, self._columns = np.append(wide, wide[:RAMPS]), len(rows) + RAMPS
         self._suspects = tuple(each for each in suspects(at.joints) if each.kind not in ("backlash", "bend", "zoom"))
         self._begins = np.zeros(0)
@@ -167,12 +163,7 @@ class FixedWatch:
     def _begin(self, t_s: float) -> None:
         """Try a new beginning, and drop the ones that the age makes needless."""
         self._sum()
-        ages = t_s - self._begins
-        keep, last = np.zeros(len(ages), bool), np.inf
-        for k, age in enumerate(ages):  # from the oldest on
-            keep[k] = k == 0 or age <= _FINE_S or last >= _RATIO * age
-            last = age if keep[k] else last
-        rows = np.flatnonzero(keep)
+        rows = np.array(thinned(self._begins.tolist(), t_s, _FINE_S, _RATIO), int)
         rows = rows if len(rows) < MOST else np.delete(rows, 1)
         new = np.zeros((self._size, 1, self._columns), np.float32)
         new[:, 0, : self._steps.shape[1]] = self._steps

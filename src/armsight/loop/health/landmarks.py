@@ -19,9 +19,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from armsight.data import Array, PoseEstimate
-from armsight.estimate.chance import chi_square_limit
 from armsight.geometry.pose import adjoint, inverse, log_se3
-from armsight.loop.finding import FALSE_ALARMS_PER_MINUTE, HealthFinding, make_finding, sized
+from armsight.loop.finding import HealthFinding, alarm_limit, make_finding, sized
 from armsight.loop.health.change import FOCAL, along_axis
 
 #: Poses of a mean.
@@ -71,7 +70,7 @@ class _Landmark:
 
 
 def _limit(freedom: int) -> float:
-    return chi_square_limit(freedom, FALSE_ALARMS_PER_MINUTE / 360.0)
+    return alarm_limit(freedom, 30.0 / _SHOTS)  # a mean of so many shots at 30 Hz
 
 
 #: So many means of all bodies together for each of them are waited for those of a body that is not seen any more.

@@ -13,7 +13,16 @@ from armsight.geometry.pose import transform
 from armsight.loop.estimators import Outcome
 from armsight.loop.finding import HealthFinding, Trust, displacement_m, make_finding
 from armsight.loop.frame_clock import FrameClock
-from armsight.loop.health.change import DATED_S, Change, ToolView, doubtful, finding, happened_besides, suspected
+from armsight.loop.health.change import (
+    DATED_S,
+    Change,
+    ToolView,
+    doubtful,
+    finding,
+    happened_besides,
+    suspected,
+    thinned,
+)
 from armsight.loop.health.fixed import FixedWatch, ShakeWatch
 from armsight.loop.health.host import HostWatch
 from armsight.loop.health.landmarks import LandmarkWatch
@@ -95,7 +104,8 @@ class HealthMonitor:
         self._poses.clear()
         due = not self._known or self._newest_s - self._known[-1][0] >= _KEEP_S
         if self._estimator is not None and due and self.trust is not Trust.NONE:
-            self._known = [*_thinned(self._known, self._newest_s), (self._newest_s, self._estimator.remembered())]
+            rows = thinned([t_s for t_s, _ in self._known], self._newest_s, _ALL_S, _RATIO)
+            self._known = [*(self._known[k] for k in rows), (self._newest_s, self._estimator.remembered())]
         if self._fixed is not None and self._closure is not None and self._measurements is not None:
             for innovation in self._innovations:
                 if agreed := self._agreed(innovation):
@@ -440,15 +450,6 @@ def _with_scene(found: tuple[HealthFinding, ...], scene: tuple[HealthFinding, ..
             both = replace(same, what=f"{same.what}; the background says: {seen.what}")
             found = tuple(both if each is same else each for each in found)
     return found
-
-
-def _thinned(known: Sequence[tuple[float, Remembered]], now_s: float) -> list[tuple[float, Remembered]]:
-    """Return what was known at some times, rising, the closer to each other the newer they are."""
-    kept: list[tuple[float, Remembered]] = []
-    for each in known:
-        if not kept or now_s - each[0] <= _ALL_S or now_s - kept[-1][0] >= _RATIO * (now_s - each[0]):
-            kept.append(each)
-    return kept
 
 
 def _clock_findings(clock: ClockFollower, t_s: float, sigma_s: float, cost_m: float) -> tuple[HealthFinding, ...]:

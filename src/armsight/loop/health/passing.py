@@ -38,8 +38,9 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from armsight.data import Array
-from armsight.loop.finding import HealthFinding, displacement_m, make_finding
+from armsight.loop.finding import ALIKE, HealthFinding, displacement_m, make_finding
 from armsight.loop.health.residuals import UNKNOWN_SHARE, ExposedShot, ResidualSums, eliminated, evidence_of_scales
+from armsight.loop.health.shape import FOCAL_SHARE
 
 #: Standard deviations that are tried of the times that each shot has of its own, s, and that of the times that all share.
 _APART_S, _SHARED_S = (0.0, *(1e-3 * 2.0**k for k in range(-2, 7))), 0.03
@@ -51,8 +52,6 @@ _AHEAD = math.log(1e4)
 #: And by this share of the log-evidence of what stays: the test in which it began is of both times.
 #: Half: a camera that rotates by 0.2 deg is a lens that breathes, double: slow breathing is a rotation.
 _MODELLED = 0.05
-#: Hypotheses whose log-evidence is nearer than this are not distinguished: 12 of chi-square.
-_ALIKE = 6.0
 #: Times are another in each shot where their own part is this share of what all have in common at the least.
 _CONSTANT = 0.4
 #: What passes and what stays began at one time where they are dated so near, s: each is known to about a test.
@@ -61,9 +60,8 @@ _DATED_S = 2.0
 _LEAST = 2
 #: Of the columns of a shot those of times: of the right camera, of the rows of the right and of the left one; acceleration.
 _TIMES = [0, 7, 8, 9]
-#: Standard deviation of a test's focal length, as a share: wide; its row after the parameters; its share against what
-#: stays.
-_FOCAL, _FOCAL_ROW, _FOCAL_VARIANCE = 0.05, 7, 0.01
+#: Row of a test's focal length after the parameters; its share of a variance against what stays.
+_FOCAL_ROW, _FOCAL_VARIANCE = 7, 0.01
 #: Newest doubtful tests explained together; half: slow breathing is taken for a change that stays, double: more time.
 TOGETHER = 12
 #: Newest tests listed in which something passed; half: hours of it are sized a little worse, double: 0.3 MB more.
@@ -226,7 +224,7 @@ class _Doubtful:
             rests["time"] = _Rest(times.rest, cost - _left(times.rest, size), occam)
         if nods is not None:
             rests["rig"] = _Rest(nods[0], cost - _left(nods[0], size), nods[1])
-        return cls(every, rests, times, _FOCAL * float(M[0, row] / (M[row, row] + 1.0)))
+        return cls(every, rests, times, FOCAL_SHARE * float(M[0, row] / (M[row, row] + 1.0)))
 
     def shows(self, cause: Passes | None, excess: float) -> bool:
         """Return whether a cause explains more than chance, of a noise whose variance is so many times larger."""
@@ -392,7 +390,7 @@ class Passing:
                 cause = cause if others and weighed.best(self._counted, one=len(others) == 1) == cause else None
         self._counted = cause
         near = max(_PASSES, key=weighed.explained.__getitem__)
-        alike = weighed.explained[near] > max(_AHEAD, weighed.stays - _ALIKE)
+        alike = weighed.explained[near] > max(_AHEAD, weighed.stays - ALIKE / 2.0)
         self.unsure = (near,) if cause is None and alike and len(tests) > 1 else ()
         self._doubtful = [replace(each, counted=cause if each.shows(cause, weighed.excess) else None) for each in tests]
         self._list(self._doubtful)
@@ -423,14 +421,14 @@ class Passing:
         self.focal_share = newest.focal_share if newest.counted == "lens" else 0.0
 
     def added(self, exposed: ExposedShot, by_focal: Array) -> Array:
-        """Return the covariance (6, 6) of a pose by what passes now; by_focal: (6,) its response, per ``_FOCAL``."""
+        """Return the covariance (6, 6) of a pose by what passes now; by_focal: (6,) its response, per ``FOCAL_SHARE``."""
         added = np.zeros((6, 6))
         if self.apart_s:
             by = self.apart_s * exposed.response()
             added += by @ by.T
         if self.focal_share:
             spread = math.sqrt(float(np.mean(np.square([share for _, share in self.focal]))))
-            added += (spread / _FOCAL) ** 2 * np.outer(by_focal, by_focal)
+            added += (spread / FOCAL_SHARE) ** 2 * np.outer(by_focal, by_focal)
         self.cost_m = max(self.cost_m, float(displacement_m(np.sqrt(np.diag(added)))))
         return added
 

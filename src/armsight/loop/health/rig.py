@@ -450,17 +450,6 @@ class RigWatch:
         sums = ResidualSums(M, freedom, stays[0][0].t_s if stays else 0.0)
         return sums if own is None else eliminate(own, self._weighed_parts(stays, every=every), sums)[0]
 
-    def _in_units(
-        self,
-        stays: Sequence[Sequence[ShotResiduals]],
-        *,
-        every: bool = False,
-        own: Apart | None = None,
-        cov: Array | None = None,
-    ) -> ResidualSums:
-        """Return the same sums of all that may have changed, in units of its priors, and of the lenses' coefficients."""
-        return self._summed(stays, every=every, own=own, cov=cov).by(self._with_lens)
-
     def _decide(self, *, ends: bool = False) -> None:
         stays, self._stays = self._stays, []
         if not stays:
@@ -553,8 +542,10 @@ class RigWatch:
         left_out = any(each.every is not each.rows for stay in stays for each in stay)
         sums = list[tuple[ResidualSums, ResidualSums]]()
         for every in (False, True)[: 1 + left_out]:
-            whole = self._in_units(stays, every=every, own=own, cov=cov)
-            usual = whole.plus(self._in_units(odd, every=every, own=own, cov=cov), -1.0) if odd else whole
+            whole = self._summed(stays, every=every, own=own, cov=cov).by(self._with_lens)
+            usual = (
+                whole.plus(self._summed(odd, every=every, own=own, cov=cov).by(self._with_lens), -1.0) if odd else whole
+            )
             sums.append((whole, usual))
         (whole, usual), of_every = sums[0], sums[-1]
         fitting = sums[0]

@@ -34,7 +34,7 @@ import numpy as np
 from armsight.data import Array, Ids, Record
 from armsight.estimate.chance import chi_square_limit
 from armsight.geometry.rotation import skew
-from armsight.loop.finding import HealthFinding, alarm_limit, make_finding, sized
+from armsight.loop.finding import ALIKE, HealthFinding, alarm_limit, make_finding, sized
 from armsight.loop.health.residuals import (
     FRESH,
     FURTHEST_M,
@@ -51,7 +51,7 @@ from armsight.loop.health.residuals import (
 )
 
 #: A focal length may change so much, as a share.
-_FOCAL = 0.05
+FOCAL_SHARE = 0.05
 #: Less than this is not reported, m and as a share: paint and glue are not more exact.
 _LEAST_M, _LEAST_FOCAL = 1e-4, 4e-4
 #: Single shots agree with all together if the median of their share of the displacement is between these.
@@ -62,8 +62,6 @@ _ASKED, _LEAST_SHOTS, _LEAST_POSES = 30, 8, 6
 _VIEWS_RAD = 0.05
 #: Directions that are remembered.
 _VIEWS = 1000
-#: Explanations whose chi-squares differ by less are not distinguished.
-_ALIKE = 12.0
 _BESIDES = chi_square_limit(3, NECESSARY)
 #: Probability, before a test, that it is the first one after any change; that a body is strained or bent as a print is.
 _RARE, _PRINTED = 1e-4, 0.1
@@ -187,7 +185,7 @@ class ShapeWatch:
         self._by_candidate = np.zeros((K, 2 + 3 * n))
         self._by_candidate[:, :2] = focal
         self._by_candidate[first : first + 3 * n, 2:] = np.eye(3 * n)
-        self._wide = np.append([_FOCAL, _FOCAL], np.full(3 * n, FURTHEST_M))
+        self._wide = np.append([FOCAL_SHARE, FOCAL_SHARE], np.full(3 * n, FURTHEST_M))
         self.by_wide = self._by_candidate * self._wide
         self._candidates = () if rigid else tuple(range(n))
         # What smooth deformations add to sums of the residual, the seven numbers and the candidates; in m of the latter.
@@ -349,7 +347,7 @@ class ShapeWatch:
             [float(_explained(besides, each._replace(rows=each.rows - 7), excess).evidence.max()) for each in some]
             for some in (smooth, points)
         )
-        if max(most) < max(_CERTAIN, max(other) + _ALIKE / 2.0):
+        if max(most) < max(_CERTAIN, max(other) + ALIKE / 2.0):
             return None
         hypothesis = smooth[int(np.argmax(most))]
         found = _explained(M, hypothesis, excess)
@@ -407,7 +405,7 @@ class ShapeWatch:
             return None
         seven = (without.square - without.gain(columns) - (whole.square - gain)) / excess
         best = chosen[0]
-        alike = tuple(each for each, score in scores.items() if each != best and score > scores[best] - _ALIKE)
+        alike = tuple(each for each, score in scores.items() if each != best and score > scores[best] - ALIKE)
         return ShapeError(chosen, value, excess * cov, scores[best], seven, alike, onset)
 
     def _values(self, whole: ResidualSums, columns: Ids, others_m: float) -> tuple[Array, Array]:
@@ -557,7 +555,7 @@ def _one_is_enough(found: _Reduced) -> bool:
     """Return whether the change of one focal length explains about as much as the seven numbers do."""
     whole, without = found
     gain, seven = without.gain(_columns([FOCAL])), without.square - whole.square
-    return gain >= seven - _ALIKE * without.excess(max(gain, seven))
+    return gain >= seven - ALIKE * without.excess(max(gain, seven))
 
 
 def _differ(views: Array) -> bool:

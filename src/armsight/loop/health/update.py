@@ -113,8 +113,9 @@ def updated_rig(
     """Estimate the relative pose of a rig's cameras again, by detections anywhere in view, before and after the change."""
     if not rig.cov.any():
         return Missed("the rig has no covariance: what is known of the cameras themselves must stand in its file")
-    prior, count = _prior(rig), rig.parameter_count
-    new, stays, found, noise_px, cov = rig, 0, list[PoseEstimate](), _NOISE_PX, prior
+    free = free_directions(rig)
+    prior = rig.cov + (free * _FREED**2) @ free.T
+    new, stays, found, noise_px = rig, 0, list[PoseEstimate](), _NOISE_PX
     for gate_px in _GATES_PX:
         gate = replace(new, cov=prior, sigma_px=gate_px or rig.sigma_px)
         measured = [measure_seen(gate, body, shot) for shot in shots]
@@ -129,19 +130,8 @@ def updated_rig(
                 f"{stays} of {len(found)} shots differ from one another, {LEAST_STAYS} are needed: move the body through "
                 "the view"
             )
-        if before:
-            change = _Change.of(rig, new, body, before, (watch, sums), noise_px)
-            noise_px *= change.noise
-            free = free_directions(rig)
-            new, cov = rig.perturbed(free @ change.f), rig.cov + free @ change.cov @ free.T
-            continue
-        L, so_far = watch.prior, np.zeros(len(sums.b))
-        so_far[:count] = _difference(rig, new)
-        whole = L @ np.linalg.solve(L.T @ sums.H @ L + np.eye(len(L)), L.T)
-        step = whole @ (sums.b + sums.H @ so_far)
-        noise_px *= float(np.sqrt(_left(sums, step - so_far) / max(sums.freedom, 1.0)))
-        new, cov = rig.perturbed(step[:count]), whole[:count, :count]
-    new = replace(new, cov=(cov + cov.T) / 2)
+        new, noise = _estimated(rig, new, body, before, sums, noise_px)
+        noise_px *= noise
     some = shots[:: -(-len(shots) // _SIZED)]
     now, then = (_position_sigma(each, body, some) for each in (new, replace(new, cov=rig.cov)))
     return _checked(rig, new, body, found, (stays, (now, then)))
@@ -164,48 +154,33 @@ def contradiction(rig: StereoRig, body: Body, missed: Sequence[PoseEstimate], sh
     return make_finding("contradicted", (float(off_px), float(high - low) / 2.0), words={"shown": shown})
 
 
-@dataclass(frozen=True, eq=False)
-class _Change(Record):
-    """A change of the right camera's pose.
+def _estimated(
+    rig: StereoRig, new: StereoRig, body: Body, before: Sequence[SeenShot], later: ResidualSums, noise_px: float
+) -> tuple[StereoRig, float]:
+    """Estimate the right camera's pose again, from shots before its change and the sums of those after it, about ``new``.
 
-    Attributes:
-        f: (5,) translation across the baseline (2), m, and rotation (3), rad, of the right camera.
-        cov: (5, 5) its covariance.
-        noise: standard deviation of the residuals over the one that they were whitened with.
+    Returns:
+        The rig, and by how much the standard deviation of its residuals is larger than the one they were whitened with.
     """
-
-    f: Array
-    cov: Array
-    noise: float
-
-    @classmethod
-    def of(
-        cls,
-        rig: StereoRig,
-        new: StereoRig,
-        body: Body,
-        before: Sequence[SeenShot],
-        after: tuple[RigWatch, ResidualSums],
-        noise_px: float,
-    ) -> _Change:
-        """Estimate the change from shots before it, and the sums of those after it, which are about a rig ``new``."""
-        watch, later = RigWatch(replace(rig, sigma_px=noise_px), body, 0.0), after[1]
-        measured = [measure_seen(rig, body, shot) for shot in before]
-        sooner, _ = watch.information([each for each in measured if isinstance(each, PoseEstimate)])
-        count, size = rig.parameter_count, len(later.b)
-        F = np.zeros((size, 5))
-        F[:count] = free_directions(rig)
-        so_far = F.T[:, :count] @ _difference(rig, new)
-        HF, b = later.H @ F, later.b + later.H @ (F @ so_far)
-        H = np.block([[sooner.H + later.H, HF], [HF.T, F.T @ HF]])
-        M = np.zeros((size + 5, size + 5))
-        M[:size, :size], M[size:, size:] = watch.prior, np.diag(_FREED)
-        cov = M @ np.linalg.solve(M.T @ H @ M + np.eye(size + 5), M.T)
-        found = cov @ np.concatenate([sooner.b + b, F.T @ b])
-        x, f = found[:size], found[size:]
-        left = _left(sooner, x) + _left(later, x + F @ (f - so_far))
-        noise = float(np.sqrt(left / max(sooner.freedom + later.freedom, 1.0)))
-        return cls(f, (cov[size:, size:] + cov[size:, size:].T) / 2, noise)
+    watch = RigWatch(replace(rig, sigma_px=noise_px), body, 0.0)
+    measured = [measure_seen(rig, body, shot) for shot in before]
+    sooner, _ = watch.information([each for each in measured if isinstance(each, PoseEstimate)])
+    count, size = rig.parameter_count, len(later.b)
+    F, so_far = np.zeros((size, 5)), np.zeros(size)
+    F[:count], so_far[:count] = free_directions(rig), _difference(rig, new)
+    HF, b = later.H @ F, later.b + later.H @ so_far
+    H = np.block([[sooner.H + later.H, HF], [HF.T, F.T @ HF]])
+    M = np.zeros((size + 5, size + 5))
+    M[:size, :size], M[size:, size:] = watch.prior, np.diag(_FREED)
+    cov = M @ np.linalg.solve(M.T @ H @ M + np.eye(size + 5), M.T)
+    found = cov @ np.concatenate([sooner.b + b, F.T @ b])
+    x, f = found[:size], found[size:]
+    left = _left(sooner, x) + _left(later, x + F @ f - so_far)
+    # Poses stay in the frame in which they were before, where it is known: then the change alone moves the rig.
+    B = np.hstack([np.zeros((size, size)) if before else np.eye(size), F])[:count]
+    spread = B @ cov @ B.T + (rig.cov if before else 0.0)
+    moved = replace(rig.perturbed(B @ found), cov=(spread + spread.T) / 2)
+    return moved, float(np.sqrt(left / max(sooner.freedom + later.freedom, 1.0)))
 
 
 def _left(sums: ResidualSums, x: Array) -> float:
@@ -251,11 +226,6 @@ def _checked(
         len(found),
         *said,
     )
-
-
-def _prior(rig: StereoRig) -> Array:
-    free = free_directions(rig)
-    return np.asarray(rig.cov + (free * _FREED**2) @ free.T)
 
 
 def _difference(old: StereoRig, new: StereoRig) -> Array:
