@@ -154,6 +154,9 @@ def test_grey_of_every_kind_of_image():
     np.testing.assert_array_equal(grey(GREY), GREY)
     np.testing.assert_array_equal(grey(GREY[:, :, None]), GREY)
     np.testing.assert_array_equal(grey(GREY.astype(np.uint16) * 257), GREY)
+    for bits in (10, 12, 14, 16):  # of a converter, at the low end
+        deep = np.arange(1 << bits, dtype=np.uint16)[None]
+        np.testing.assert_array_equal(grey(deep), np.rint(deep * (255 / (2**bits - 1))))
     expected = cv2.cvtColor(COLOUR, cv2.COLOR_BGR2GRAY)
     np.testing.assert_array_equal(grey(COLOUR), expected)
     np.testing.assert_array_equal(grey(np.dstack([COLOUR, GREY])), expected)

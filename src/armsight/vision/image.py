@@ -182,8 +182,8 @@ def one_image(left: Image, right: Image) -> bool:
 def grey(image: Image) -> NDArray[np.uint8]:
     """Convert an image, (H, W), (H, W, 1), (H, W, 3) BGR or (H, W, 4) BGRA, uint8 or uint16, to 8-bit grey (H, W).
 
-    16 bits are scaled by 1/257. The result is always read-only: for compiled functions read-only and writable arrays
-    are two types, and each type is compiled separately. InputError: another shape or type.
+    uint16 is scaled as :func:`eight_bits`. The result is always read-only: for compiled functions read-only and writable
+    arrays are two types, and each type is compiled separately. InputError: another shape or type.
     """
     if image.dtype not in (np.uint8, np.uint16) or image.ndim not in (2, 3) or 0 in image.shape:
         raise InputError(f"an image must be (H, W) or (H, W, 3), 8 or 16 bits; got {image.shape} of {image.dtype}")
@@ -191,8 +191,17 @@ def grey(image: Image) -> NDArray[np.uint8]:
         raise InputError(f"an image has 1 (grey), 3 (BGR) or 4 (BGRA) channels, got {image.shape[2]}")
     if image.ndim == 3:
         image = image[:, :, 0] if image.shape[2] == 1 else cv2.cvtColor(image[:, :, :3].copy(), cv2.COLOR_BGR2GRAY)
-    if image.dtype == np.uint16:
-        image = np.rint(image / 257.0).astype(np.uint8)
-    out = np.ascontiguousarray(image).view()
+    out = np.ascontiguousarray(eight_bits(image)).view()
     out.flags.writeable = False
     return out
+
+
+def eight_bits(image: Image) -> NDArray[np.uint8]:
+    """Return an image, uint8 or uint16, as uint8, scaled from the least of 10, 12, 14 and 16 bits that hold its pixels.
+
+    Converters of fewer than 16 bits leave the high ones empty (GenICam's PFNC: Mono12), and the file does not say so.
+    """
+    if image.dtype == np.uint8:
+        return image
+    full = next((1 << bits) - 1 for bits in (10, 12, 14, 16) if not int(image.max()) >> bits)
+    return np.rint(image * (255.0 / full)).astype(np.uint8)

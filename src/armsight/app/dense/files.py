@@ -17,6 +17,7 @@ from armsight.vision.dense.depth import Depth, depth_of
 from armsight.vision.dense.evaluate import TrueDisparity
 from armsight.vision.dense.method import FILLED, MEASURED, NOTHING, OCCLUDED, Disparity
 from armsight.vision.dense.middlebury import write_pfm
+from armsight.vision.image import eight_bits
 from armsight.vision.rectify import Rectification
 
 #: Width of the scale, of the space for its numbers, and height of the caption, px.
@@ -203,6 +204,7 @@ def write_cloud(path: Path, form: Rectification, result: Disparity, depth: Depth
     header = ["ply", "format binary_little_endian 1.0", "comment frame: left camera; x y z in m"]
     header += ["comment sigma: standard deviation of the depth, m", f"element vertex {count}"]
     header += [f"property {kinds[kind]} {name}" for name, kind in _FIELDS]
+    image = eight_bits(image)
     with replacing(path, "wb") as file:
         file.write(("\n".join([*header, "end_header"]) + "\n").encode())
         for top in range(0, chosen.shape[0], _ROWS_AT_ONCE):
@@ -218,8 +220,6 @@ def _vertices(
     v += strip.start
     p_left = form.points(np.column_stack([u, v]).astype(np.float64), result.disparity[v, u].astype(np.float64))
     colours = image[v, u] if image.ndim == 3 else np.repeat(image[v, u][:, None], 3, axis=1)
-    if colours.dtype == np.uint16:
-        colours = colours >> 8
     rows = np.empty(len(u), np.dtype(_FIELDS))
     for k, name in enumerate("xyz"):
         rows[name] = p_left[:, k]
