@@ -163,6 +163,14 @@ _SAID = {
 }
 
 
+class _LeftOut:
+    def __repr__(self) -> str:
+        return "..."
+
+
+_LEFT_OUT = _LeftOut()  # what help shows of a default that is a function
+
+
 def _in_python(function: Callable[..., Any], name: str) -> Callable[..., Any]:
     """Return a function by its public name, whose errors name arguments where the command line's name options."""
 
@@ -181,7 +189,9 @@ def _in_python(function: Callable[..., Any], name: str) -> Callable[..., Any]:
     call.__module__, call.__name__, call.__qualname__ = __name__, name, name  # where pickle finds it
     shown = importlib.import_module("inspect").signature(function)
     given = list(shown.parameters.values())
-    plain = [each.replace(default=...) if isinstance(each.default, types.FunctionType) else each for each in given]
+    plain = [
+        each.replace(default=_LEFT_OUT) if isinstance(each.default, types.FunctionType) else each for each in given
+    ]
     call.__signature__ = shown.replace(parameters=plain)  # type: ignore[attr-defined]  # help shows no lambda
     return call
 

@@ -86,6 +86,15 @@ def _too_large(path: str | Path, size: int, most_mb: float) -> str:
     return f"{path}: has {size / _MB:.0f} MB, such a file at most {most_mb:.0f} MB: is it the right one?"
 
 
+@contextlib.contextmanager
+def as_input_error(problem: str) -> Iterator[None]:
+    """Raise an InputError instead of an OSError of the block: ``problem``, and why."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(f"{problem}: {error.strerror}") from None
+
+
 def check_readable(path: str | Path, most_mb: float | None = None) -> str:
     """Return the name of an ordinary file for a library that opens it by itself; errors as :func:`opened`."""
     opened(path, most_mb).close()
@@ -94,12 +103,9 @@ def check_readable(path: str | Path, most_mb: float | None = None) -> str:
 
 def read_bytes(path: str | Path, most_mb: float = DOCUMENT_MB) -> bytes:
     """Read a whole file; errors as :func:`opened`."""
-    with opened(path, most_mb) as file:
-        try:
-            pieces = iter(lambda: file.read(_MB) or b"", b"")  # some files of the system have no size, and no end
-            data = b"".join(itertools.islice(pieces, int(most_mb) + 1))
-        except OSError as error:
-            raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    with opened(path, most_mb) as file, as_input_error(f"{path}: cannot be read"):
+        pieces = iter(lambda: file.read(_MB) or b"", b"")  # some files of the system have no size, and no end
+        data = b"".join(itertools.islice(pieces, int(most_mb) + 1))
     if len(data) > most_mb * _MB:
         raise InputError(_too_large(path, len(data), most_mb))
     return data
@@ -403,6 +409,20 @@ def write_text(path: str | Path, text: str) -> None:
         file.write(text)
 
 
+def made_folder(folder: Path, problem: str = "cannot be made a folder") -> Path:
+    """Make a folder with those above it, if it is not there, and return it; InputError: ``problem``, and why."""
+    with as_input_error(f"{folder}: {problem}"):
+        folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+def table_text(names: Iterable[object], rows: Iterable[Iterable[object]] = ()) -> str:
+    """Return a table as CSV, a line each; None is an empty cell."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows([names, *rows])
+    return text.getvalue()
+
+
 class RowFile:
     """A CSV being written: a row is in the file, whole, once it is added, and nothing of one that failed."""
 
@@ -422,17 +442,11 @@ class RowFile:
                 target.unlink()
             raise
 
-    @contextlib.contextmanager
-    def _named(self) -> Iterator[None]:
-        try:
-            yield
-        except OSError as error:
-            raise InputError(f"{self.path}: cannot be written: {error.strerror}") from None
+    def _named(self) -> contextlib.AbstractContextManager[None]:
+        return as_input_error(f"{self.path}: cannot be written")
 
     def _append(self, cells: Sequence[object]) -> None:
-        text = io.StringIO()
-        csv.writer(text, lineterminator="\n").writerow(cells)
-        data = text.getvalue().encode(errors="backslashreplace")
+        data = table_text(cells).encode(errors="backslashreplace")
         with self._named():
             try:
                 if os.write(self._file, data) < len(data):
@@ -495,12 +509,10 @@ def check_writable(path: str | Path, *, apart_from: Iterable[str | Path | None] 
         raise InputError(f"{path}: cannot be written: no permission to write in {folder}")
     if os.path.exists(target) and not os.access(target, os.W_OK):
         raise InputError(f"{path}: cannot be written: it is read-only")
-    try:
+    with as_input_error(f"{path}: cannot be written"):
         with contextlib.suppress(FileNotFoundError):
             os.lstat(_beside(target))  # a name that is too long
         try_writing(folder)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror}") from None
 
 
 def unused(path: Path) -> Path:

@@ -158,7 +158,8 @@ def _run(arguments: list[str], at_exit: list[Callable[[int, str], None]]) -> tup
         if isinstance(error.__context__, EOFError):
             click.echo(err=True)  # the question stands in this line
             return 2, f"{UNANSWERED}, or with --yes where there is one"
-        click.echo("armsight: interrupted", err=True)
+        answered_no = isinstance(error, click.exceptions.Abort) and error.__context__ is None
+        click.echo("armsight: the answer is no: not done" if answered_no else "armsight: interrupted", err=True)
         return 130, ""
     except click.exceptions.NoArgsIsHelpError as error:  # a group by itself: its help
         error.show()

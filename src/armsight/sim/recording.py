@@ -19,7 +19,7 @@ import numpy as np
 
 from armsight.data import SIDES, Array, Image, Record
 from armsight.errors import InputError
-from armsight.files import read_json, replacing, write_text
+from armsight.files import made_folder, read_json, replacing, write_text
 from armsight.geometry.check import checked
 from armsight.sim.render.background import BACKGROUNDS
 from armsight.sim.render.optics import Optics, Sensor
@@ -100,11 +100,7 @@ def record(
     ``twists`` (N, 6): velocity of the target in its own axes at each shot, for its blur; ``threads``: how many shots
     are rendered at once, which the images do not depend on.
     """
-    folder, look = Path(folder), look or Look()
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be made: {error.strerror}") from None
+    folder, look = made_folder(Path(folder)), look or Look()
     twists = np.zeros((len(truth.shots), 6)) if twists is None else twists
     wall, *seeds = np.random.SeedSequence(seed).spawn(1 + len(truth.shots))
     rng = np.random.default_rng(wall)

@@ -19,7 +19,7 @@ class FakeBoard:
     """Reads twice, with what it is given as faults, and is then gone; its clock begins at 0 with each."""
 
     def __init__(self, faults=()):
-        self.status, self.joints = SimpleNamespace(faults=faults), SimpleNamespace(temperature_c=np.array([31.0]))
+        self.status = SimpleNamespace(faults=faults)
         self.reads, self.closed = 0, False
 
     def receive(self, wait_s):
@@ -52,7 +52,6 @@ def test_a_lost_board_is_opened_again_and_each_loss_is_said_once(monkeypatch):
     monkeypatch.setattr(readings, "_PAUSE_S", 0.001)
     data, lines, began = [], [], time.monotonic()
     board = BoardReadings("feetech:/dev/none")
-    assert board.temperatures_c() is None
     board.start(data.append, lines.append)
     assert done.wait(20)
     board.close()

@@ -117,7 +117,7 @@ def test_a_board_that_is_lost_and_back_is_said_once(tmp_path):
     says(**SHOT)
     log("board: connected", "info")
     says(kind="joints", t_s=[1.0, 1.1], q_rad=[[0.0] * 5] * 2)
-    assert (served.state()["healthy"], served.state()["reading_age_s"] < 5) == (True, True)
+    assert served.state()["healthy"]
     assert (served.values()["board_up"], served.values()["readings_total"]) == (1, 2)
     for _ in range(2):
         log("board: arm: no such port; trying again", "error")
@@ -133,13 +133,6 @@ def test_a_board_that_is_lost_and_back_is_said_once(tmp_path):
     assert (said.count("no such port"), said.count("joint 2: hot")) == (1, 1)
     served._hear("board: joint 2: hot")  # the child's own line of what it published
     assert (tmp_path / "log").read_text() == said
-
-
-def test_a_board_without_readings_is_no_healthy_one(tmp_path):
-    served = Service(ServeConfig(("--board=feetech:arm",), tmp_path, http="", log="log", stale_s=0.01), print)
-    served._take(json.dumps(SHOT).encode())
-    time.sleep(0.02)
-    assert served.state()["why"] == "board: no reading for 0.01 s"
 
 
 def fetch(port, path):

@@ -58,7 +58,8 @@ def _text(value: float | tuple[float, float] | None, digits: int = 3) -> str:
     if not isinstance(value, tuple):
         return f"{value:.{digits}f}"
     sigma = f"± {value[1]:.{digits}f}"
-    return f"{value[0]:.{digits}f} {sigma}" if determined(value) else f"not determined ({sigma})"
+    shown = determined(value) or not float(sigma[2:])  # a sigma of 0.000 determines a value of 0.000
+    return f"{value[0]:.{digits}f} {sigma}" if shown else f"not determined ({sigma})"
 
 
 def determined(value: tuple[float, float] | None) -> bool:
@@ -117,15 +118,17 @@ def remarks(report: ArmReport) -> list[str]:
 
 
 def _map_figure(report: ArmReport, figure: FigureBase) -> None:
-    size = 1e3 * np.linalg.norm(report.off, axis=1)
-    enlarged = 0.08 * float(np.ptp(report.at[:, :2], axis=0).max()) / max(float(np.quantile(size, 0.9)) / 1e3, 1e-9)
+    at, off = 1e3 * report.at, 1e3 * report.off
+    size = np.linalg.norm(off, axis=1)
+    enlarged = 0.08 * float(np.ptp(at[:, :2], axis=0).max()) / max(float(np.quantile(size, 0.9)), 1e-6)
     both = figure.subplots(1, 2)
     for axes, (i, k), title in zip(both, ((0, 1), (0, 2)), ("from above", "from the side"), strict=True):
-        shown = axes.scatter(report.at[:, i], report.at[:, k], c=size, s=18, cmap="viridis", vmin=0)
+        shown = axes.scatter(at[:, i], at[:, k], c=size, s=18, cmap="viridis", vmin=0)
         axes.margins(0.15)
         axes.set_aspect("equal", adjustable="datalim")
-        arrows(axes, report.at[:, [i, k]], 1e3 * report.off[:, [i, k]], enlarged / 1e3, INK, 0.003, "mm", 0.05)
-        axes.set(title=f"error, {title}", xlabel="x, m", ylabel=f"{'xyz'[k]}, m")
+        axes.locator_params(nbins=5)
+        arrows(axes, at[:, [i, k]], off[:, [i, k]], enlarged, INK, 0.003, "mm", 0.05)
+        axes.set(title=f"error, {title}", xlabel="x, mm", ylabel=f"{'xyz'[k]}, mm")
     figure.colorbar(shown, ax=both, label="mm", shrink=0.8)
 
 
@@ -181,7 +184,7 @@ _PAGE = 13.0  # height of a page of the PDF, inches
 def arm_report(report: ArmReport, others: Mapping[str, dict[str, Any]]) -> Report:
     """Return what a run shows of an arm; ``others`` are the JSON objects of other arms by their names."""
     heading = f"{report.arm}: {report.accuracy_mm[0]:.2f} mm RMS, {report.placed_mm:.2f} with another base and tool"
-    sub = f"{report.poses} poses, {report.rests} rests in {60 * report.hours:.0f} min; controller: {report.board}"
+    sub = f"{report.poses} poses, {report.rests} rests in {60 * report.hours:.2g} min; controller: {report.board}"
     plots = [Plot(name, partial(_figure, report, name), caption, caption) for name, (caption, *_) in _FIGURES.items()]
     sections: dict[str, Section] = {
         "figures": ("In numbers", tables(report, others)),

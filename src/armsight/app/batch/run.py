@@ -23,7 +23,16 @@ from armsight import __version__
 from armsight.app.batch.work import BatchOptions, Done, work
 from armsight.app.progress import bar
 from armsight.errors import InputError
-from armsight.files import alone_in, check_folder, parsed_json, read_bytes, read_text, replacing, write_text
+from armsight.files import (
+    alone_in,
+    check_folder,
+    made_folder,
+    parsed_json,
+    read_bytes,
+    read_text,
+    replacing,
+    write_text,
+)
 from armsight.robot.arm_file import open_arm
 from armsight.vision.markers.targets import open_body, open_target
 from armsight.vision.sources import open_rig
@@ -155,11 +164,7 @@ def run_batch(batch: Batch, say: Callable[[str], None]) -> BatchDone:
 
 def _run_batch(batch: Batch, paths: dict[str, str], say: Callable[[str], None]) -> BatchDone:
     """Run a batch whose folder is checked."""
-    parts = batch.output / PARTS
-    try:
-        parts.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{parts}: cannot be written: {error.strerror}") from None
+    parts = made_folder(batch.output / PARTS)
     keys = _keys(paths, batch.options)
     left = [path for path in paths if not (parts / keys[path]).is_file()]
     failed: dict[str, Done] = {}

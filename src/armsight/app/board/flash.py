@@ -15,7 +15,7 @@ from shutil import which
 
 from armsight import firmware
 from armsight.errors import DeviceError, InputError
-from armsight.files import check_folder, read_text, replacing
+from armsight.files import check_folder, made_folder, read_text, replacing
 from armsight.firmware import build
 from armsight.firmware.elf import read_elf
 
@@ -48,11 +48,7 @@ def build_firmware(board: str, folder: Path, compiler: str | None = None) -> Bui
     if board not in build.boards():
         raise InputError(f"no board {board!r}; there are {', '.join(build.boards())}")
     check_folder(folder, problem="cannot be made a folder of firmware")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be made: {error.strerror}") from None
-    image = build.build_board(board, folder / f"{board}.elf", chosen)
+    image = build.build_board(board, made_folder(folder) / f"{board}.elf", chosen)
     elf = read_elf(image)
     pieces = []
     for segment in elf.segments:

@@ -14,8 +14,8 @@ import numpy as np
 
 from armsight.app.board.command import open_any
 from armsight.app.options import BOARD
-from armsight.data import Array, JointStates
-from armsight.errors import ArmsightError, DeviceError
+from armsight.data import JointStates
+from armsight.errors import DeviceError
 from armsight.loop.running.data import Datum, JointsDatum, NoteDatum
 from armsight.loop.running.setup import HostClock
 from armsight.robot.board_registry import check_board, is_real
@@ -25,8 +25,6 @@ from armsight.robot.boards.contract import MotionBoard
 _BATCH_S = 0.1
 #: s, first and longest pause before a lost board is opened again; half: more tries, double: it is back later.
 _PAUSE_S, _LONGEST_S = 0.25, 2.0
-#: s, that closing waits for an answer of the board; half: a slow port stays open, double: the end is later.
-_END_S = 1.0
 
 
 class BoardReadings:
@@ -41,7 +39,6 @@ class BoardReadings:
             check_board(name)
         self._name, self._ended = name, threading.Event()
         self._thread = threading.Thread(target=self._run, name="board", daemon=True)
-        self._board: MotionBoard | None = None
         self._newest_s, self._faults, self._lost = -np.inf, tuple[str, ...](), False
 
     def start(self, put: Callable[[Datum], None], say: Callable[[str], None]) -> None:
@@ -49,24 +46,19 @@ class BoardReadings:
         self._put, self._say = put, say
         self._thread.start()
 
-    def temperatures_c(self) -> Array | None:
-        """Return those of the motors (n,), degrees Celsius; None where nothing measures them now."""
-        return None if (board := self._board) is None else board.joints.temperature_c
-
     def _run(self) -> None:
         pause_s = 0.0
         while not self._ended.wait(pause_s):
             pause_s = min(max(2 * pause_s, _PAUSE_S), _LONGEST_S)
             try:
-                with open_any(self._name) as self._board:
+                with open_any(self._name) as board:
                     self._lost, pause_s = False, _PAUSE_S
                     self._note("connected", "info")
-                    self._read(self._board)
-            except ArmsightError as error:
+                    self._read(board)
+            except Exception as error:  # noqa: BLE001 - nobody else watches this thread; the board is read again
                 if not self._lost:
                     self._note(f"{error}; trying again", "error")
                 self._lost = True
-            self._board = None
 
     def _read(self, board: MotionBoard) -> None:
         """Publish what a board reads until the end; its readings are on the clock of live cameras."""
@@ -92,4 +84,4 @@ class BoardReadings:
         """Stop reading, and close the port."""
         self._ended.set()
         if self._thread.is_alive():
-            self._thread.join(_END_S)
+            self._thread.join(1.0)  # it may be waiting for an answer of the board

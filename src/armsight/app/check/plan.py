@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import tempfile
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -17,7 +15,7 @@ from armsight.app.check import CYCLES, DRIFT_CYCLES, REQUIRED_CYCLES
 from armsight.app.run.motion_file import read_motions
 from armsight.data import Array
 from armsight.errors import InputError
-from armsight.files import read_json, write_text
+from armsight.files import read_json, table_text, write_text
 from armsight.geometry.check import checked
 from armsight.geometry.pose import inverse, pose, transform
 from armsight.geometry.rotation import quaternion_wxyz
@@ -179,13 +177,12 @@ def _motion(kind: str, name: str, keys: Mapping[str, Any]) -> str:
 
 def plan_csv(plan: CheckPlan) -> str:
     """Return the poses as CSV, for an arm that another program moves: joint angles and the commanded pose."""
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
     names = [f"command_{n}" for n in ("x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")]
-    writer.writerow(["pose", *(f"q{i + 1}_rad" for i in range(plan.q.shape[1])), *names])
-    for name, q, T in zip(plan.names, plan.q, plan.Ts_base_tool, strict=True):
-        writer.writerow([name, *(f"{v:.9f}" for v in (*q, *T[:3, 3], *quaternion_wxyz(T[:3, :3])))])
-    return out.getvalue()
+    rows = (
+        [name, *(f"{v:.9f}" for v in (*q, *T[:3, 3], *quaternion_wxyz(T[:3, :3])))]
+        for name, q, T in zip(plan.names, plan.q, plan.Ts_base_tool, strict=True)
+    )
+    return table_text(["pose", *(f"q{i + 1}_rad" for i in range(plan.q.shape[1])), *names], rows)
 
 
 def plan_json(test: PlannedTest) -> dict[str, object]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -12,6 +10,7 @@ import numpy as np
 
 from armsight.data import Array, Record
 from armsight.errors import InputError
+from armsight.files import table_text
 from armsight.geometry.pose import pose
 from armsight.geometry.rotation import from_quaternion_wxyz, quaternion_wxyz
 from armsight.tables.cells import read_columns
@@ -158,14 +157,12 @@ def first_few(notes: list[str], what: str) -> list[str]:
 
 def rows_csv(rows: list[Row]) -> str:
     """Return rows as the CSV that they can be read from again; of a covariance its diagonal."""
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(_COLUMNS)
+    out = []
     for row in rows:
         entries = [row.test, row.pose, row.cycle, row.approach, "" if row.t_s is None else f"{row.t_s:.6f}"]
         numbers: list[float | None] = []
         for T, known in ((row.T, row.measured_rotation), (row.T_command, row.commanded_rotation)):
             numbers += [*T[:3, 3], *(quaternion_wxyz(T[:3, :3]) if known else [None] * len(_QUATERNION))]
         numbers += [*np.sqrt(np.diag(row.cov)), *np.sqrt(np.diag(row.cov_common))]
-        writer.writerow(entries + ["" if number is None else f"{number:.9f}" for number in numbers])
-    return out.getvalue()
+        out.append(entries + ["" if number is None else f"{number:.9f}" for number in numbers])
+    return table_text(_COLUMNS, out)

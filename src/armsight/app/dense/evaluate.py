@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from armsight.app.dense.files import make_folder, paint_disparity, paint_errors, write_png
+from armsight.app.dense.files import paint_disparity, paint_errors, write_png
 from armsight.app.show.encode import json_of
-from armsight.files import write_text
+from armsight.files import made_folder, write_text
 from armsight.vision.dense import open_method
 from armsight.vision.dense.evaluate import DisparityErrors, evaluate_disparity
 from armsight.vision.dense.middlebury import MiddleburyScene
@@ -68,7 +68,7 @@ def evaluate_scene(scene: MiddleburyScene, name: str, out: Path | None) -> Scene
     result = method.match(left, right, scene.search)
     seconds = time.perf_counter() - begun
     if out is not None:
-        make_folder(out)
+        made_folder(out)
         write_png(out / f"{scene.name}_{name}_errors.png", paint_errors(result.disparity, truth))
         write_png(out / f"{scene.name}_{name}.png", paint_disparity(result))
     sure = result.measured & truth.seen & truth.known

@@ -170,15 +170,6 @@ class DenseSummary:
         return document
 
 
-def make_folder(path: Path) -> Path:
-    """Make the folder of a result."""
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be made a folder: {error.strerror}") from None
-    return path
-
-
 def write_png(path: Path, image: Image) -> None:
     """Write an image as PNG; errors as :func:`armsight.files.replacing`."""
     good, data = cv2.imencode(".png", image)

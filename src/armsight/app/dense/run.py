@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from armsight.app.dense.files import DenseSummary, make_folder, write_png, write_result
+from armsight.app.dense.files import DenseSummary, write_png, write_result
 from armsight.data import Image, Shot
 from armsight.errors import InputError
+from armsight.files import made_folder
 from armsight.vision.dense.method import NOTHING, Disparity, Method, Search
 from armsight.vision.dense.middlebury import read_pfm, read_tiff
 from armsight.vision.dense.rectified import match_pair, plain_grey
@@ -126,7 +127,7 @@ def run_shot(
         where = shot.name if form is None else f"{shot.name}, rectified by the rig"
         raise InputError(f"{where}: {error}") from None
     seconds = time.perf_counter() - begun
-    make_folder(folder)
+    made_folder(folder)
     if form is not None:
         result = _in_view(result, form)
         write_png(folder / "left.png", left)

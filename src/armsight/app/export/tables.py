@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +9,7 @@ from armsight.app.replay.recorded import RecordedRun
 from armsight.app.replay.tables import Cell, Table, live_table
 from armsight.app.run.tracks import NAMES, require_pyarrow
 from armsight.errors import InputError
-from armsight.files import replacing, write_text
+from armsight.files import made_folder, replacing, table_text, write_text
 from armsight.loop.running.data import JointsDatum, ShotDatum
 from armsight.vision.pose.shot_pose import UPPER
 
@@ -79,12 +77,8 @@ def write_csv(run: RecordedRun, folder: Path) -> list[Path]:
     """Write a CSV a table; return the files."""
     files = []
     for name, (header, rows) in _some(run, tables_of(run)).items():
-        output = io.StringIO()
-        writer = csv.writer(output, lineterminator="\n")
-        writer.writerow(header)
-        writer.writerows([["" if cell is None else cell for cell in row] for row in rows])
-        files.append(_file(folder, f"{name}.csv"))
-        write_text(files[-1], output.getvalue())
+        files.append(made_folder(folder) / f"{name}.csv")
+        write_text(files[-1], table_text(header, rows))
     return files
 
 
@@ -103,7 +97,7 @@ def write_parquet(run: RecordedRun, folder: Path) -> list[Path]:
         if track.is_file() and track.stem not in found:
             found[track.stem] = read_csv(track)
     for name, table in found.items():
-        files.append(_file(folder, f"{name}.parquet"))
+        files.append(made_folder(folder) / f"{name}.parquet")
         with replacing(files[-1], "wb") as file:
             parquet.write_table(table, file)
     return files
@@ -117,7 +111,7 @@ def write_tum(run: RecordedRun, folder: Path) -> list[Path]:
         at = [header.index(key) for key in ("t_s", "x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")]
         lines = [" ".join(repr(row[k]) for k in at) for row in rows if all(row[k] is not None for k in at)]
         if lines:
-            files.append(_file(folder, {"poses": "body.tum", "live": "tool.tum"}[name]))
+            files.append(made_folder(folder) / {"poses": "body.tum", "live": "tool.tum"}[name])
             write_text(files[-1], "\n".join(lines) + "\n")
     if not files:
         raise InputError(f"{run.path}: holds no pose with a time")
@@ -129,11 +123,3 @@ def _some(run: RecordedRun, tables: dict[str, Table]) -> dict[str, Table]:
     if not tables:
         raise InputError(f"{run.path}: holds no shot and no joint reading")
     return tables
-
-
-def _file(folder: Path, name: str) -> Path:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be written: {error.strerror}") from None
-    return folder / name

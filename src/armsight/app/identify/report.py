@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Callable, Sequence
 from itertools import groupby
 from pathlib import Path
@@ -19,7 +17,7 @@ from armsight.app.show.plotting import BLUE, INK, MUTED, ORANGE, new_figure, pan
 from armsight.app.show.report import Block, Fact, Grade, Html, Lines, Report, Text, figures
 from armsight.app.show.table import TextTable, plain_text
 from armsight.data import Array
-from armsight.files import write_text
+from armsight.files import table_text, write_text
 from armsight.loop.identify.backlash import JointBacklash, joint_backlashes
 from armsight.loop.identify.corrected import Corrected, zeros_text
 from armsight.loop.identify.identify import contributions, value_text
@@ -314,14 +312,11 @@ def _values(run: Identification) -> dict[str, Any]:
 def write_results(run: Identification, report: Report, out: Path) -> None:
     """Write the corrected arm, the board's zeros, the parameters and the summary into a folder."""
     out.mkdir(parents=True, exist_ok=True)
-    corrected, parameters = Corrected.of(run.found), io.StringIO()
-    writer = csv.writer(parameters, lineterminator="\n")
-    writer.writerow(ParameterRow._fields)
-    writer.writerows(["" if value is None else value for value in row] for row in parameter_rows(run))
+    corrected = Corrected.of(run.found)
     corrected.save(out / "corrected.toml")
     write_text(out / "corrected.urdf", corrected.urdf())
     write_text(out / "zeros.toml", zeros_text(run.found))
-    write_text(out / "parameters.csv", parameters.getvalue())
+    write_text(out / "parameters.csv", table_text(ParameterRow._fields, parameter_rows(run)))
     write_text(out / "identify.json", report.json_text())
 
 

@@ -22,7 +22,7 @@ from armsight.app.stream.mcap_file import LazyMcap, properties
 from armsight.app.stream.streams import open_streams
 from armsight.data import Array, Body, Missed, PoseEstimate, Shot
 from armsight.errors import InputError
-from armsight.files import RowFile
+from armsight.files import RowFile, made_folder
 from armsight.geometry.pose import adjoint, inverse, left_axes, transform
 from armsight.geometry.rotation import euler_zyx, skew
 from armsight.loop.handeye.pivot import MIN_POSES, Pivot, calibrate_pivot
@@ -139,10 +139,7 @@ class _PoseFile:
             number += 1
             path = folder / f"poses-{number}.csv"
         self.path, self.body = path, body
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(f"{path}: cannot be written: {error.strerror}") from None
+        made_folder(folder)
         self._file = RowFile(path, CSV_COLUMNS)
         published = Published(rig, body, None, properties(rig, None, command="live"))
         self._mcap = LazyMcap(folder, published, say, path.with_suffix(".mcap").name)

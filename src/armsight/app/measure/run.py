@@ -76,10 +76,10 @@ def measure_shots(options: MeasureOptions) -> tuple[HealthFinding, ...]:
         if view is not None:
             stack.callback(lambda: view.finish([*run.records]))
         stack.callback(run.close)
-        board = None if options.board is None else BoardReadings(options.board)
-        publisher = stack.enter_context(contextlib.closing(_streams(options.stream, rig, shots.body, board)))
-        if board is not None:
-            stack.enter_context(contextlib.closing(board)).start(publisher.put, lambda line: click.echo(line, err=True))
+        publisher = stack.enter_context(contextlib.closing(_streams(options.stream, rig, shots.body)))
+        if options.board is not None:
+            board = stack.enter_context(contextlib.closing(BoardReadings(options.board)))
+            board.start(publisher.put, lambda line: click.echo(line, err=True))
         missed = _Contradicting(rig, shots.body, shots.again)
         try:
             run.measure(_watched(rig, fixed, missed.keeping(shots.results), run.monitor), publisher)
@@ -388,13 +388,12 @@ def _watched(
         yield result
 
 
-def _streams(specs: Sequence[str], rig: StereoRig, body: Body, board: BoardReadings | None) -> Publisher:
+def _streams(specs: Sequence[str], rig: StereoRig, body: Body) -> Publisher:
     if not specs:
         return Fanout()
     from armsight.app.stream.streams import open_streams
 
-    celsius = None if board is None else board.temperatures_c
-    published = Published(rig, body, properties={"command": "measure"}, temperatures_c=celsius)
+    published = Published(rig, body, properties={"command": "measure"})
     return open_streams(specs, published, lambda line: click.echo(line, err=True))
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from armsight.app.interrupts import uninterrupted
 from armsight.data import SIDES, Shot
 from armsight.errors import ArmsightError, InputError
-from armsight.files import RowFile, check_folder, replacing
+from armsight.files import RowFile, check_folder, made_folder, replacing
 from armsight.vision.source import Source
 from armsight.vision.sources.folder import COLUMNS, INDEX
 
@@ -149,9 +149,5 @@ class ShotFolder:
     def _opened(self) -> RowFile:
         """Return the open index; make folder and index the first time."""
         if self._index is None:
-            try:
-                self.folder.mkdir(parents=True, exist_ok=True)
-            except OSError as error:
-                raise InputError(f"{self.folder}: no recording can be made here: {error.strerror}") from None
-            self._index = RowFile(self.folder / INDEX, COLUMNS)
+            self._index = RowFile(made_folder(self.folder, "no recording can be made here") / INDEX, COLUMNS)
         return self._index

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +12,7 @@ import numpy as np
 from armsight.app.replay.run import Replayed
 from armsight.data import Array
 from armsight.errors import InputError
-from armsight.files import write_text
+from armsight.files import table_text, write_text
 from armsight.tables.columns import Columns
 from armsight.tables.lengths import number
 from armsight.vision.pose.shot_pose import UPPER, rows_of
@@ -51,15 +49,10 @@ def write_tables(folder: Path, replayed: Replayed) -> None:
         rows = [
             row + ["" if angle != angle else angle for angle in at] for row, at in zip(rows, q.tolist(), strict=True)
         ]
-    _write(folder / POSES, names, rows)
+    write_text(folder / POSES, table_text(names, rows))
     if replayed.live:
-        _write(folder / LIVE, *live_table(datum.to_json(replayed.body) for datum in replayed.live))
-
-
-def _write(path: Path, header: Sequence[str], rows: Sequence[Sequence[Cell]]) -> None:
-    output = io.StringIO()
-    csv.writer(output, lineterminator="\n").writerows([header, *rows])
-    write_text(path, output.getvalue())
+        live = live_table(datum.to_json(replayed.body) for datum in replayed.live)
+        write_text(folder / LIVE, table_text(*live))
 
 
 @dataclass(frozen=True)

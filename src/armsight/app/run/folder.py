@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import csv
-import io
 import json
 import os
 import shutil
@@ -41,7 +40,7 @@ from armsight.app.stream.mcap_file import REFERENCES, RUN_MCAP, LazyMcap, proper
 from armsight.app.stream.streams import open_streams
 from armsight.data import Array, Image, PoseEstimate, Shot
 from armsight.errors import ArmsightError, InputError
-from armsight.files import alone_in, check_folder, replacing, write_text
+from armsight.files import alone_in, as_input_error, check_folder, replacing, table_text, write_text
 from armsight.geometry.pose import left_axes
 from armsight.geometry.rotation import quaternion_wxyz
 from armsight.loop.estimators import Mounting
@@ -245,11 +244,7 @@ def write_handeye(folder: Path, run: HandEyeRun, corrected: Sequence[tuple[float
     named |= {f"q{axis}": quaternions[:, i] for i, axis in enumerate("wxyz")}
     named |= {f"cov_{i}{j}": np.array([cov[i, j] for cov in covs]) for i, j in UPPER}
     named |= {f"approach{i + 1}": run.approach[:, i].astype(int) for i in range(run.q.shape[1])}
-    output = io.StringIO()
-    writer = csv.writer(output, lineterminator="\n")
-    writer.writerow(named)
-    writer.writerows(zip(*named.values(), strict=True))
-    write_text(folder / "handeye_poses.csv", output.getvalue())
+    write_text(folder / "handeye_poses.csv", table_text(named, zip(*named.values(), strict=True)))
 
 
 def write_shots(folder: Path, shots: Sequence[Shot]) -> None:
@@ -267,16 +262,14 @@ def write_shots(folder: Path, shots: Sequence[Shot]) -> None:
 
     if not shots:
         return
-    try:
-        with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as temporary:
-            stored = record(Kept(), Path(temporary) / folder.name)
-            if stored.interrupted:
-                raise KeyboardInterrupt
-            if stored.stopped is not None:
-                raise InputError(stored.stopped.replace(str(stored.directory), str(folder)))
-            os.replace(stored.directory, folder)
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be written: {error.strerror}") from None
+    written, prefix = as_input_error(f"{folder}: cannot be written"), f".{folder.name}."
+    with written, tempfile.TemporaryDirectory(prefix=prefix, dir=folder.parent) as temporary:
+        stored = record(Kept(), Path(temporary) / folder.name)
+        if stored.interrupted:
+            raise KeyboardInterrupt
+        if stored.stopped is not None:
+            raise InputError(stored.stopped.replace(str(stored.directory), str(folder)))
+        os.replace(stored.directory, folder)
 
 
 @contextlib.contextmanager

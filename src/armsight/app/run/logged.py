@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,6 +17,7 @@ from armsight.app.show.plotting import BLUE, new_figure
 from armsight.app.show.report import Lines, Report, figures
 from armsight.data import Array, Missed, PoseEstimate, Record
 from armsight.errors import CalibrationError, InputError
+from armsight.files import table_text
 from armsight.geometry.pose import inverse
 from armsight.loop.handeye.handeye import TRUSTED_M, TRUSTED_RAD, HandEye, calibrate_handeye, require_known
 from armsight.loop.identify.measured import Measured
@@ -180,15 +179,12 @@ def write_logged(folder: Path, result: LoggedRun, properties: dict[str, str]) ->
     """Write the files of a run without motion and return its summary."""
     summary = {**properties, **result.to_json()}
     write_handeye(folder, result.run)
-    output = io.StringIO()
-    writer = csv.writer(output, lineterminator="\n")
-    writer.writerow(["shot", *(f"q{k + 1}_deg" for k in range(result.run.q.shape[1])), "error_mm", "error_deg", "used"])
-    rows = zip(
+    names = ["shot", *(f"q{k + 1}_deg" for k in range(result.run.q.shape[1])), "error_mm", "error_deg", "used"]
+    each = zip(
         result.names, np.degrees(result.run.q), result.error_mm, result.error_deg, result.run.found.used, strict=True
     )
-    for name, q, mm, deg, used in rows:
-        writer.writerow([name, *np.round(q, 4), _rounded(mm), _rounded(deg), int(used)])
-    files = {"errors.csv": output.getvalue(), "summary.json": json.dumps(summary, indent=1) + "\n"}
+    rows = ([name, *np.round(q, 4), _rounded(mm), _rounded(deg), int(used)] for name, q, mm, deg, used in each)
+    files = {"errors.csv": table_text(names, rows), "summary.json": json.dumps(summary, indent=1) + "\n"}
     _report(result, summary).write(folder, files)
     return summary
 

@@ -53,10 +53,9 @@ METRICS = {
     "latency_seconds": ("gauge", "time from the newest exposure to its pose"),
     "sigma_metres": ("gauge", "standard deviation of the newest position, root sum of squares of its axes"),
     "process_resident_bytes": ("gauge", "memory of the process that measures"),
-    "board_up": ("gauge", "1 while the board's joint readings arrive"),
+    "board_up": ("gauge", "1 while the board is read"),
     "readings_total": ("counter", "joint readings of the board since the service began"),
     "board_losses_total": ("counter", "times that the board was lost"),
-    "reading_age_seconds": ("gauge", "time since the newest joint reading arrived"),
 }
 
 
@@ -74,10 +73,8 @@ class Service:
         self._why, self._tries = "starting", 0
         self._counts = {"shots_total": 0.0, "missed_total": 0.0, "losses_total": 0.0}
         self._values: dict[str, float] = {}
-        self._board = any(each.startswith("--board=") for each in config.arguments)
-        self._read = self._began  # when the newest joint readings came
         self._board_lost: tuple[float, str] | None = None  # since when, and why
-        if self._board:
+        if any(each.startswith("--board=") for each in config.arguments):
             self._counts |= {"readings_total": 0.0, "board_losses_total": 0.0}
 
     def run(self) -> int:
@@ -116,31 +113,22 @@ class Service:
     def state(self) -> dict[str, Any]:
         """Return what /healthz shows."""
         now = time.monotonic()
-        lost, board = self._lost_since, self._board_why(now)
+        lost, board = self._lost_since, None if self._board_lost is None else self._board_lost[1]
         return {
             "healthy": not self._why and board is None,
             "why": self._why or board,
             "for_s": round(now - (self._began if lost is None else lost), 1),
             "shot_age_s": round(now - self._newest, 2) if self._counts["shots_total"] else None,
             "tries": self._tries,
-            "reading_age_s": round(now - self._read, 2) if self._board else None,
         }
-
-    def _board_why(self, now: float) -> str | None:
-        """Return why no joint readings arrive; None where they do, or no board is watched."""
-        if self._board_lost is not None:
-            return self._board_lost[1]
-        silent = self._board and now - self._read > self._config.stale_s
-        return f"{BOARD}no reading for {self._config.stale_s:g} s" if silent else None
 
     def values(self) -> dict[str, float]:
         """Return what /metrics shows."""
         found = {"up": float(not self._why), **self._counts, **self._values}
         if self._counts["shots_total"]:
             found["shot_age_seconds"] = time.monotonic() - self._newest
-        if self._board:
-            now = time.monotonic()
-            found |= {"board_up": float(self._board_why(now) is None), "reading_age_seconds": now - self._read}
+        if "readings_total" in self._counts:
+            found["board_up"] = float(self._board_lost is None)
         if (child := self._child) is not None:
             with suppress(OSError, IndexError):
                 pages = int(Path(f"/proc/{child.pid}/statm").read_text().split()[1])
@@ -195,8 +183,7 @@ class Service:
         """Take one published datum; what is none, from whoever sends to the port, is passed over."""
         try:
             datum = json.loads(datagram)
-            if datum["kind"] == "joints" and self._board:
-                self._read = time.monotonic()
+            if datum["kind"] == "joints":
                 self._counts["readings_total"] += len(datum["t_s"])
             if datum["kind"] == "log" and datum["text"].startswith(BOARD):
                 self._said_of_board(datum["text"], datum["level"])

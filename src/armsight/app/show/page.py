@@ -12,8 +12,8 @@ from armsight.app.show.plotting import plain
 from armsight.errors import InputError
 from armsight.files import replacing, try_writing
 
-#: A number, with its sigma or its unit.
-_NUMBER = re.compile(r"[-+\u2212]?\d[\d.,]*(?: \u00b1 [\d.,]+)?(?: ?[%a-z\u00b0/]{1,5})?")
+#: A number, with its sigma or its unit; or the dash where there is none.
+_NUMBER = re.compile(r"\u2013|[-+\u2212]?\d[\d.,]*(?: \u00b1 [\d.,]+)?(?: ?[%a-z\u00b0/]{1,5})?")
 #: Before a sigma, and what keeps the two in one line.
 PLUS_MINUS, NEVER_APART = "\u00b1 ", "\u00b1\u00a0"
 #: Name of the page in the folder of every report.
@@ -58,6 +58,7 @@ figcaption p { margin: .3rem 0; }
     background: linear-gradient(to left, var(--back) 50%, transparent) right / 2rem 100% no-repeat local,
     linear-gradient(to left, var(--line), transparent) right / .8rem 100% no-repeat scroll; }  /* more to the right */
   th, td { overflow-wrap: break-word; padding-right: .7rem; } td:not(.number) { min-width: 7rem; }
+  thead th:not(:empty) { min-width: 5rem; }
   td:last-child:not(.number):not(:empty) { min-width: 20rem; }
   table.provenance td { min-width: 0 !important; overflow-wrap: anywhere; } table.headline { font-size: .78rem; }
   table.headline tr { display: flex; flex-wrap: wrap; } table.headline tr > * { border: 0; flex: 1; min-width: 0;

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import csv
 import importlib
 import io
 import logging
@@ -15,6 +14,7 @@ import numpy as np
 
 from armsight.data import Array
 from armsight.errors import InputError
+from armsight.files import table_text
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -118,9 +118,7 @@ def data_csv(figure: Figure) -> bytes:
     ``y`` of the point, end of the bar or foot of the arrow, the titles of both axes, and ``value``: a point's or a cell's
     on the colour scale, or ``u`` and ``v`` of an arrow as it is drawn.
     """
-    output = io.StringIO()
-    writer = csv.writer(output, lineterminator="\n")
-    writer.writerow(("panel", "title", "series", "x", "y", "value", "u", "v", "x axis", "y axis"))
+    rows = []
     for panel, axes in enumerate(figure.axes, 1):
         if axes.get_label() == "<colorbar>":
             continue
@@ -129,10 +127,10 @@ def data_csv(figure: Figure) -> bytes:
             ends = axes.get_xlabel(), axes.get_ylabel()
             for row in zip(*(np.asarray(c, float).ravel() for c in columns), strict=True):
                 cells = ["" if np.isnan(v) else f"{v:.8g}" for v in row]
-                writer.writerow(
-                    (panel, axes.get_title("left") or axes.get_title(), label, *cells, *[""] * (5 - len(cells)), *ends)
-                )
-    return output.getvalue().encode()
+                title = axes.get_title("left") or axes.get_title()
+                rows.append((panel, title, label, *cells, *[""] * (5 - len(cells)), *ends))
+    names = ("panel", "title", "series", "x", "y", "value", "u", "v", "x axis", "y axis")
+    return table_text(names, rows).encode()
 
 
 def _series(axes: Axes) -> Iterator[tuple[str, tuple[Any, ...]]]:

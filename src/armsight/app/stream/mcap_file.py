@@ -27,6 +27,7 @@ from armsight.app.stream.ros import IMU, IMU_KIND, IMU_SCHEMA, imu_messages
 from armsight.app.stream.sink import Sink
 from armsight.data import Shot
 from armsight.errors import InputError
+from armsight.files import as_input_error
 from armsight.loop.running.data import Datum, EventDatum, JointsDatum, NoteDatum, ShotDatum
 from armsight.processes import Process
 from armsight.robot.kinematics.arm import Arm
@@ -65,10 +66,8 @@ class McapSink(Sink):
         super().__init__(wakes=_WAKES)
         self.path = path
         self._published, self._messages = published, Messages(published)
-        try:
+        with as_input_error(f"{path}: cannot be written"):
             self._file: IO[bytes] = path.open("xb")
-        except OSError as error:
-            raise InputError(f"{path}: cannot be written: {error.strerror}") from None
         self._writer = McapWriter(self._file, "armsight")
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
@@ -218,11 +217,9 @@ class LazyMcap:
             except InputError as error:
                 self._say(f"note: no run.mcap is written: {error}")
                 return
-            try:
+            with as_input_error(f"{self._path}: cannot be written"):
                 self._path.parent.mkdir(parents=True, exist_ok=True)
                 self._path.unlink(missing_ok=True)
-            except OSError as error:
-                raise InputError(f"{self._path}: cannot be written: {error.strerror}") from None
             self.sink = self._writes(self._path, self._published)
             self.sink.start()
         if self.sink is not None:

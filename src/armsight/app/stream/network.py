@@ -16,6 +16,7 @@ from typing import Any
 from armsight.app.stream.datum import Published, json_text
 from armsight.app.stream.sink import Sink
 from armsight.errors import InputError
+from armsight.files import as_input_error
 from armsight.loop.running.data import Datum, EventDatum, JointsDatum, NoteDatum, ShotDatum
 
 #: Lines that may wait for one reader.
@@ -46,10 +47,8 @@ def host_and_port(spec: str, what: str, *, host: str) -> tuple[str, int]:
 
 def listening(host: str, port: int, what: str) -> socket.socket:
     """Return a socket that listens."""
-    try:
+    with as_input_error(f"--stream {what}:{port}: cannot listen there"):
         return socket.create_server((host, port))
-    except OSError as error:
-        raise InputError(f"--stream {what}:{port}: cannot listen there: {error.strerror}") from None
 
 
 class _Connected:

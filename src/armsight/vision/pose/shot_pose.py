@@ -13,9 +13,7 @@ way round, as roll (about x), pitch, yaw (about z).
 
 from __future__ import annotations
 
-import csv
 import importlib
-import io
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -27,7 +25,7 @@ import numpy as np
 
 from armsight.data import Array, Body, Dropped, Missed, PoseEstimate, SeenPose
 from armsight.errors import InputError
-from armsight.files import write_text
+from armsight.files import table_text, write_text
 from armsight.geometry.pose import left_axes, pose
 from armsight.geometry.rotation import euler_zyx, from_quaternion_wxyz, quaternion_wxyz
 from armsight.plots import new_figure
@@ -219,10 +217,7 @@ def rows_of(poses: Sequence[ShotPose]) -> tuple[tuple[str, ...], list[list[Any]]
 
 def csv_text(poses: Sequence[ShotPose]) -> str:
     """Return the CSV of many shots."""
-    output = io.StringIO()
-    columns, rows = rows_of(poses)
-    csv.writer(output, lineterminator="\n").writerows([columns, *rows])
-    return output.getvalue()
+    return table_text(*rows_of(poses))
 
 
 @dataclass(frozen=True, repr=False)
