@@ -539,6 +539,17 @@ def test_kalibr_says_what_it_leaves_behind(tmp_path):
     assert "left behind: rostopic" in rig.provenance["notes"]
 
 
+def test_a_chain_of_more_than_ten_cameras_is_in_the_order_of_its_numbers(tmp_path):
+    step = np.eye(4)
+    step[0, 3] = -0.1
+    (path,) = camchain(tmp_path)
+    camera = yaml.safe_load(path.read_text())["cam1"] | {"T_cn_cnm1": step.tolist()}
+    [path] = camchain(tmp_path, cam1=camera, more={f"cam{k}": camera for k in range(2, 12)})
+    assert list(yaml.safe_load(path.read_text()))[2:5] == ["cam10", "cam11", "cam2"]  # as Kalibr writes it
+    for pair, baseline_m in ((("cam0", "cam2"), 0.2), (("cam2", "cam11"), 0.9)):
+        assert import_rig(None, [path], pair=pair).baseline_m == pytest.approx(baseline_m)
+
+
 @pytest.mark.parametrize(
     ("changes", "said"),
     [

@@ -14,6 +14,7 @@ import numpy as np
 
 from armsight.data import Array
 from armsight.errors import InputError
+from armsight.files import natural_key
 from armsight.geometry.check import checked
 from armsight.geometry.pose import inverse
 from armsight.tables.document import Foreign, dump_yaml
@@ -46,7 +47,7 @@ def _entries(documents: Sequence[Document]) -> dict[str, Mapping[str, Foreign]]:
         return {}
     return {
         str(name): entry
-        for name, entry in documents[0].items()
+        for name, entry in sorted(documents[0].items(), key=lambda one: natural_key(one[0]))  # cam2 stands behind cam10
         if str(name)[-1:].isdigit() and str(name).startswith("cam") and isinstance(entry, Mapping)
     }
 

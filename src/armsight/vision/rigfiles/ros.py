@@ -51,7 +51,7 @@ def recognises(documents: Sequence[Document]) -> bool:
     """Say whether every file has a camera's matrix and its projection, in files' or messages' names."""
     return all(
         is_camera(document) and found(document, _NAMES["projection_matrix"]) is not None for document in documents
-    ) or all(_rows(document) is not None for document in documents)
+    ) or all(document.get("P") is not None for document in documents)
 
 
 def read(documents: Sequence[Document], paths: Sequence[Path], options: ImportOptions) -> StereoRig:
@@ -115,11 +115,6 @@ def write(rig: StereoRig, paths: Sequence[Path]) -> tuple[str, ...]:
         )
     write_together(paths, [dump_yaml(document) for document in documents])
     return tuple(lost)
-
-
-def _rows(document: Document) -> Document | None:
-    """Return the numbers of P by itself, where a document has a projection and no matrix of the raw camera."""
-    return document if found(document, _NAMES["projection_matrix"]) is not None and "P" in document else None
 
 
 def _read_one(document: Document, options: ImportOptions) -> tuple[Camera, Array, list[str]]:
