@@ -13,7 +13,6 @@ from pathlib import Path
 import click
 import numpy as np
 
-from armsight.app.board.readings import BoardReadings
 from armsight.app.measure.command import MeasureOptions
 from armsight.app.measure.moving import Requested, requested_shutters
 from armsight.app.measure.picture import SINGULAR
@@ -78,6 +77,8 @@ def measure_shots(options: MeasureOptions) -> tuple[HealthFinding, ...]:
         stack.callback(run.close)
         publisher = stack.enter_context(contextlib.closing(_streams(options.stream, rig, shots.body)))
         if options.board is not None:
+            from armsight.app.board.readings import BoardReadings  # not above: a pair of images needs no board
+
             board = stack.enter_context(contextlib.closing(BoardReadings(options.board)))
             board.start(publisher.put, lambda line: click.echo(line, err=True))
         missed = _Contradicting(rig, shots.body, shots.again)
