@@ -47,6 +47,8 @@ def command(arm: str, source: str | None, board: str | None, begin: int | None, 
     walk = SetupWalk.open(arm, begin, simulate)
     if not simulate:
         walk.words |= words_of(source, board)
+    else:
+        click.echo("simulated: what a person does in a step is done by a program", err=True)
     result: dict[str, Any] = {"arm": arm, "folder": str(Path.cwd()), "steps": []}
     code = INTERRUPTED
     stdout = contextlib.redirect_stdout(sys.stderr) if as_json else contextlib.nullcontext()  # what commands print

@@ -100,7 +100,7 @@ class SetupWalk:
             if step.command in self.done:
                 say(f"{number} of {len(steps)} {row['state']}: {row['command']}")
                 continue
-            say(f"\n{number} of {len(steps)}{' (simulated)' if self.simulated else ''}: {step.say}")
+            say(f"\n{number} of {len(steps)}: {step.say}")
             possible = self.find(step, say)
             if PLATE in self.typed(step) and not Path(PLATE).exists():  # outside of a checkout
                 Path(PLATE).parent.mkdir(exist_ok=True)
