@@ -156,7 +156,8 @@ def broken(library, seed, table, kind, hurt, *, moving, load=0.6, brake=0.0, sto
     limit = float(arm.core.config.joint[joint].speed_limit_rad_s)
     begun, late, asleep, fast, stopped_at = arm.ticks, None, None, 0.0, None
     way = None
-    for _ in range(round(1500 / PERIOD_TICKS) if stop_ms is None else 300):
+    look_ms = 1200 if stop_ms is not None else 4000 if moving else 1500  # in motion both ways
+    for _ in range(round(look_ms / PERIOD_TICKS)):
         ms = arm.ticks - begun
         if stop_ms is not None and stopped_at is None and ms >= stop_ms:
             arm.inputs.stop_pressed, stopped_at = 1, arm.plant.link[joint]

@@ -28,6 +28,16 @@
                          half: other motors are never learnt, double: wrong scales are */
 #define TEACHES 1.5f /* as much as one that is off by so many; half: a winding that warms is followed too late, double:
                         a drift is followed */
+#define KNOWN_TICKS 1000u /* so often what was learnt is kept; half: a weak motor is learnt before it shows, double: a young arm shows
+                            it later */
+#define LATELY_S 1.5f /* what says what the constant is now fades so; half: slow joints show nothing, double: a weak motor shows
+                         later */
+#define LATELY_WARMS 0.02f /* per s, of R: so fast a winding may warm or cool meanwhile; half: warm windings are weak motors, double:
+                              weak motors show later */
+#define LATELY_LEFT 0.8f /* variances of a window's noise that a constant may leave; half: weak motors show later, double: readings
+                            that lag are weak motors */
+#define WEAKENED 0.1f /* of the configured constant, and SIGMAS: so much less is a weak motor; half: other motors are weak, double:
+                         motors that lost a quarter are not seen */
 #define SAMPLE_TICKS 8u /* between samples; half: ticks cost more, double: faults are named later */
 #define AGREED 4.0f /* of apart_rad: so much way together proves that wiring and scale are right; half: noise proves
                        it, double: joints are careful for longer */
@@ -142,30 +152,29 @@ static float window_noise(motor_state *motor, const motor_config *config, float 
     return WINDOW_NOISE_RAD + crossed * config->backlash_rad + twist_rad + motor->uneven * number_size(way_rad);
 }
 
-/* Learn both scales from a window: v = r (R i) + k (K w), by recursive least squares (Kalman's form). */
-static void learn(motor_state *motor, const motor_config *config, float angle_rad, float noise_rad, bool rests)
+/* Learn both scales from the last window: v = r (R i) + k (K w), by recursive least squares (Kalman's form). */
+static void learn(motor_state *motor, const motor_config *config)
 {
-    const float ticks = (float)motor->window_ticks;
-    const float per_tick = 1.0f / ticks;
+    const bool moved = motor->window_side != SIDE_UNKNOWN;
+    const float ticks = (float)motor->mean_ticks;
     const float wander = WANDER_VARIANCE * ticks;
     if (motor->variance_rr < WARM_VARIANCE) { /* also where nothing is learnt; a temperature that rises is no random walk */
         const float sigma = number_root(motor->variance_rr) + WARMS * ticks;
         motor->variance_rr = sigma * sigma;
         motor->unsure_per_a = SIGMAS * sigma * config->resistance_ohm / config->constant_v_s;
     }
-    const float per_s = (float)TICKS_PER_S * per_tick;
-    const float ir_v = motor->window_ir_v * per_tick;
-    const float kw_v = config->constant_v_s * (angle_rad - motor->window_rad) * per_s;
-    const float noise_v = config->constant_v_s * noise_rad * per_s;
+    const float ir_v = motor->mean_ir_v;
+    const float kw_v = motor->mean_kw_v;
+    const float noise_v = motor->mean_noise_v;
     /* What a joint that rests hides in its backlash goes with the current: all such windows err alike, and one says what
      * many do. */
-    if (rests && motor->variance_rr * ir_v * ir_v < noise_v * noise_v) {
+    if (!moved && motor->variance_rr * ir_v * ir_v < noise_v * noise_v) {
         return;
     }
     const float gain_r = motor->variance_rr * ir_v + motor->variance_rk * kw_v;
     const float gain_k = motor->variance_rk * ir_v + motor->variance_kk * kw_v;
     const float variance = ir_v * gain_r + kw_v * gain_k + noise_v * noise_v;
-    const float seen_v = motor->window_v * per_tick - motor->resistance_scale * ir_v - motor->constant_scale * kw_v;
+    const float seen_v = motor->mean_v - motor->resistance_scale * ir_v - motor->constant_scale * kw_v;
     const float sigma_v = number_root(variance);
     if (motor->trust != 1.0f && number_size(seen_v) > SURPRISE * sigma_v) {
         return;
@@ -174,13 +183,106 @@ static void learn(motor_state *motor, const motor_config *config, float angle_ra
     const float per_variance = 1.0f / variance;
     motor->resistance_scale =
         number_clamp(motor->resistance_scale + gain_r * off_v * per_variance, SCALE_LOW, SCALE_HIGH);
-    if (number_size(angle_rad - motor->window_rad) > WINDOW_WAY_RAD) { /* else the constant is only taken into account */
+    if (moved) { /* else the constant is only taken into account */
         motor->constant_scale = /* (Schmidt's form) */
             number_clamp(motor->constant_scale + gain_k * off_v * per_variance, CONSTANT_LOW, CONSTANT_HIGH);
         motor->variance_kk += wander - gain_k * gain_k * per_variance;
     }
     motor->variance_rr -= gain_r * gain_r * per_variance;
     motor->variance_rk -= gain_r * gain_k * per_variance;
+}
+
+/* Take the means of a window. */
+static void mean(motor_state *motor, const motor_config *config, float way_rad, float noise_rad)
+{
+    const float per_tick = 1.0f / (float)motor->window_ticks;
+    const float emf_v = config->constant_v_s * (float)TICKS_PER_S * per_tick;
+    motor->mean_v = motor->window_v * per_tick;
+    motor->mean_ir_v = motor->window_ir_v * per_tick;
+    motor->mean_kw_v = emf_v * way_rad;
+    motor->mean_noise_v = emf_v * noise_rad;
+    motor->mean_ticks = motor->window_ticks;
+}
+
+/* Return the faults of a motor whose constant is less than it was. One that was learnt down to its bound is none: motor and reading
+ * may never have agreed. */
+static uint32_t weak_parts(const motor_state *motor, bool agreed)
+{
+    const bool sure = agreed && motor->constant_scale > CONSTANT_LOW;
+    return FAULT_BIT(FAULT_MOTOR) | (sure ? 0u : FAULT_BIT(FAULT_POT_SCALE));
+}
+
+/* Look whether the constant is less than it was: not behind a spring, on which a joint swings while dry friction holds its motor. */
+static void weakened(motor_state *motor)
+{
+    const float rr = motor->lately_rr + 1.0f / WARM_VARIANCE;
+    const float rv = motor->lately_rv + motor->resistance_scale / WARM_VARIANCE;
+    const float ttr = motor->lately_ttr + 1.0f / (LATELY_WARMS * LATELY_WARMS);
+    const float per_square = 1.0f / (rr * ttr - motor->lately_tr * motor->lately_tr);
+    const float by_r = (ttr * motor->lately_rk - motor->lately_tr * motor->lately_tk) * per_square;
+    const float by_tr = (rr * motor->lately_tk - motor->lately_tr * motor->lately_rk) * per_square;
+    const float kk = motor->lately_kk - by_r * motor->lately_rk - by_tr * motor->lately_tk;
+    const float kv = motor->lately_kv - by_r * rv - by_tr * motor->lately_tv;
+    const uint32_t oldest = motor->known > MOTOR_KNOWN ? motor->known % MOTOR_KNOWN : 0u;
+    const float by_rv = (ttr * rv - motor->lately_tr * motor->lately_tv) * per_square;
+    const float by_tv = (rr * motor->lately_tv - motor->lately_tr * rv) * per_square;
+    const float left = motor->lately_vv + motor->resistance_scale * motor->resistance_scale / WARM_VARIANCE - by_rv * rv -
+                       by_tv * motor->lately_tv - kv * kv / kk;
+    if (left > LATELY_LEFT * motor->lately_n) {
+        return; /* it is none: a reading that lags looks slower, too, but follows no constant */
+    }
+    const float constant = kv / kk + 2.0f * motor->uneven;
+    const float sigma = number_root(1.0f / kk + motor->known_kk[oldest]);
+    if (motor->known_k[oldest] - WEAKENED - constant > SIGMAS * sigma ||
+        CONSTANT_LOW - 0.5f * WEAKENED - constant > SIGMAS * number_root(1.0f / kk)) {
+        motor->weakened = weak_parts(motor, motor->known > MOTOR_KNOWN);
+    }
+}
+
+/* Take the last window, if in motion, into what the constant is of late, by least squares beside a resistance that changes
+ * steadily: v = (r + s t) R i + k K w. A motion either way shows it, however slow; an offset, a winding that warms and a reading
+ * that drifts err one way in one direction, the other in the other. */
+static void lately(motor_state *motor)
+{
+    const float seconds = (float)motor->mean_ticks * TICK_S;
+    const float keeps = 1.0f - seconds / LATELY_S;
+    const bool moved = motor->window_side != SIDE_UNKNOWN && motor->heard_rad_s > 0.0f;
+    const float weight = moved ? 1.0f / (motor->mean_noise_v * motor->mean_noise_v) : 0.0f;
+    const float weight_r = weight * motor->mean_ir_v;
+    const float weight_k = weight * motor->mean_kw_v;
+    motor->mean_ticks = 0u;
+    motor->lately_ttr = keeps * (motor->lately_ttr - seconds * (2.0f * motor->lately_tr - seconds * motor->lately_rr));
+    motor->lately_tr = keeps * (motor->lately_tr - seconds * motor->lately_rr); /* the newest is at 0 s */
+    motor->lately_tk = keeps * (motor->lately_tk - seconds * motor->lately_rk);
+    motor->lately_tv = keeps * (motor->lately_tv - seconds * motor->lately_rv);
+    motor->lately_rr = keeps * motor->lately_rr + weight_r * motor->mean_ir_v;
+    motor->lately_rk = keeps * motor->lately_rk + weight_r * motor->mean_kw_v;
+    motor->lately_kk = keeps * motor->lately_kk + weight_k * motor->mean_kw_v;
+    motor->lately_rv = keeps * motor->lately_rv + weight_r * motor->mean_v;
+    motor->lately_kv = keeps * motor->lately_kv + weight_k * motor->mean_v;
+    motor->lately_vv = keeps * motor->lately_vv + weight * motor->mean_v * motor->mean_v;
+    motor->lately_n = keeps * motor->lately_n + (moved ? 1.0f : 0.0f);
+    if (motor->driven_ticks >= (motor->known + 1u) * KNOWN_TICKS) {
+        motor->known_k[motor->known % MOTOR_KNOWN] = motor->constant_scale;
+        motor->known_kk[motor->known % MOTOR_KNOWN] = motor->variance_kk;
+        motor->known++;
+    }
+    motor->weakened = 0u;
+    if (moved && motor->trust == 1.0f && motor->known != 0u && motor->twist_rad_per_a == 0.0f) {
+        weakened(motor);
+    }
+}
+
+/* Take the last window: learn from it in the sample after it, compare with what was learnt in the next. */
+static void take(motor_state *motor, const motor_config *config)
+{
+    if (motor->window_ticks > SAMPLE_TICKS) {
+        lately(motor);
+        return;
+    }
+    if (motor->mean_teaches != 0u) {
+        learn(motor, config);
+    }
 }
 
 static void window_begin(motor_state *motor, float angle_rad)
@@ -198,6 +300,9 @@ static void window(motor_state *motor, const motor_config *config, float angle_r
     motor->window_ir_v += motor->part_a * config->resistance_ohm;
     motor->window_ticks += motor->driven_ticks - motor->part_ticks;
     if (motor->window_ticks < WINDOW_TICKS) {
+        if (motor->mean_ticks != 0u) { /* the last one, shared among samples: no tick is long */
+            take(motor, config);
+        }
         return;
     }
     const float way_rad = angle_rad - motor->window_rad;
@@ -205,13 +310,13 @@ static void window(motor_state *motor, const motor_config *config, float angle_r
         return;
     }
     const float noise_rad = window_noise(motor, config, way_rad);
+    mean(motor, config, way_rad, noise_rad);
     if (motor->trust != 1.0f) {
         earn(motor, config, way_rad);
     }
     /* A gap that R and K may explain must be learnt from: else they would stay wrong for good. */
-    if (motor->heard_rad_s > 0.0f && number_size(motor->gap_rad) < 0.5f * config->apart_rad + motor_explains(motor)) {
-        learn(motor, config, angle_rad, noise_rad, motor->window_side == SIDE_UNKNOWN);
-    }
+    const float explained_rad = 0.5f * config->apart_rad + motor_explains(motor);
+    motor->mean_teaches = motor->heard_rad_s > 0.0f && number_size(motor->gap_rad) < explained_rad ? 1u : 0u;
     window_begin(motor, angle_rad);
 }
 
@@ -243,6 +348,7 @@ static void sample_limited(motor_state *motor, const motor_config *config, float
     motor->part_v = number_clamp(asked_v, low_v, high_v);
     motor->dither_vv = motor->dither_va = motor->dither_aa = motor->dithers = 0.0f; /* what changed is not known */
     motor->window_side = SIDE_UNKNOWN; /* backlash may be crossed meanwhile */
+    motor->mean_ticks = 0u;
     motor->limited = 0u;
 }
 
@@ -642,12 +748,10 @@ uint32_t motor_names(const motor_state *motor, const motor_config *config, uint3
     }
     const bool drifts = number_size(drift) * (float)count > 4.0f * NAME_NOISE_RAD;
     const uint32_t drifting = FAULT_BIT(drifts ? FAULT_POT_DRIFT : suspect);
-    /* A constant that was learnt down to its bound is none: they may never have agreed. */
-    const uint32_t sharing = FAULT_BIT(share < 0.15f  ? FAULT_POT_FROZEN
-                                       : !agreed      ? FAULT_POT_SCALE
-                                       : share < 1.0f ? FAULT_POT_SLIP
-                                                      : FAULT_MOTOR) |
-                             (share > 1.0f && motor->constant_scale <= CONSTANT_LOW ? FAULT_BIT(FAULT_POT_SCALE) : 0u);
+    const uint32_t sharing = share < 0.15f  ? FAULT_BIT(FAULT_POT_FROZEN)
+                             : !agreed      ? FAULT_BIT(FAULT_POT_SCALE)
+                             : share < 1.0f ? FAULT_BIT(FAULT_POT_SLIP)
+                                            : weak_parts(motor, true);
     return (by_drift < SAME_SHARE * by_share ? 0u : sharing) |
            (by_share < (agreed ? SAME_SHARE : 1.0f / SAME_SHARE) * by_drift ? 0u : drifting);
 }

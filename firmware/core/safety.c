@@ -256,11 +256,8 @@ static void blame(core_state *core, joint_state *joint, uint32_t fault, uint32_t
         rename_fault(core, i, core->first_fault, fault);
     }
     safety_raise(core, fault, i);
-    joint->suspect = fault;
-    if (fault == FAULT_BRIDGE) {
-        core->shorted = 0u;
-        joint->suspect = FAULT_NONE;
-    }
+    joint->suspect = fault == FAULT_CURRENT_SENSOR ? fault : FAULT_NONE;
+    core->shorted = fault == FAULT_BRIDGE ? 0u : core->shorted;
 }
 
 /* Hold a joint by its reading: its motor is no witness any more, until the drives were off. */
@@ -289,6 +286,11 @@ static void watch_motor(core_state *core, joint_state *joint, const joint_config
             safety_raise(core, fault, i);
             joint->suspect = fault;
         }
+    } else if (motor->weakened != 0u && !motor_answers_otherwise(motor, &config->motor)) {
+        doubt_motor(joint, config);
+        blame(core, joint, FAULT_MOTOR, i);
+        core->joint_faults[i] |= motor->weakened;
+        core->faults |= motor->weakened;
     }
 }
 

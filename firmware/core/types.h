@@ -366,6 +366,7 @@ typedef struct governor_state {
 } governor_state;
 
 #define MOTOR_SAMPLES 32u /* of a joint's last 256 ms */
+#define MOTOR_KNOWN 4u    /* in which a fault does not spoil what was learnt */
 
 /* What is remembered of one motor, watched by its own voltage and current. */
 typedef struct motor_state {
@@ -421,6 +422,27 @@ typedef struct motor_state {
     float window_ir_v;       /* what the configured resistance takes of it, */
     float window_rad;        /* the reading at its beginning */
     uint32_t window_ticks;
+    float mean_v;            /* means of the last whole window: applied voltage, */
+    float mean_ir_v;         /* what the configured resistance takes of it, */
+    float mean_kw_v;         /* the back-EMF by reading and configured constant, */
+    float mean_noise_v;      /* and what noise and backlash leave in that; */
+    uint32_t mean_ticks;     /* its length, 0 once it counts in what follows */
+    uint32_t mean_teaches;   /* not 0: motor and reading agreed as far as both scales may explain */
+    float lately_rr;         /* what windows in motion say of both scales of late: squares and product over noise, */
+    float lately_rk;
+    float lately_kk;
+    float lately_rv;         /* and their products with the voltage; */
+    float lately_kv;
+    float lately_vv;         /* squares of the voltage, */
+    float lately_n;          /* and how many windows they hold; */
+    float lately_tr;         /* the same by the time, s: square of R, */
+    float lately_ttr;        /* twice, */
+    float lately_tk;         /* its product with the constant, */
+    float lately_tv;         /* and with the voltage; all fade */
+    float known_k[MOTOR_KNOWN];  /* the constant's scale as it was learnt each KNOWN_TICKS of late, */
+    float known_kk[MOTOR_KNOWN]; /* and its variance */
+    uint32_t known;              /* how many of them there were */
+    uint32_t weakened;           /* the faults of a constant that by these is less than it was; 0: none */
     int32_t window_side;     /* which way the last one went, 1 or -1; 0: not known where in its backlash it ended */
     uint32_t sampled;        /* samples taken */
     float trust;             /* of the speed limit: what the joint may use; 1 once motor and reading went the same way */

@@ -130,6 +130,23 @@ def test_a_weak_motor_is_named_and_its_joint_held(motors, library):
     assert abs(arm.plant.link[joint] - arm.out[0]["reference_rad"][joint]) < 0.1
 
 
+@pytest.mark.parametrize("seed", [881012349, 881006238, 881021370])
+def test_a_weak_motor_of_a_slow_joint_under_load_shows_once_it_moved_either_way(motors, library, seed):
+    """Motor and reading are never far apart there: the winding's resistance may explain each stroke alone."""
+    arm = motors.drawn_arm(library, seed)
+    arm.enable()
+    joint = int(arm.rng.integers(6))
+    arm.rest(400)
+    motors.until_moving(arm, joint)
+    motors.weak(arm, joint)
+    for _ in range(100):
+        arm.swing(40, stop_at_fault=False)
+        assert abs(arm.plant.link[joint] - arm.out[0]["reference_rad"][joint]) < 0.1  # held, never released
+    assert arm.first[1] == joint
+    assert int(arm.out[0]["joint_faults"][joint]) & 1  # MOTOR, 32, has bit 0
+    assert arm.out[0]["drives_on"]
+
+
 @pytest.mark.parametrize(("seed", "joint", "share"), [(71003159, 0, 0.57), (71004323, 0, 0.65), (73001419, 2, 0.67)])
 def test_a_weak_motor_at_its_duty_limit_is_no_bridge(motors, library, seed, joint, share):
     """Its voltage stays as a stuck bridge's does, but its current follows the duty."""
