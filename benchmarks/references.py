@@ -28,7 +28,7 @@ from armsight.geometry.pose import exp_se3, inverse, log_se3, pose
 from armsight.geometry.rotation import exp_so3, from_quaternion_wxyz
 from armsight.loop.identify.gravity import gravity_shows
 from armsight.loop.references.calibrate import PosePath, calibrate
-from armsight.loop.references.file import INERTIAL_COLUMNS, Entry, written
+from armsight.loop.references.file import COLUMNS, Entry, written
 from armsight.loop.references.inertial import ACCELEROMETER, GYRO, INERTIAL_CLASSES, Inertial
 from armsight.loop.references.reference import STANDARD_GRAVITY_M_S2, Reading, ToolMotion
 from armsight.sim.references.inertial import InertialErrors, record
@@ -123,7 +123,7 @@ def said_and_read(kind: str, seed: int, truth: dict[str, np.ndarray], folder: Pa
         np.column_stack([t_s, z]),
         "%.9g",
         ",",
-        header=",".join(["t_s", *INERTIAL_COLUMNS]),
+        header=",".join(["t_s", *COLUMNS[Inertial]]),
         comments="",
     )
     # In the estimator's tool and base: the accelerometer's matrix is upper triangular in axes that are rotated a little.
@@ -140,7 +140,7 @@ def said_and_read(kind: str, seed: int, truth: dict[str, np.ndarray], folder: Pa
     late_s += np.sqrt(2.0) / (2 * np.pi * errors.bandwidth_hz) + rng.normal() * SWEPT_S
     sensor = replace(sensor, cov=np.diag(SWEPT**2), delay_s=late_s, sigma_delay_s=SWEPT_S)
     file = folder / "references.toml"
-    file.write_text(written(Entry(sensor, "inertial", kind, folder / "imu.csv", None, rate_hz, True), folder))
+    file.write_text(written(Entry(sensor, kind, folder / "imu.csv", None, rate_hz, True), folder))
     return file
 
 

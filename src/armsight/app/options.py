@@ -37,7 +37,7 @@ def output(metavar: str, text: str, *name: str, **attributes: Any) -> Callable[.
 
 def references_option() -> Callable[[_Command], _Command]:
     """Give a command ``--references``."""
-    said = "Fuse an inertial unit, too (docs/howto/references.md)."
+    said = "Fuse an inertial unit, or compare a magnetometer (docs/howto/references.md)."
     return click.option("--references", metavar="REFERENCES.toml", type=PATH, help=said)
 
 

@@ -12,13 +12,15 @@ from armsight.errors import InputError
 from armsight.geometry.pose import exp_se3, inverse, log_se3
 from armsight.geometry.rotation import quaternion_wxyz
 from armsight.loop.references.calibrate import PosePath
-from armsight.loop.references.file import INERTIAL_COLUMNS
+from armsight.loop.references.file import COLUMNS
+from armsight.loop.references.heading import Magnetometer
 from armsight.loop.references.inertial import Inertial
 from armsight.loop.references.reference import ToolMotion
 from armsight.robot.arm_file import open_arm
+from armsight.sim.references.heading import MagneticUnit
 from cli_runs import hold_keys, run, said_of
 
-HEAD = ["t_s", *INERTIAL_COLUMNS]
+HEAD = ["t_s", *COLUMNS[Inertial]]
 RATES = np.array([1.1, 1.7, 2.3, 0.9, 1.3, 1.9])
 
 
@@ -128,7 +130,7 @@ def test_a_sweep_that_rotates_the_tool_little_is_said(sweep, capsys, tmp_path, m
 @pytest.mark.parametrize(
     ("toml", "change", "said"),
     [
-        ("[imu]\nkind = 'compass'", None, r"\[imu\]: kind is 'compass'; known is inertial"),
+        ("[imu]\nkind = 'compass'", None, r"\[imu\]: kind is 'compass'; known are inertial, magnetometer"),
         ("[imu]\nkind = 'inertial'\nrate = 3", None, r"\[imu\]: unknown key 'rate'; known are kind, source"),
         ("[imu]\nkind = 'inertial'\nclass = 'best'", None, "no class of inertial units 'best'; there are icm-42688"),
         ("[imu]\nkind = 'inertial'\nrate_hz = 0", None, "rate_hz is 0; expected more"),
@@ -188,3 +190,31 @@ def test_a_calibration_that_was_written_is_read_whatever_its_name_and_delay(swee
     out.write_text(out.read_text().replace("covariance = [\n  [", 'covariance = [\n  ["x", ', 1))
     with pytest.raises(InputError, match="must be numbers"):
         read_references(out)
+
+
+def test_a_magnetometer_is_checked_and_calibrated_and_other_units_are_named(capsys, tmp_path):
+    """Beside a motor, as the workcell has one; the poses are those of a sweep."""
+    t, rng = np.arange(0.0, 30.0, 0.02), np.random.default_rng(8)
+    Ts = np.array([pose(at) for at in t])
+    t_s, z = MagneticUnit(rng, 50.0).read(t, Ts)
+    rows = np.column_stack([t, Ts[:, :3, 3], quaternion_wxyz(Ts[:, :3, :3])])
+    np.savetxt(tmp_path / "poses.csv", rows, "%.9f", ",", header="t_s,x_m,y_m,z_m,qw,qx,qy,qz", comments="")
+    head = ",".join(["t_s", *COLUMNS[Magnetometer]])
+    for name, scale in (("field", 1.0), ("micro", 1e6)):
+        np.savetxt(tmp_path / f"{name}.csv", np.column_stack([t_s, scale * z]), "%.9g", ",", header=head, comments="")
+        (tmp_path / f"{name}.toml").write_text(f'[m]\nkind = "magnetometer"\nsource = "{name}.csv"\nrate_hz = 50.0\n')
+    assert run("references", "check", tmp_path / "field.toml") == 0
+    assert "m: 1500 readings, 50 Hz" in capsys.readouterr().out
+    given = "--poses", tmp_path / "poses.csv", "-o", tmp_path / "out.toml", "--json"
+    said = said_of(capsys, "references", "calibrate", tmp_path / "field.toml", *given)
+    assert said.code == 0, said.err
+    (found,) = said.lines[0]["references"]
+    assert found["left_out_rms"]["field_t"] < 5e-6
+    assert found["left_out_over_sigma"] == pytest.approx(1.0, abs=0.3)
+    assert run("references", "check", tmp_path / "out.toml") == 0
+    said = said_of(capsys, "references", "calibrate", tmp_path / "micro.toml", *given[:2])
+    assert (said.code, len(said.err.splitlines())) == (2, 2)  # and what is fitted
+    assert "as if in uT" in said.err
+    said = said_of(capsys, "references", "gravity", tmp_path / "out.toml", "--model", "six_r", "--joints", "none.csv")
+    assert said.code == 2
+    assert "is a magnetometer" in said.err

@@ -154,14 +154,15 @@ def test_another_arm_or_estimator_changes_the_answers_and_compare_shows_it(armsi
 
 
 def test_an_inertial_unit_is_fused_and_said_to_agree_or_not(armsight, run, tmp_path):
-    from armsight.loop.references.file import INERTIAL_COLUMNS, Entry, written
+    from armsight.loop.references.file import COLUMNS, Entry, written
+    from armsight.loop.references.inertial import Inertial
 
     stamps, z, known = known_unit()
     table, file = tmp_path / "imu.csv", tmp_path / "references.toml"
-    file.write_text(written(Entry(known, "inertial", "icm-42688", table, None, None, True), tmp_path))
+    file.write_text(written(Entry(known, "icm-42688", table, None, None, True), tmp_path))
     for sign, agrees in ((1.0, True), (-1.0, False)):
         rows = np.column_stack([stamps, z * np.repeat([sign, 1.0], 3)])
-        np.savetxt(table, rows, delimiter=",", header=",".join(["t_s", *INERTIAL_COLUMNS]), comments="")
+        np.savetxt(table, rows, delimiter=",", header=",".join(["t_s", *COLUMNS[Inertial]]), comments="")
         said = armsight("replay", run, "--references", file, "--json")
         assert said.code == 0, said
         (answer,) = said.lines
@@ -171,14 +172,14 @@ def test_an_inertial_unit_is_fused_and_said_to_agree_or_not(armsight, run, tmp_p
         assert 0.2 < answer["reference"]["begin_s"] < 0.3  # the second estimator, which keeps the delay
     slow = np.column_stack([stamps, z])[::50]
     np.savetxt(
-        file.with_name("slow.csv"), slow, delimiter=",", header=",".join(["t_s", *INERTIAL_COLUMNS]), comments=""
+        file.with_name("slow.csv"), slow, delimiter=",", header=",".join(["t_s", *COLUMNS[Inertial]]), comments=""
     )
     other = tmp_path / "other.toml"
     other.write_text(file.read_text().replace("imu.csv", "slow.csv"))
     assert_rejected(armsight("replay", run, "--references", other), "imu", "50 ms apart", "at most 30 are integrated")
     slow[:, 0] += 1e3
     np.savetxt(
-        file.with_name("slow.csv"), slow, delimiter=",", header=",".join(["t_s", *INERTIAL_COLUMNS]), comments=""
+        file.with_name("slow.csv"), slow, delimiter=",", header=",".join(["t_s", *COLUMNS[Inertial]]), comments=""
     )
     assert_rejected(armsight("replay", run, "--references", other), "imu", "do both have one clock?")
     assert "disagrees with joints and vision" in armsight("replay", run, "--references", file).out
@@ -194,7 +195,7 @@ def test_a_run_with_a_unit_is_the_same_to_the_last_digit_and_holds_ros_messages(
     from armsight.vision.sources.bag import Bag
 
     stamps, z, known = known_unit()
-    text = written(Entry(known, "inertial", "icm-42688", tmp_path / "run.mcap", None, None, True), tmp_path)
+    text = written(Entry(known, "icm-42688", tmp_path / "run.mcap", None, None, True), tmp_path)
     made(tmp_path, text)
     (answer,) = armsight("replay", tmp_path, "--json").lines
     assert answer["differences"] == {"position_m": 0.0, "quaternion": 0.0, "covariance": 0.0}

@@ -12,15 +12,15 @@ import pytest
 
 from armsight.app.run.devices import JUMP_S, LiveReadings
 from armsight.errors import ArmsightError
-from armsight.loop.references.file import INERTIAL_COLUMNS, Entry
+from armsight.loop.references.file import COLUMNS, Entry
 from armsight.loop.references.inertial import Inertial
 from armsight.loop.running.setup import Fused, HostClock
 
-ENTRY = Entry(Inertial.of("imu"), "inertial", "mpu-6050", None, None, None, False)
+ENTRY = Entry(Inertial.of("imu"), "mpu-6050", None, None, None, False)
 
 
 def line(t_s, value=1.0):
-    return json.dumps({"t_s": t_s} | dict.fromkeys(INERTIAL_COLUMNS, value)).encode()
+    return json.dumps({"t_s": t_s} | dict.fromkeys(COLUMNS[Inertial], value)).encode()
 
 
 def free_port():

@@ -8,8 +8,7 @@ from armsight.errors import InputError
 from armsight.geometry.pose import pose
 from armsight.geometry.rotation import exp_so3, log_so3
 from armsight.loop.references.calibrate import calibrate
-from armsight.loop.references.file import FIELD as FIELD_MESSAGE
-from armsight.loop.references.file import read_recording
+from armsight.loop.references.file import MESSAGES, RANGE, read_ranges, read_recording
 from armsight.loop.references.heading import EARTH_T, Magnetometer, heading_off
 from armsight.loop.references.reference import Reading, ToolMotion
 
@@ -131,24 +130,39 @@ def test_too_few_or_flat_attitudes_are_rejected():
 
 
 @pytest.mark.parametrize("ros1", [True, False])
-def test_a_bags_magnetic_field_is_read(tmp_path, ros1):
+def test_a_bags_fields_and_ranges_are_read(tmp_path, ros1):
+    """Of ranges those that their message calls out of range, as infinity is by REP 117, are no measurement."""
     from rosbags.rosbag1 import Writer as Writer1
     from rosbags.rosbag2 import StoragePlugin
     from rosbags.rosbag2 import Writer as Writer2
     from rosbags.typesys import Stores, get_typestore
 
-    store, kind = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE), "sensor_msgs/msg/MagneticField"
+    store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_JAZZY)
     path = tmp_path / ("a.bag" if ros1 else "a")
     writer = Writer1(path) if ros1 else Writer2(path, version=9, storage_plugin=StoragePlugin.MCAP)
     types, given = store.types, np.array([[20e-6, -3e-6, 40e-6], [21e-6, 0.0, 41e-6]])
+
+    def write(connection, ns, kind, *content):
+        header = types["std_msgs/msg/Header"](
+            *([0] if ros1 else []), types["builtin_interfaces/msg/Time"](5, ns), "imu"
+        )
+        message = types[kind](header, *content)
+        writer.write(connection, 10**9, (store.serialize_ros1 if ros1 else store.serialize_cdr)(message, kind))
+
     with writer:
-        connection = writer.add_connection("/imu/mag", kind, typestore=store)
-        for k, field in enumerate(given):
-            header = types["std_msgs/msg/Header"](
-                *([k] if ros1 else []), types["builtin_interfaces/msg/Time"](5, k), "imu"
-            )
-            message = types[kind](header, types["geometry_msgs/msg/Vector3"](*field), np.zeros(9))
-            writer.write(connection, 10**9, (store.serialize_ros1 if ros1 else store.serialize_cdr)(message, kind))
-    t_s, z = read_recording(path, FIELD_MESSAGE)
+        kind, of_range = MESSAGES[Magnetometer].replace("/", "/msg/"), RANGE.replace("/", "/msg/")
+        field = writer.add_connection("/imu/mag", kind, typestore=store)
+        ranges = [writer.add_connection(f"/range/{name}", of_range, typestore=store) for name in ("right", "left")]
+        for k, value in enumerate(given):
+            write(field, k, kind, types["geometry_msgs/msg/Vector3"](*value), np.zeros(9))
+        for k, value in enumerate((0.5, 1.25, np.inf, 2.5)):
+            write(ranges[k % 2], 10 - k, of_range, 0, 0.1, 0.2, 2.0, value, *([] if ros1 else [0.01]))
+    t_s, z = read_recording(path, Magnetometer)
     np.testing.assert_array_equal(z, given)
     np.testing.assert_allclose(t_s, [5.0, 5.0 + 1e-9], rtol=0, atol=1e-12)
+    topics, t_s, channel, z = read_ranges(path)
+    assert topics == ("/range/left", "/range/right")
+    assert (channel.tolist(), z.tolist()) == ([0, 1], [1.25, 0.5])
+    np.testing.assert_allclose(t_s, [5.0 + 9e-9, 5.0 + 1e-8], rtol=0, atol=1e-12)
+    with pytest.raises(InputError, match="expected one topic of sensor_msgs/Imu; there are 0"):
+        read_recording(path)

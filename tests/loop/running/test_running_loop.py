@@ -376,7 +376,7 @@ def test_interrupts_are_held_back_and_reported():
 
 def test_what_is_lost_of_a_reference_is_published_once():
     loop, losses, said = looped(Standing()), Counter(), []
-    entry = Entry(Inertial.of("imu"), "inertial", "mpu-6050", None, None, None, False)
+    entry = Entry(Inertial.of("imu"), "mpu-6050", None, None, None, False)
     loop.setup = replace(loop.setup, beside=Fused(entry, losses=losses))
     loop.publisher = SimpleNamespace(put=said.append)
     for kind in ("a line was no reading", "a line was no reading", "it was lost: gone"):

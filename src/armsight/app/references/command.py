@@ -13,8 +13,7 @@ from armsight.app.options import PATH, output
 if TYPE_CHECKING:
     from armsight.app.show.report import Grade, Report
     from armsight.loop.references.calibrate import ReferenceCalibration
-    from armsight.loop.references.file import Entry
-    from armsight.loop.references.inertial import Inertial
+    from armsight.loop.references.file import Entry, Sensor
 
 #: A noise so many times that of its class is said.
 NOISY = 3.0
@@ -24,8 +23,9 @@ RATE = 0.05
 UNIT = 0.2
 #: A rest is so long at least, s.
 REST_S = 0.5
-#: Readings are averaged over so long, s; half: twice the time, double: fast sweeps are cut (0.5 mm at 60 mm).
-AVERAGED_S = 0.02
+#: Readings are averaged over so long, s; half: twice the time, double: fast sweeps are cut (0.5 mm at 60 mm). Those of a
+#: field are so far apart, s; half: a motor's field counts twice, double: sweeps are short of attitudes.
+AVERAGED_S, FIELDS_S = 0.02, 0.2
 #: A smaller sweep is said to be small, deg; half: levers off by 10 mm pass, double: good sweeps are blamed.
 SMALL_DEG = 60.0
 #: Stamps of a sensor may be so late against those of the poses, s; half: a phone's are not found, double: more is cut off.
@@ -37,12 +37,12 @@ ALLAN = {
     "gyro": ("rad", "rad_per_sqrt_s", "rad_s", "rad_s_per_sqrt_s", "rad_s2"),
     "accelerometer": ("m_s", "m_s_per_sqrt_s", "m_s2", "m_s2_per_sqrt_s", "m_s3"),
 }
-UNITS = {"gyro": "rad_s", "accelerometer": "m_s2"}  # in keys of JSON
+UNITS = {"gyro": "rad/s", "accelerometer": "m/s2", "field": "T"}
 
 
 @click.group("references")
 def command() -> None:
-    """Check and calibrate sensors beside vision: inertial units, named in a file references.toml."""
+    """Check and calibrate sensors beside vision: inertial units, magnetometers, named in a file references.toml."""
 
 
 @command.command()
@@ -61,7 +61,7 @@ def check(path: Path, as_json: bool) -> None:
 @output("OUT.toml", "Where to write the result.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
 def calibrate(path: Path, poses: str, output: Path | None, as_json: bool) -> None:
-    """Find mounting, biases, scales and delay from one sweep with poses by vision or by the arm."""
+    """Find mounting, biases, scales, iron and delay from one sweep with poses by vision or by the arm."""
     from armsight.files import check_writable, write_text
     from armsight.loop.references.file import read_references, written
 
@@ -94,19 +94,22 @@ def _gravity(entry: Entry, model: str, joints: Path) -> Report:
     from armsight.app.show.report import Report
     from armsight.app.show.table import TextTable
     from armsight.errors import InputError
-    from armsight.loop.identify.gravity import gravity_shows
-    from armsight.loop.references.inertial import ACCELEROMETER
+    from armsight.loop.identify.gravity import check_rests, gravity_shows
+    from armsight.loop.references.inertial import ACCELEROMETER, Inertial
     from armsight.loop.references.reference import Reading, ToolMotion
     from armsight.robot.arm_file import open_arm
     from armsight.tables.poses import read_pose_table
 
+    if not isinstance(unit := entry.reference, Inertial):
+        raise InputError(f"[{unit.name}]: is a magnetometer; gravity is felt by an inertial unit")
     arm = open_arm(model)
     table = read_pose_table(joints, arm=arm, only_joints=True)
     if table.t_s is None or table.q is None:
         raise InputError(f"{joints}: line 1: a column t_s is needed")
+    check_rests(str(joints), len(table.q))  # before the recording, which may take long
     source, t_s, z = _recording(entry)
     readings = []
-    for rest, at in enumerate(table.t_s - entry.reference.delay_s):
+    for rest, at in enumerate(table.t_s - unit.delay_s):
         rows = np.flatnonzero(np.abs(t_s - at) <= REST_S / 2)
         if len(rows) < 8:
             raise InputError(
@@ -115,7 +118,7 @@ def _gravity(entry: Entry, model: str, joints: Path) -> Report:
         parts = [z[part, 3:].mean(axis=0) for part in np.array_split(rows, 4)]
         noise = np.maximum(np.var(parts, axis=0, ddof=1) / 4, 1e-6)
         readings.append(Reading(float(rest), ACCELEROMETER, np.mean(parts, axis=0), np.diag(np.full(3, noise.mean()))))
-    sensor, poses = replace(entry.reference, delay_s=0.0), arm.forward(table.q)  # from here on a rest's time is its row
+    sensor, poses = replace(unit, delay_s=0.0), arm.forward(table.q)  # from here on a rest's time is its row
     if not entry.calibrated:
         sensor = sensor.begun(readings, lambda rest: ToolMotion(poses[int(rest)]))
     shown, found = gravity_shows(arm, sensor, table.q, readings)
@@ -152,13 +155,13 @@ def _gravity(entry: Entry, model: str, joints: Path) -> Report:
 
 
 def _recording(entry: Entry) -> tuple[Path, Any, Any]:
-    """Return the file of a reference, its times (N,) and its values (N, 6)."""
+    """Return the file of a reference, its times (N,) and its values (N, m)."""
     from armsight.errors import InputError
     from armsight.loop.references.file import read_recording
 
     if entry.source is None:
         raise InputError(f'[{entry.reference.name}]: no source; name its recording: source = "imu.csv"')
-    return entry.source, *read_recording(entry.source)
+    return entry.source, *read_recording(entry.source, type(entry.reference))
 
 
 def _checked(entries: list[Entry]) -> Report:
@@ -187,7 +190,9 @@ def _check(entry: Entry) -> tuple[dict[str, Any], list[str], list[str]]:
     import numpy as np
 
     from armsight.errors import InputError
-    from armsight.loop.references.inertial import INERTIAL_CLASSES
+    from armsight.loop.references.file import COLUMNS
+    from armsight.loop.references.heading import check_unit
+    from armsight.loop.references.inertial import INERTIAL_CLASSES, Inertial
     from armsight.loop.references.reference import STANDARD_GRAVITY_M_S2
     from armsight.loop.references.stream import allan, check_stream, coefficients, settling
 
@@ -202,7 +207,7 @@ def _check(entry: Entry) -> tuple[dict[str, Any], list[str], list[str]]:
         "longest_gap_s": stream.longest_gap_s,
         "doubled": stream.doubled,
         "frozen_s": stream.frozen_s,
-        "saturated": [("gyro" if k < 3 else "accelerometer") + f"_{'xyz'[k % 3]}" for k in stream.saturated],
+        "saturated": ["_".join(COLUMNS[type(entry.reference)][k].split("_")[:2]) for k in stream.saturated],
     }
     lines = [
         f"{name}: {len(t_s)} readings, {stream.rate_hz:.4g} Hz, jitter {1e3 * stream.jitter_s:.2g} ms, "
@@ -216,10 +221,16 @@ def _check(entry: Entry) -> tuple[dict[str, Any], list[str], list[str]]:
     if stream.frozen_s:
         weak.append(f"{name}: no value changes for {stream.frozen_s:.2f} s")
     weak += [f"{name}: {axis} stands at the end of its range: that is too small" for axis in values["saturated"]]
+    if not isinstance(entry.reference, Inertial):
+        check_unit(str(source), z)
     rest = z[stream.rest]
     values["rest_s"] = len(rest) / stream.rate_hz
     if not len(rest):
         weak.append(f"{name}: no rest of a second was found, so its noise is unknown")
+        return values, lines, weak
+    if not isinstance(entry.reference, Inertial):
+        values["noise_t"] = [float(sigma) for sigma in rest.std(axis=0, ddof=1)]
+        lines.append(f"{name}: noise {1e6 * max(values['noise_t']):.2g} uT at rest for {values['rest_s']:.1f} s")
         return values, lines, weak
     force = float(np.linalg.norm(rest[:, 3:].mean(axis=0)))
     if abs(force - 1.0) < UNIT:
@@ -294,7 +305,7 @@ def _calibrated(entries: list[Entry], poses: Path) -> tuple[Report, list[Entry]]
     sections = {"references": ("References", blocks)}
     worst = max(found, key=lambda each: each["left_out_over_sigma"])
     ratio = f"{worst['name']}: times left out are off by {worst['left_out_over_sigma']:.2f} of their sigma"
-    answer: tuple[Grade, str] = ("good", f"Good: {ratio}; references gravity and the filter take the file.")
+    answer: tuple[Grade, str] = ("good", f"Good: {ratio}; run, demo and replay --references take the file.")
     if worst["left_out_over_sigma"] > HONEST:
         answer = "fair", f"Usable with care: {ratio}: something moves that no parameter describes; fasten the sensor."
     values = {"references": found}
@@ -313,7 +324,8 @@ def _averaged(entry: Entry, path: Any) -> list[Any]:  # noqa: ANN401 - imported 
     size = max(round(AVERAGED_S * check_stream(t_s, z, str(source)).rate_hz), 1)
     count = len(t_s) // size
     times = t_s[: count * size].reshape(count, size).mean(axis=1)
-    means = z[: count * size].reshape(count, size, 2, 3).mean(axis=1)
+    channels = len(entry.reference.channels)
+    means = z[: count * size].reshape(count, size, channels, 3).mean(axis=1)
     within = np.flatnonzero([path.covers(t - entry.reference.delay_s, DELAY_S) for t in times])
     if len(within) < 20:
         raise InputError(
@@ -324,12 +336,12 @@ def _averaged(entry: Entry, path: Any) -> list[Any]:  # noqa: ANN401 - imported 
     noise = np.maximum(np.median(np.abs(bend), axis=0) / (0.6745 * np.sqrt(6.0)), 1e-6)
     return [
         Reading(float(times[k]), channel, means[k, channel], np.diag(noise[channel] ** 2))
-        for k in within
-        for channel in (0, 1)
+        for k in within[:: 1 if channels > 1 else max(round(FIELDS_S / float(np.median(np.diff(times)))), 1)]
+        for channel in range(channels)
     ]
 
 
-def _said(result: ReferenceCalibration[Inertial]) -> tuple[dict[str, Any], list[Any]]:
+def _said(result: ReferenceCalibration[Sensor]) -> tuple[dict[str, Any], list[Any]]:
     import numpy as np
 
     from armsight.app.show.report import Fact
@@ -337,8 +349,9 @@ def _said(result: ReferenceCalibration[Inertial]) -> tuple[dict[str, Any], list[
 
     sensor, sigmas = result.reference, np.sqrt(np.diag(result.reference.cov))
     named = dict(zip(sensor.parameters, sigmas.tolist(), strict=True))
+    count = len(sensor.channels)
     errors = {
-        f"{name}_{UNITS[name]}": float(np.sqrt(np.mean(result.left_out[k::2][result.used[k::2]] ** 2)))
+        name: float(np.sqrt(np.mean(result.left_out[k::count][result.used[k::count]] ** 2)))
         for k, name in enumerate(sensor.channels)
     }
     values = {
@@ -349,7 +362,7 @@ def _said(result: ReferenceCalibration[Inertial]) -> tuple[dict[str, Any], list[
         "sigma_delay_s": sensor.sigma_delay_s,
         "open": list(result.open),
         "noise_factor": result.noise,
-        "left_out_rms": errors,
+        "left_out_rms": {f"{name}_{UNITS[name].lower().replace('/', '_')}": rms for name, rms in errors.items()},
         "left_out_over_sigma": float(np.sqrt(np.mean(result.squares[result.used]))),
         "outliers": int((~result.used).sum()),
     }
@@ -358,9 +371,9 @@ def _said(result: ReferenceCalibration[Inertial]) -> tuple[dict[str, Any], list[
         for name, value in (*sensor.parameters.items(),)
     )
     delay = ("delay_s", f"{sensor.delay_s:.5g}", f"{sensor.sigma_delay_s:.2g}")
+    wrong = " and ".join(f"{rms:.3g} {UNITS[name]}" for name, rms in errors.items())
     sentence = (
-        f"{sensor.name}: readings of times left out are wrong by {errors['gyro_rad_s']:.3g} rad/s and "
-        f"{errors['accelerometer_m_s2']:.3g} m/s2 RMS, {values['left_out_over_sigma']:.2f} sigma; "
+        f"{sensor.name}: readings of times left out are wrong by {wrong} RMS, {values['left_out_over_sigma']:.2f} sigma; "
         f"{values['outliers']} of {len(result.used)} are outliers"
     )
     return values, [Fact(sentence), TextTable(sensor.name, ("parameter", "value", "sigma"), (*rows, delay))]

@@ -104,6 +104,9 @@ def described(recording: str, replayed: Replayed) -> tuple[dict[str, object], li
             else "the estimates differ from those of the run by at most "
             + ", ".join(f"{name} {value:.3g}" for name, value in replayed.differences.items())
         )
+    if replayed.odometry is not None:
+        answer["odometry"] = replayed.odometry._asdict()
+        lines.append(replayed.odometry.line)
     if (row := replayed.beside) is not None:
         answer["reference"] = asdict(row)
         lines.append(row.line)

@@ -16,7 +16,7 @@ from armsight.app.stream.streams import open_streams
 from armsight.data import Body
 from armsight.errors import InputError
 from armsight.loop.references.file import entries_of, read_references
-from armsight.loop.running.setup import Fused, recorded, the_one
+from armsight.loop.running.setup import fused, recorded, the_one
 from armsight.robot.arm_file import open_arm
 from armsight.vision.markers.marker import Target
 from armsight.vision.markers.targets import open_body, open_target
@@ -79,7 +79,7 @@ def _of_run(request: Request, run: RecordedRun, say: Callable[[str], None]) -> R
     if request.references is not None:
         beside = recorded(the_one(read_references(request.references), request.references))
     elif text is not None and request.estimator == "kalman":
-        beside = Fused(the_one(entries_of(text, run.path), run.path))
+        beside = fused(the_one(entries_of(text, run.path), run.path))
     with contextlib.closing(open_streams(request.streams, Published(rig, body, arm, _PROPERTIES), say)) as publisher:
         return replay_run(
             run,

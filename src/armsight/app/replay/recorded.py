@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from armsight.app.stream.mcap_file import RUN_MCAP, TOPICS
-from armsight.app.stream.ros import IMU
+from armsight.app.stream.ros import READINGS
 from armsight.data import Array, JointStates, Missed, PoseEstimate
 from armsight.errors import InputError
 from armsight.loop.references.file import reading_of
@@ -27,7 +27,7 @@ class RecordedDatum:
 
     kind: type  #: ShotDatum, JointsDatum or EventDatum: what was published
     content: dict[str, Any]  #: its JSON; docs/reference/data.md describes the keys
-    #: of joints: times (N,), s, and readings (N, 6) of an inertial unit that were given with them.
+    #: of joints: times (N,), s, and readings (N, m) of a reference that were given with them.
     felt: tuple[Array, Array] = (np.empty(0), np.empty((0, 6)))
 
     @property
@@ -85,8 +85,9 @@ def read_run(path: Path) -> RecordedRun | None:
     if METADATA not in bag.metadata:
         return None
     data, felt = list[RecordedDatum](), list[tuple[float, Array]]()
-    for message in bag.messages([topic for topic in (*_KINDS, IMU) if topic in bag.topics]):
-        if message.topic == IMU:
+    readings = [topic for topic, *_ in READINGS.values()]
+    for message in bag.messages([topic for topic in (*_KINDS, *readings) if topic in bag.topics]):
+        if message.topic in readings:
             felt.append(reading_of(message))
             continue
         content = message.decode()

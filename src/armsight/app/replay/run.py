@@ -28,8 +28,9 @@ from armsight.loop.estimators import (
     Prior,
     Remembered,
 )
+from armsight.loop.identify.odometry import Odometry, odometry
 from armsight.loop.running.data import EventDatum, JointsDatum, Publisher, ShotDatum
-from armsight.loop.running.setup import Fused, FusedRow
+from armsight.loop.running.setup import Fused, FusedRow, HeadingRow
 from armsight.robot.kinematics.arm import Arm
 from armsight.vision.detections import SeenShot
 from armsight.vision.follow.follower import Follower, follows
@@ -55,7 +56,11 @@ class Replayed:
     joints: JointStream | None = None  #: the joint readings that a bag holds; None without
     #: largest absolute difference of the estimates to those recorded, by name; none where not comparable.
     differences: dict[str, float] | None = None
-    beside: FusedRow | None = None  #: what a reference beside vision did; None without
+    beside: FusedRow | HeadingRow | None = None  #: what a reference beside vision did; None without
+    odometry: Odometry | None = None  #: joints alone against the estimates with fresh vision; None without
+
+
+_FRESH_S = 0.1  # s; estimates that odometry is compared with have seen the body since
 
 
 class Pace:
@@ -112,10 +117,12 @@ def replay_run(
             publisher.put(ShotDatum(shot, result, each.content["arrival_s"], each.content["sigma_t_s"], outcome))
     same = None if changed or (beside is not None and not own) else _differences(before, live, body)
     row = None if beside is None or own else _row(beside, before, live, body)
-    return Replayed(body, tuple(poses), tuple(live), None, same, row)
+    seen = [each for each in live if each.vision_age_s < _FRESH_S]
+    q, Ts = np.array([each.states.q[-1] for each in seen]), np.array([each.T_base_tool for each in seen])
+    return Replayed(body, tuple(poses), tuple(live), None, same, row, odometry(arm, q, Ts) if seen else None)
 
 
-def _row(beside: Fused, before: list[RecordedDatum], live: list[JointsDatum], body: Body) -> FusedRow:
+def _row(beside: Fused, before: list[RecordedDatum], live: list[JointsDatum], body: Body) -> FusedRow | HeadingRow:
     """Return what a reference did to the estimates since the first of its windows."""
     rows = [(was, now) for was, now in zip(before, live, strict=True) if now.states.t_s[-1] >= beside.begin_s]
     fused = [now.to_json(body) for _, now in rows]

@@ -20,13 +20,14 @@ import numpy as np
 from armsight.app.options import SIM
 from armsight.data import Array
 from armsight.errors import DeviceError, InputError
-from armsight.loop.references.file import INERTIAL_COLUMNS, Entry
-from armsight.loop.references.inertial import INERTIAL_CLASSES
-from armsight.loop.running.setup import Fused, HostClock, LiveShots, Setup
+from armsight.loop.references.file import COLUMNS, Entry
+from armsight.loop.references.inertial import INERTIAL_CLASSES, Inertial
+from armsight.loop.running.setup import Fused, HostClock, LiveShots, Setup, fused
 from armsight.robot.board_registry import EMULATED, check_board, emulator_name, open_motion_board, slowed
 from armsight.robot.boards.board import Board
 from armsight.robot.boards.contract import MotionBoard
 from armsight.robot.kinematics.arm import Arm
+from armsight.sim.references.heading import MagneticUnit
 from armsight.sim.references.inertial import InertialErrors, InertialUnit
 from armsight.vision.markers.targets import Composite
 from armsight.vision.sources import open_source
@@ -36,7 +37,7 @@ if TYPE_CHECKING:
 
 #: The workcell's arm and cameras where ``sim:`` names none: those of ``armsight demo``.
 _SIM_ARM, _SIM_CAMERAS = "worn", "1280x720@60"
-_UNIT_HZ = 1000.0  # of an inertial unit in the workcell whose table does not say
+_UNIT_HZ, _FIELDS_HZ = 1000.0, 50.0  # of an inertial unit, a magnetometer in the workcell whose table does not say
 _RATE_HZ = 60.0  # of cameras whose times show none; half: the loop expects shots late, double: early
 
 
@@ -64,7 +65,7 @@ class LiveReadings:
     """
 
     def __init__(self, entry: Entry, clock: HostClock, now: Callable[[], float] = time.monotonic) -> None:
-        self._where = f"[{entry.reference.name}]: live"
+        self._where, self._columns = f"[{entry.reference.name}]: live", COLUMNS[type(entry.reference)]
         self._board, self._own, self._now = clock, HostClock(now), now
         self._lock, self._ended, self._problem = threading.Lock(), threading.Event(), ""
         self._rows: list[tuple[float, list[float]]] = []  # time, s, on the computer's clock; values
@@ -132,10 +133,10 @@ class LiveReadings:
         now = self._now()
         try:
             record = json.loads(line)
-            t_s, *values = (float(record[name]) for name in ("t_s", *INERTIAL_COLUMNS))
+            t_s, *values = (float(record[name]) for name in ("t_s", *self._columns))
         except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
             kind = f"{error.args[0]} is missing" if isinstance(error, KeyError) else "is no JSON object of numbers"
-            self._problem = f"expected lines of JSON with t_s, {', '.join(INERTIAL_COLUMNS)}; {line[:40]!r} {kind}"
+            self._problem = f"expected lines of JSON with t_s, {', '.join(self._columns)}; {line[:40]!r} {kind}"
             self.losses["a line was no reading"] += 1
             return
         # No time is known of a stamp whose last digit is longer than JUMP_S; NaN and infinity are among them.
@@ -165,7 +166,7 @@ class LiveReadings:
         t_s = np.array([t for t, _ in rows]) - (self._board.offset_s if rows else 0.0)
         rising = t_s > np.maximum.accumulate(np.append(self._newest_s, t_s))[:-1]
         self._newest_s = max(self._newest_s, t_s.max(initial=-np.inf))
-        return t_s[rising], np.array([values for _, values in rows]).reshape(-1, 6)[rising]
+        return t_s[rising], np.array([values for _, values in rows]).reshape(-1, len(self._columns))[rising]
 
     def close(self) -> None:
         """Stop reading."""
@@ -191,11 +192,14 @@ def setup_of(workcell: Workcell) -> Setup:
 
 
 def simulated_unit(workcell: Workcell, entry: Entry, seed: int) -> Fused:
-    """Return an inertial unit of a class on the workcell's tool, with errors beyond what its calibration knows."""
-    c, rng = INERTIAL_CLASSES[entry.sensor_class], np.random.default_rng([seed, 77])
+    """Return a sensor on the workcell's tool, a unit as its class is, with errors beyond what its calibration knows."""
+    rng = np.random.default_rng([seed, 77])
+    if not isinstance(entry.reference, Inertial):
+        return fused(entry, workcell.carry(MagneticUnit(rng, entry.rate_hz or _FIELDS_HZ)))
+    c = INERTIAL_CLASSES[entry.sensor_class]
     drawn = (c.gyro_noise, c.noise), (c.gyro_bias, c.bias), c.scale, c.g_sensitivity, rng
     errors = InertialErrors.typical(*drawn, good=entry.sensor_class == "icm-42688", rate_hz=entry.rate_hz or _UNIT_HZ)
-    return Fused(entry, workcell.carry(InertialUnit(errors, rng)))
+    return fused(entry, workcell.carry(InertialUnit(errors, rng)))
 
 
 def sync_led_bit_s(board: MotionBoard, name: str) -> float:
@@ -284,7 +288,7 @@ def open_devices(devices: Devices) -> Iterator[Setup]:
         if devices.reference is not None:
             readings = LiveReadings(devices.reference, clock)
             stack.callback(readings.close)
-            beside = Fused(devices.reference, readings, readings.losses)
+            beside = fused(devices.reference, readings, readings.losses)
         yield Setup(
             devices.arm,
             controller,

@@ -33,8 +33,10 @@ from armsight.data import Image
 from armsight.errors import InputError
 from armsight.loop.health import health_lines, unseen_lines
 from armsight.loop.health.follow import correction_lines
+from armsight.loop.identify.odometry import Odometry, odometry
 from armsight.loop.running.log import Log
 from armsight.loop.running.setup import Fused
+from armsight.robot.kinematics.arm import Arm
 
 #: Track -> its name in tables.
 TRACKS = {
@@ -122,6 +124,9 @@ def report_of(
                 f"body hidden for {occlusion['duration_s']:g} s in motion: the fused estimate was wrong by at most "
                 f"{1e3 * occlusion['fused_position_max_m']:.2f} mm"
             )
+        if result.open_s is not None and (alone := _odometry(tracks.between(*result.open_s, most=_MOST), tracks.arm)):
+            values["odometry"] = alone._asdict()
+            lines.append(alone.line)
         if passes is not None:
             values["closed_loop"] = _passes_json(*passes)
         tables = [_track_table(found), _loop_table(passes)]
@@ -158,6 +163,17 @@ def report_of(
         prefix="",
         assessed=assess(result, passes),
     )
+
+
+_MOST = 20_000  # rows of a run that show odometry; half: nothing, double: long runs take seconds
+
+
+def _odometry(part: Part, arm: Arm) -> Odometry | None:
+    attained = part.attained
+    if len(attained) < 2:
+        return None
+    rows = (part.t_s >= attained.t_s[0]) & (part.t_s <= attained.t_s[-1])
+    return odometry(arm, part.q[rows], attained.at(part.t_s[rows]))
 
 
 _FEW = 0.8  # of the shots in view; half: misses are hardly noticed, 1: one missed shot is said

@@ -23,7 +23,7 @@ import numpy as np
 from armsight import __version__
 from armsight.app.stream.datum import Published, json_text
 from armsight.app.stream.foxglove import LookedAt, Messages, nanoseconds, require_foxglove
-from armsight.app.stream.ros import IMU, IMU_KIND, IMU_SCHEMA, imu_messages
+from armsight.app.stream.ros import READINGS, reading_messages
 from armsight.app.stream.sink import Sink
 from armsight.data import Shot
 from armsight.errors import InputError
@@ -83,8 +83,9 @@ class McapSink(Sink):
         for topic, message in self._messages.of(datum):
             self._writer.add_message(self._channel(topic, message), log_ns, stamp_ns, message.SerializeToString())
         if isinstance(datum, JointsDatum) and datum.felt is not None:
-            for imu_ns, data in imu_messages(*datum.felt):
-                self._writer.add_message(self._imu_channel(), log_ns, imu_ns, data)
+            channel = self._readings_channel(*READINGS[datum.felt[1].z.shape[1]])
+            for read_ns, data in reading_messages(*datum.felt):
+                self._writer.add_message(channel, log_ns, read_ns, data)
         if not isinstance(datum, NoteDatum):
             content: Mapping[str, Any] = (
                 datum.content if isinstance(datum, EventDatum) else datum.to_json(self._published.body)
@@ -104,11 +105,11 @@ class McapSink(Sink):
             self._channels[topic] = self._writer.register_channel(topic, "protobuf", self._schemas[name], images=images)
         return self._channels[topic]
 
-    def _imu_channel(self) -> int:
-        if IMU not in self._channels:
-            schema = self._writer.register_schema(IMU_KIND, "ros2msg", IMU_SCHEMA.encode())
-            self._channels[IMU] = self._writer.register_channel(IMU, "cdr", schema)
-        return self._channels[IMU]
+    def _readings_channel(self, topic: str, kind: str, text: str) -> int:
+        if topic not in self._channels:
+            schema = self._writer.register_schema(kind, "ros2msg", text.encode())
+            self._channels[topic] = self._writer.register_channel(topic, "cdr", schema)
+        return self._channels[topic]
 
     def _json_channel(self, topic: str) -> int:
         if topic not in self._channels:

@@ -113,34 +113,40 @@ TO_ROS: dict[str, Callable[[_Types, Decoded], _Made]] = {
     "foxglove.Log": _log,
 }
 
-#: Topic and type of a run's readings.
-IMU, IMU_KIND = "/imu", "sensor_msgs/msg/Imu"
 _PARTS = {
     "std_msgs/Header": "builtin_interfaces/Time stamp\nstring frame_id",
     "builtin_interfaces/Time": "int32 sec\nuint32 nanosec",
     "geometry_msgs/Quaternion": "float64 x\nfloat64 y\nfloat64 z\nfloat64 w",
     "geometry_msgs/Vector3": "float64 x\nfloat64 y\nfloat64 z",
 }
-_FIELDS = """std_msgs/Header header
+_IMU = """std_msgs/Header header
 geometry_msgs/Quaternion orientation
 float64[9] orientation_covariance
 geometry_msgs/Vector3 angular_velocity
 float64[9] angular_velocity_covariance
 geometry_msgs/Vector3 linear_acceleration
 float64[9] linear_acceleration_covariance"""
-#: What encoding "ros2msg" has: the type, and those that it is made of.
-IMU_SCHEMA = _FIELDS + "".join(f"\n{'=' * 80}\nMSG: {name}\n{text}" for name, text in _PARTS.items())
+_FIELD = """std_msgs/Header header
+geometry_msgs/Vector3 magnetic_field
+float64[9] magnetic_field_covariance"""
+#: Numbers of a run's readings -> their topic, type, and what encoding "ros2msg" has: the type, and those it is made of.
+READINGS = {
+    count: (topic, kind, fields + "".join(f"\n{'=' * 80}\nMSG: {name}\n{text}" for name, text in _PARTS.items()))
+    for count, topic, kind, fields in (
+        (6, "/imu", "sensor_msgs/msg/Imu", _IMU),
+        (3, "/magnetic_field", "sensor_msgs/msg/MagneticField", _FIELD),
+    )
+}
 #: Orientation, which is not measured (its covariance begins with -1), then the rest; covariances are not known.
-_VALUES = struct.Struct("<37d")
-_BEFORE = (0.0, 0.0, 0.0, 1.0, -1.0, *[0.0] * 8)
+_BEFORE, _ZERO = (0.0, 0.0, 0.0, 1.0, -1.0, *[0.0] * 8), (0.0,) * 9
 
 
-def imu_messages(name: str, samples: Samples) -> Iterator[tuple[int, bytes]]:
+def reading_messages(name: str, samples: Samples) -> Iterator[tuple[int, bytes]]:
     """Yield the time, ns, and the bytes of the message of each sample; ``name`` is its frame."""
     frame = name.encode() + b"\0"
     frame = struct.pack("<I", len(frame)) + frame
     frame += b"\0" * (-(8 + len(frame)) % 8)  # numbers stand at multiples of their size, from the stamp on
-    zero = (0.0,) * 9
     for t_ns, z in zip(np.round(1e9 * samples.t_s).astype(np.int64).tolist(), samples.z.tolist(), strict=True):
         stamp = struct.pack("<4siI", b"\0\1\0\0", *divmod(t_ns, 1_000_000_000))
-        yield t_ns, stamp + frame + _VALUES.pack(*_BEFORE, *z[:3], *zero, *z[3:], *zero)
+        numbers = (*z, *_ZERO) if len(z) == 3 else (*_BEFORE, *z[:3], *_ZERO, *z[3:], *_ZERO)
+        yield t_ns, stamp + frame + struct.pack(f"<{len(numbers)}d", *numbers)

@@ -507,6 +507,11 @@ class KalmanEstimator:
             S = noise + at.HP @ H.T
             beside, gain = _measured(beside, step.kept[0], H, at.HP, z, S)
             by = np.hstack([H * step.kept[0], np.zeros((6, len(gain)))])
+            # The gain is that of images which count less; what remains is by their own noise (Joseph's form).
+            less = (1.0 - 1.0 / ALIKE) * pose_measurement.cov_noise @ np.hstack([K.T, gain.T])
+            whole = np.vstack([K, gain]) @ less
+            P = P - whole[: len(P), : len(P)]
+            beside = beside._replace(C=beside.C - whole[: len(P), len(P) :], Y=beside.Y - whole[len(P) :, len(P) :])
             steps = *steps, StateStep(step.kept[0], by, np.vstack([K, gain]), z, S)
         if not (np.abs(x) < self._furthest).all():  # NaN neither
             return None, Outcome.OUTLIER

@@ -100,6 +100,12 @@ def parallel(arm: Arm) -> list[list[int]]:
     return sets
 
 
+def check_rests(where: str, count: int) -> None:
+    """Raise an InputError about what ``where`` says if rests are too few."""
+    if count < LEAST_RESTS:
+        raise InputError(f"{where}: {count} rests were given; gravity shows zeros from {LEAST_RESTS} on, 30 are good")
+
+
 def gravity_shows(
     arm: Arm, sensor: Inertial, q: Array, readings: Sequence[Reading], prior: Prior | None = None
 ) -> tuple[list[Shown], ReferenceCalibration[Inertial]]:
@@ -115,10 +121,7 @@ def gravity_shows(
     Raises:
         InputError: too few rests.
     """
-    if len(q) < LEAST_RESTS:
-        raise InputError(
-            f"{sensor.name}: {len(q)} rests were given; gravity shows zeros from {LEAST_RESTS} on, 30 are good"
-        )
+    check_rests(sensor.name, len(q))
     if any(reading.channel != ACCELEROMETER for reading in readings):
         raise InputError(f"{sensor.name}: rests need readings of the accelerometer only")
     carrier = ArmRests(arm, prior or Prior(), q)

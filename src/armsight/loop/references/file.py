@@ -1,10 +1,10 @@
 """``references.toml``: a table a reference, and the recordings that it names.
 
 [imu]
-kind = "inertial"
-source = "imu.csv"          # CSV or JSON lines: t_s, gyro_x_rad_s .., accelerometer_x_m_s2 ..; a bag of ROS, a run
+kind = "inertial"           # or "magnetometer"
+source = "imu.csv"          # CSV or JSON lines: t_s and its columns, such as gyro_x_rad_s; a bag of ROS, a run
 live = "udp:5005"           # where `armsight run` reads it, JSON lines of the same keys; or serial:PORT
-class = "mpu-6050"          # what is not known is left out
+class = "mpu-6050"          # of an inertial unit; what is not known is left out
 rate_hz = 100.0
 delay_s = 0.004
 sigma_delay_s = 0.001
@@ -23,28 +23,31 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from armsight.data import Array, Record
 from armsight.errors import InputError
 from armsight.files import read_text, read_toml
 from armsight.geometry.check import checked
-from armsight.geometry.pose import pose
-from armsight.geometry.rotation import exp_so3
+from armsight.loop.references.heading import Magnetometer
 from armsight.loop.references.inertial import Inertial
 from armsight.tables.columns import Columns
 from armsight.vision.sources.bag.reader import S_NS, SUFFIXES, Bag, BagMessage
 
 #: Keys of a reference's table.
 _KEYS = ("kind", "source", "live", "class", "rate_hz", "delay_s", "sigma_delay_s", "parameters", "covariance")
-#: The columns of an inertial unit's recording.
-INERTIAL_COLUMNS = tuple(
-    f"{sensor}_{axis}_{unit}" for sensor, unit in (("gyro", "rad_s"), ("accelerometer", "m_s2")) for axis in "xyz"
-)
-FIELD_COLUMNS = ("field_x_t", "field_y_t", "field_z_t")  # of a magnetometer's, T
 _MOST_MB = 200  # of a recording
-#: ROS's messages: columns of a table with the same, bytes of the numbers at the end, where among them a reading stands.
-IMU, FIELD = "sensor_msgs/Imu", "sensor_msgs/MagneticField"
-_MESSAGES = {IMU: (INERTIAL_COLUMNS, 37 * 8, np.r_[13:16, 25:28]), FIELD: (FIELD_COLUMNS, 12 * 8, np.r_[0:3])}
+Sensor = Inertial | Magnetometer  #: what a file can name
+#: Their kinds in it, and the columns of their recordings.
+KINDS: dict[type[Sensor], str] = {Inertial: "inertial", Magnetometer: "magnetometer"}
+COLUMNS: dict[type[Sensor], tuple[str, ...]] = {
+    Inertial: tuple(f"gyro_{a}_rad_s" for a in "xyz") + tuple(f"accelerometer_{a}_m_s2" for a in "xyz"),
+    Magnetometer: tuple(f"field_{a}_t" for a in "xyz"),
+}
+#: Messages of ROS that have them; bytes of the numbers at the end of these, and where among them a reading stands.
+MESSAGES: dict[type[Sensor], str] = {Inertial: "sensor_msgs/Imu", Magnetometer: "sensor_msgs/MagneticField"}
+_NUMBERS = {MESSAGES[Inertial]: (37 * 8, np.r_[13:16, 25:28]), MESSAGES[Magnetometer]: (12 * 8, np.r_[0:3])}
+RANGE = "sensor_msgs/Range"
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,14 +55,13 @@ class Entry(Record):
     """A reference of the file.
 
     Attributes:
-        sensor_class: what it is like.
+        sensor_class: what an inertial unit is like.
         live: where it is read in a run; None where that is not said.
         rate_hz: readings a second, as the file says; None where it does not.
         calibrated: whether the file has its parameters.
     """
 
-    reference: Inertial
-    kind: str
+    reference: Sensor
     sensor_class: str
     source: Path | None
     live: str | None
@@ -88,8 +90,8 @@ def _entry(path: Path, name: str, table: dict[str, Any]) -> Entry:
     where = f"{path}: [{name}]"
     if unknown := [key for key in table if key not in _KEYS]:
         raise InputError(f"{where}: unknown key {unknown[0]!r}; known are {', '.join(_KEYS)}")
-    if table.get("kind") != "inertial":
-        raise InputError(f"{where}: kind is {table.get('kind')!r}; known is inertial")
+    if (kind := table.get("kind")) not in KINDS.values():
+        raise InputError(f"{where}: kind is {kind!r}; known are {', '.join(KINDS.values())}")
     for key in ("rate_hz", "delay_s", "sigma_delay_s"):
         value = table.get(key, 1.0)
         if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
@@ -100,39 +102,42 @@ def _entry(path: Path, name: str, table: dict[str, Any]) -> Entry:
     for key in ("source", "live", "class"):
         if not isinstance(table.get(key, ""), str):
             raise InputError(f"{where}: {key} is {table[key]!r}; expected a text")
-    kind = table.get("class", "mpu-6050")
-    sensor = Inertial.of(name, kind)
+    like = table.get("class", "mpu-6050")
+    sensor: Sensor = Inertial.of(name, like) if kind == KINDS[Inertial] else Magnetometer.of(name)
     late = table.get("delay_s", 0.0), table.get("sigma_delay_s", sensor.sigma_delay_s)
     sensor = replace(sensor, delay_s=float(late[0]), sigma_delay_s=float(late[1]))
     if "parameters" in table:
         sensor = _known(where, sensor, table["parameters"], table.get("covariance"))
     source = path.parent / table["source"] if "source" in table else None
-    return Entry(sensor, "inertial", kind, source, table.get("live"), table.get("rate_hz"), "parameters" in table)
+    return Entry(sensor, like, source, table.get("live"), table.get("rate_hz"), "parameters" in table)
 
 
-def _known(where: str, sensor: Inertial, given: object, covariance: object) -> Inertial:
-    """Return a sensor with parameters of the file."""
+def _known(where: str, sensor: Sensor, given: object, covariance: object) -> Sensor:
+    """Return a sensor, of which nothing is known, with parameters of the file."""
     names = list(sensor.parameters)
     if not isinstance(given, dict) or list(given) != names:
-        raise InputError(f"{where}: parameters are not those of an inertial unit; calibrate it again")
+        raise InputError(f"{where}: parameters are not those of its kind; calibrate it again")
     try:
         values, cov = np.array(list(given.values()), float), np.array(covariance, float)
     except (TypeError, ValueError):
         raise InputError(f"{where}: parameters and covariance must be numbers; calibrate it again") from None
     checked(values, (len(names),), f"{where}: parameters")
     checked(cov, (len(names), len(names)), f"{where}: covariance")
-    T = pose(exp_so3(values[:3]), values[3:6])
-    return replace(sensor, T_tool_sensor=T, values=values[3:], cov=cov)
+    return replace(sensor.moved(values - np.array(list(sensor.parameters.values()))), cov=cov)
 
 
 def written(entry: Entry, folder: Path) -> str:
     """Return the table of a reference as text, for a file in a folder."""
-    sensor, lines = entry.reference, [f"[{json.dumps(entry.reference.name)}]", f'kind = "{entry.kind}"']
+    sensor, lines = (
+        entry.reference,
+        [f"[{json.dumps(entry.reference.name)}]", f'kind = "{KINDS[type(entry.reference)]}"'],
+    )
     if entry.source is not None:
         lines.append(f"source = {json.dumps(os.path.relpath(entry.source, folder))}")
     if entry.live is not None:
         lines.append(f"live = {json.dumps(entry.live)}")
-    lines.append(f'class = "{entry.sensor_class}"')
+    if isinstance(sensor, Inertial):
+        lines.append(f'class = "{entry.sensor_class}"')
     if entry.rate_hz is not None:
         lines.append(f"rate_hz = {entry.rate_hz:g}")
     lines += [f"delay_s = {sensor.delay_s:.9g}", f"sigma_delay_s = {sensor.sigma_delay_s:.9g}"]
@@ -141,17 +146,17 @@ def written(entry: Entry, folder: Path) -> str:
     return "\n".join([*lines, f"covariance = [\n{rows}\n]"]) + "\n"
 
 
-def read_recording(path: Path, kind: str = IMU) -> tuple[Array, Array]:
-    """Return times (N,), s, and values of a recording: of an IMU (N, 6), rad/s and m/s2, of a FIELD (N, 3), T.
+def read_recording(path: Path, kind: type[Sensor] = Inertial) -> tuple[Array, Array]:
+    """Return times (N,), s, and values of a recording, by a reference's columns: of a unit (N, 6), rad/s and m/s2.
 
     Raises:
         InputError: the file, the line and what was expected.
     """
     if path.is_dir() or path.suffix.lower() in SUFFIXES:
-        return _of_bag(Bag(path), kind)
-    names = _MESSAGES[kind][0]
-    columns = Columns.of_csv(path) if path.suffix.lower() not in (".jsonl", ".ndjson") else _json_lines(path, names)
-    return columns.numbers(["t_s"])[:, 0], columns.numbers(names)
+        return _of_bag(Bag(path), MESSAGES[kind])
+    lines = path.suffix.lower() in (".jsonl", ".ndjson")
+    columns = _json_lines(path, COLUMNS[kind]) if lines else Columns.of_csv(path)
+    return columns.numbers(["t_s"])[:, 0], columns.numbers(COLUMNS[kind])
 
 
 def _of_bag(bag: Bag, kind: str) -> tuple[Array, Array]:
@@ -160,23 +165,48 @@ def _of_bag(bag: Bag, kind: str) -> tuple[Array, Array]:
     if len(topics) != 1:
         listed = ", ".join(topics) or bag.holds()
         raise InputError(f"{bag.path}: expected one topic of {kind}; there are {len(topics)}: {listed}")
-    found = [reading_of(message, kind) for message in bag.messages(topics)]
+    found = [reading_of(message) for message in bag.messages(topics)]
     return np.array([t for t, _ in found]), np.array([z for _, z in found])
 
 
-def reading_of(message: BagMessage, kind: str = IMU) -> tuple[float, Array]:
+def read_ranges(path: Path) -> tuple[tuple[str, ...], Array, NDArray[np.int64], Array]:
+    """Return what ``sensor_msgs/Range`` of a bag of ROS measured: topics, a sensor each, in order of their names.
+
+    Then times (N,), s, rising; the topic's number (N,); ranges (N,), m. Those outside of what their message says that the
+    sensor measures, infinite ones among them (REP 117), are left out.
+
+    Raises:
+        InputError: the bag has none.
+    """
+    bag = Bag(path)
+    topics = tuple(topic.name for topic in bag.of_kind(RANGE))
+    if not topics:
+        raise InputError(f"{path}: expected topics of {RANGE}; it holds {bag.holds()}")
+    rows = list[tuple[float, int, float]]()
+    for message in bag.messages(topics):
+        range_ = message.decode()
+        if range_.min_range <= range_.range <= range_.max_range and np.isfinite(range_.range):
+            rows.append((_time_s(message), topics.index(message.topic), float(range_.range)))
+    t_s, channel, z = np.array(sorted(rows)).reshape(-1, 3).T
+    return topics, t_s, channel.astype(np.int64), z
+
+
+def _time_s(message: BagMessage) -> float:
+    return (message.stamp_ns() or message.arrival_ns) / S_NS
+
+
+def reading_of(message: BagMessage) -> tuple[float, Array]:
     """Return the time, s, and the reading of a message: (6,), rad/s and m/s2, or of a field (3,), T.
 
     Raises:
         InputError: it is too short.
     """
-    _, size, rows = _MESSAGES[kind]
-    stamp = message.stamp_ns() or message.arrival_ns
+    size, rows = _NUMBERS[message.kind]
     if len(message.data) < size:
         raise InputError(f"{message.topic}: message {message.index + 1} is cut short: {len(message.data)} bytes")
     order = ">" if message.encoding == "cdr" and not message.data[1] & 1 else "<"
     values = np.frombuffer(message.data[-size:], f"{order}f8").astype(float)
-    return stamp / S_NS, values[rows]
+    return _time_s(message), values[rows]
 
 
 def _json_lines(path: Path, names: Sequence[str]) -> Columns:

@@ -22,8 +22,11 @@ from armsight.loop.references.reference import ExpectedReading, Reading, Referen
 
 #: The Earth's field, T, is 22e-6 to 67e-6 (IGRF); half, double: the soft iron is as much too small, no heading differs.
 EARTH_T = 45e-6
+#: One reading of a consumer's chip, one sigma, T; half, double: nothing, as motors are louder.
+NOISE_T = 0.5e-6
 #: A field that rotates with the tool by less, T, is none; half: dead sensors pass, double: weak fields are rejected.
 LEAST_T = 5e-6
+_MOST_T = 5e-3  # ranges of chips end there; half, double: nothing
 #: One sigma before a calibration: soft iron, relative; hard iron and field, T; half, double: nothing.
 _SOFT, _HARD_T, _FIELD_T = 0.3, 200e-6, 30e-6
 #: Attitudes for 10 unknowns a row at least; singular value, last over first, below which they do not span the space.
@@ -106,6 +109,7 @@ class Magnetometer(Reference):
         Raises:
             InputError: too few attitudes, or all about one axis.
         """
+        check_unit(self.name, np.array([each.z for each in readings]))
         if len(readings) < _ATTITUDES:
             raise InputError(f"{self.name}: {len(readings)} attitudes; {_ATTITUDES} at least are needed")
         R = np.array([motion(each.t_s - self.delay_s).T_base_tool[:3, :3] for each in readings])
@@ -124,6 +128,13 @@ class Magnetometer(Reference):
         size = np.linalg.norm(m) / EARTH_T
         rotation, soft = polar(sign * size * A, side="left")
         return replace(self, R_tool_sensor=rotation.T, soft=soft, hard_t=found[9], field_t=sign * m / size)
+
+
+def check_unit(where: str, z: Array) -> None:
+    """Raise an InputError where fields (N, 3) are so large that they are no tesla."""
+    size = float(np.median(np.linalg.norm(z, axis=1))) if len(z) else 0.0
+    if size > _MOST_T:
+        raise InputError(f"{where}: the field is {size:.3g} T, as if in uT, mG or gauss; give T (1 G is 1e-4 T)")
 
 
 @dataclass(frozen=True, eq=False)

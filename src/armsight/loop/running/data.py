@@ -88,7 +88,7 @@ class JointsDatum(Record):
     )
     cov: Array | None = None  #: (6, 6) its covariance, right tangent [m; rad]
     vision_age_s: float = np.inf  #: time since the newest measurement used, s; infinite before the first
-    #: name and samples of the inertial unit that the estimator was given after these readings; None without.
+    #: name and samples of the reference that came after these readings; None without.
     felt: tuple[str, Samples] | None = None
 
     @property

@@ -22,7 +22,9 @@ from armsight.estimate.solve import squares_of
 from armsight.loop.estimators.estimator import Estimator, Innovation, Outcome
 from armsight.loop.estimators.kalman import KalmanEstimator
 from armsight.loop.references.file import Entry, read_recording
-from armsight.loop.references.inertial import INERTIAL_CLASSES
+from armsight.loop.references.heading import NOISE_T, Magnetometer, heading_off
+from armsight.loop.references.inertial import INERTIAL_CLASSES, Inertial
+from armsight.loop.references.reference import Reading, ToolMotion
 from armsight.loop.references.strapdown import GAP_S, Samples
 from armsight.robot.boards.contract import MotionBoard
 from armsight.robot.kinematics.arm import Arm
@@ -121,6 +123,8 @@ MOST = 1000
 #: Outliers so close together are one impact, s; half: one that rings counts twice, double: two knocks count once.
 APART_S = 0.3
 _SAID = 5  # impacts in a line
+#: Fields are compared so far apart, s; half: a motor counts twice, double: less is averaged. Sigmas that agree at most.
+FIELDS_S, AGREES = 0.2, 3.0
 #: Returns times (N,), s, and readings (N, 6) up to a time, s, that were not returned before.
 ReadingsSource = Callable[[float], tuple[Array, Array]]
 
@@ -162,6 +166,29 @@ class FusedRow:
         )
 
 
+@dataclass(frozen=True)
+class HeadingRow:
+    """How the arm's heading agrees with a magnetometer's."""
+
+    name: str  #: of the reference
+    readings: int  #: that were compared, ``FIELDS_S`` apart
+    begin_s: float  #: of the first, s
+    heading_off_rad: float  #: rotation of the base about its z, or of joint 1's zero, since the calibration
+    sigma_rad: float  #: of that, motors and calibration included
+    agrees: bool  #: whether it is below ``AGREES`` sigma
+    disturbance_t: float  #: median field of motors and iron, T, as far as it shows
+    losses: tuple[str, ...]  #: what was lost of it; empty where nothing was
+
+    @property
+    def line(self) -> str:
+        """It as a line for people."""
+        found = "agrees" if self.agrees else "disagrees: was the base rotated, or is a magnet near?"
+        return (
+            f"heading by {self.name} since {self.begin_s:.1f} s: off by {np.degrees(self.heading_off_rad):.2f} deg, sigma "
+            f"{np.degrees(self.sigma_rad):.2f}, motors disturb it by {1e6 * self.disturbance_t:.2g} uT; it {found}"
+        ) + "".join(f"; {each}" for each in self.losses)
+
+
 class Fused:
     """A unit in an estimator.
 
@@ -180,12 +207,11 @@ class Fused:
         source: ReadingsSource = lambda end_s: (np.empty(0), np.empty((0, 6))),
         losses: Counter[str] | None = None,
     ) -> None:
-        self.entry, self._sensor, self._source = entry, entry.reference, source
-        self._losses = Counter[str]() if losses is None else losses
+        self.entry, self._source, self._losses = entry, source, Counter[str]() if losses is None else losses
         kind = INERTIAL_CLASSES[entry.sensor_class]
         self._density = np.repeat([kind.gyro_noise, kind.noise], 3)
         self._squares, self.windows, self.outliers = 0.0, 0, 0
-        self.impacts = list[float]()
+        self.impacts, self._compared = list[float](), list[tuple[Reading, Array]]()
         self.begin_s = np.inf
         self.rejected_s: float | None = None
         self._impact_s, self._off = -np.inf, list[str]()
@@ -203,16 +229,19 @@ class Fused:
         samples = Samples(np.round(1e9 * t_s) / 1e9, z, self._density)
         self._apart_s, self._newest_s = float(t_s[-1] - (t_s[-2] if len(t_s) > 1 else self._newest_s)), float(t_s[-1])
         if self.entry.calibrated and isinstance(estimator, KalmanEstimator):
-            estimator.on_reading = self._heard
-            outcome = estimator.take(self._sensor, samples)
-            if outcome is Outcome.OUTLIER and self.rejected_s is None:
-                self.rejected_s = float(t_s[-1])
-                self._losses[f"it was dropped at {self.rejected_s:.1f} s: images contradict it"] += 1
-            for name, off in estimator.unit_differs().items():
-                if off > OFF and name not in self._off:
-                    self._off.append(name)
-                    self._losses[f"its {name} is more than {OFF:g} sigma off: calibrate it again"] += 1
+            self._take(estimator, samples)
         return samples
+
+    def _take(self, estimator: KalmanEstimator, samples: Samples) -> None:
+        estimator.on_reading = self._heard
+        outcome = estimator.take(self.entry.reference, samples)
+        if outcome is Outcome.OUTLIER and self.rejected_s is None:
+            self.rejected_s = self._newest_s
+            self._losses[f"it was dropped at {self.rejected_s:.1f} s: images contradict it"] += 1
+        for name, off in estimator.unit_differs().items():
+            if off > OFF and name not in self._off:
+                self._off.append(name)
+                self._losses[f"its {name} is more than {OFF:g} sigma off: calibrate it again"] += 1
 
     @property
     def losses(self) -> tuple[str, ...]:
@@ -232,7 +261,7 @@ class Fused:
         else:
             self._squares += float(squares_of(z[None], innovation.cov[None])[0]) / len(z)
 
-    def row(self, covs: Array, before: tuple[float, float] | None = None) -> FusedRow:
+    def row(self, covs: Array, before: tuple[float, float] | None = None) -> FusedRow | HeadingRow:
         """Return what it did to estimates with covariances (N, 6, 6) since the first window.
 
         ``before``: how far these are from others without it, and the sigma of those, RMS, m.
@@ -241,7 +270,7 @@ class Fused:
             InputError: it was never used; the message says why.
         """
         if not self.windows or not len(covs):
-            raise InputError("; ".join((f"[{self._sensor.name}]: {self._unused()}", *self.losses)))
+            raise InputError("; ".join((f"[{self.entry.reference.name}]: {self._unused()}", *self.losses)))
         ratio = float(np.sqrt(self._squares / max(self.windows - self.outliers, 1)))
         agrees = (
             self.outliers < OUTLIERS * self.windows and self.rejected_s is None and ratio < HONEST and not self._off
@@ -249,7 +278,7 @@ class Fused:
         sigma = float(np.sqrt(np.einsum("nii->ni", covs)[:, :3].sum(axis=1).mean()))
         moved, without = (None, None) if before is None else before
         said = self.windows, self.outliers, self.begin_s, ratio, agrees, self.rejected_s
-        return FusedRow(self._sensor.name, *said, moved, sigma, without, tuple(self.impacts), self.losses)
+        return FusedRow(self.entry.reference.name, *said, moved, sigma, without, tuple(self.impacts), self.losses)
 
     def _unused(self) -> str:
         """Return why no window was used."""
@@ -257,7 +286,7 @@ class Fused:
             return "was recorded alone: armsight references calibrate finds its parameters"
         if np.isnan(self._newest_s):
             return "no reading is of the run's times; do both have one clock?"
-        if self._apart_s > GAP_S:
+        if self._apart_s > GAP_S and isinstance(self.entry.reference, Inertial):
             return (
                 f"samples are {1e3 * self._apart_s:.0f} ms apart, at most {1e3 * GAP_S:.0f} are integrated over; record "
                 "faster"
@@ -265,8 +294,40 @@ class Fused:
         return "the run ended before its mounting and the camera's delay were known; a unit is used from then on"
 
 
+class Witness(Fused):
+    """A magnetometer: it is compared with the estimates and changes none, as motors disturb it for seconds."""
+
+    def _take(self, estimator: KalmanEstimator, samples: Samples) -> None:
+        for t, z in zip(samples.t_s.tolist(), samples.z, strict=True):
+            at = t - self.entry.reference.delay_s
+            begin, end = estimator.span_s
+            if begin <= at <= end and (not self._compared or t - self._compared[-1][0].t_s >= FIELDS_S):
+                T = estimator.track(np.array([at])).Ts_base_tool[0]
+                self._compared.append((Reading(t, 0, z, NOISE_T**2 * np.eye(3)), T))
+                self.begin_s, self.windows = min(self.begin_s, at), self.windows + 1
+
+    def row(self, covs: Array, before: tuple[float, float] | None = None) -> FusedRow | HeadingRow:
+        """Return how the heading of the arm agrees with that of the field; ``before`` does not matter."""
+        sensor = self.entry.reference
+        if self.windows < 2 or not isinstance(sensor, Magnetometer):
+            return super().row(covs[:0])
+        poses = {each.t_s - sensor.delay_s: T for each, T in self._compared}
+        off = heading_off(sensor, [each for each, _ in self._compared], lambda t: ToolMotion(poses[t]))
+        agrees = abs(off.angle_rad) < AGREES * off.sigma_rad
+        disturbed = float(np.median(off.disturbance_t))
+        return HeadingRow(
+            sensor.name, self.windows, self.begin_s, off.angle_rad, off.sigma_rad, agrees, disturbed, self.losses
+        )
+
+
+def fused(entry: Entry, source: ReadingsSource | None = None, losses: Counter[str] | None = None) -> Fused:
+    """Return what takes a reference's readings into a run."""
+    kind = Fused if isinstance(entry.reference, Inertial) else Witness
+    return kind(entry, losses=losses) if source is None else kind(entry, source, losses)
+
+
 def recorded(entry: Entry) -> Fused:
-    """Return a unit whose readings are those of its recording.
+    """Return a reference whose readings are those of its recording.
 
     Raises:
         InputError: it is not calibrated, or its recording cannot be read.
@@ -276,7 +337,7 @@ def recorded(entry: Entry) -> Fused:
         raise InputError(
             f"[{entry.reference.name}]: has no {lacks}; armsight references calibrate writes a file that has them"
         )
-    t_s, z = read_recording(entry.source)
+    t_s, z = read_recording(entry.source, type(entry.reference))
     at = 0
 
     def source(end_s: float) -> tuple[Array, Array]:
@@ -285,11 +346,11 @@ def recorded(entry: Entry) -> Fused:
         first, at = max(at, end - MOST), end
         return t_s[first:end], z[first:end]
 
-    return Fused(entry, source)
+    return fused(entry, source)
 
 
 def the_one(entries: list[Entry], where: object) -> Entry:
-    """Return the one reference that is fused.
+    """Return the one reference of a run.
 
     Raises:
         InputError: there are several.
@@ -297,7 +358,7 @@ def the_one(entries: list[Entry], where: object) -> Entry:
     first, *others = entries
     if others:
         raise InputError(
-            f"{where}: [{others[0].reference.name}]: one inertial unit is fused; leave one table in the file"
+            f"{where}: [{others[0].reference.name}]: a run takes one reference; leave one table in the file"
         )
     return first
 

@@ -31,6 +31,7 @@ from armsight.robot.boards.link import TICK_S
 from armsight.robot.kinematics.arm import Arm
 from armsight.sim.camera.stages import CameraPipeline
 from armsight.sim.example_rig import board_poses
+from armsight.sim.references.heading import MagneticUnit
 from armsight.sim.references.inertial import InertialUnit
 from armsight.sim.render.optics import Sensor
 from armsight.sim.render.scene import charuco, chessboard
@@ -324,8 +325,8 @@ class Workcell:
         """(5, n) the joint angles of the workcell's five poses, rad, as the nominal table has them; body in view."""
         return workcell_poses(self.model, default=self._default)
 
-    def carry(self, unit: InertialUnit) -> Callable[[float], tuple[Array, Array]]:
-        """Return what reads an inertial unit on the tool: stamps (N,) up to a time, s, and readings (N, 6), each once."""
+    def carry(self, unit: InertialUnit | MagneticUnit) -> Callable[[float], tuple[Array, Array]]:
+        """Return what reads a sensor on the tool: stamps (N,) up to a time, s, and readings (N, m), each once."""
         at = self.plant.travelled.ticks
 
         def read(end_s: float) -> tuple[Array, Array]:
