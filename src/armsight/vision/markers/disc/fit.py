@@ -704,7 +704,7 @@ REASONS = {
     10: "its surround is not uniform: text, a ring, a square of a board",
     11: "a duplicate of another disc",
 }
-FAINT, HILLY, NOT_UNIFORM, FOUND_TWICE = 6, 8, 10, 11
+NOT_ELLIPSE, FAINT, HILLY, NOT_UNIFORM, FOUND_TWICE = 5, 6, 8, 10, 11
 #: Reasons of candidates that have a closed rim, those that look most like a disc first.
 LOOK_ALIKES = (5, 8, 1, 10, 3, 4, 6)
 _MOST_BLUR = 0.8  # of the smaller half axis
