@@ -20,6 +20,7 @@ from armsight.kernels import kernel
 from armsight.vision.markers.disc.common import FIELDS, SHARED, common, correct
 from armsight.vision.markers.disc.fit import (
     MOST_DISCS,
+    NOT_ELLIPSE,
     PARAMETERS,
     REASONS,
     SURROUND,
@@ -104,7 +105,7 @@ def _outlines(
     n, _ = search(image, words, noise_of(image), bright, dark, starts, codes, signs, room)
     across, good = np.empty(_RAYS), 0
     for i in range(n):
-        if codes[i] != 0 and codes[i] not in OUTLINED:
+        if codes[i] == NOT_ELLIPSE or (codes[i] != 0 and codes[i] not in OUTLINED):
             continue
         found, _ = _rim_contrast(image, starts[i], signs[i], across)
         if found > 0.0:

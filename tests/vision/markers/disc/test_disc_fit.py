@@ -402,3 +402,27 @@ def test_what_in_the_background_is_skewed_and_faint_moves_no_disc():
         found = BRIGHT.find(grey(light, 1.0, rng))
         assert len(found.uv) == 8
         assert not found.common[0].any()
+
+
+def wall(seed, count=16):
+    """Return an image of a brick wall (480, 640) with discs of 90 levels before it, and their centres."""
+    rng = np.random.default_rng(seed)
+    fine = np.full((4 * 480, 4 * 640), 45.0)
+    for top in range(0, 4 * 480, 96):
+        for column in range(11):
+            left = 208 * column - 100 + 104 * (top // 96 % 2)
+            cv2.rectangle(fine, (left, top), (left + 193, top + 81), float(np.clip(rng.normal(75, 12), 50, 120)), -1)
+    cells = rng.permutation(48)[:count]
+    uv = np.stack([60 + 74 * (cells % 8), 50 + 76 * (cells // 8)], axis=1) + rng.uniform(-15, 15, (count, 2))
+    for centre, radius in zip(uv, rng.uniform(5, 9, count), strict=True):
+        cv2.circle(fine, tuple(np.rint(64 * centre + 24).astype(int).tolist()), int(64 * radius), 165.0, -1, shift=4)
+    image = cv2.GaussianBlur(cv2.resize(fine, (640, 480), interpolation=cv2.INTER_AREA), (0, 0), 0.8)
+    return grey(image, 2.0, rng), uv
+
+
+def test_bricks_are_rejected_by_their_outlines_and_hide_no_disc():
+    image, uv = wall(0)
+    found = BRIGHT.find(image)
+    assert np.linalg.norm(uv[:, None] - found.uv[None], axis=2).min(axis=1).max() < 0.2
+    assert len(found.uv) == len(uv)
+    assert {each.reason for each in found.rejected} == {REASONS[5]}
