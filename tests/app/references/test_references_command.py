@@ -170,6 +170,11 @@ def test_gravity_shows_a_tilted_base_and_says_what_is_open(capsys, tmp_path):
     said = said_of(capsys, *given, "--json")
     assert said.code == 0, said.err
     hold_keys(given, said.out)
+    np.savetxt(tmp_path / "few.csv", rests[:7], "%.6f", ",", header=head, comments="")
+    (tmp_path / "imu.csv").unlink()  # which is not read before
+    few = said_of(capsys, *given[:-1], tmp_path / "few.csv")
+    assert few.code == 2
+    assert "few.csv: 7 rests were given; gravity shows zeros from 8 on" in few.err
     found = {each["name"]: each for each in said.lines[0]["found"]}
     for axis, tilt in (("x", 0.5), ("y", -0.3)):
         tilted = found[f"base tilt about {axis}"]
