@@ -22,15 +22,15 @@ class Retired(NamedTuple):
 
 
 def _into(option: str, form: str = "{}", *, many: bool = True) -> Rule:
-    """Return the rule of an option whose value another one takes, which may be given several times, or not."""
+    """Return the rule of an option whose value another one, or none, takes, which may be given several times, or not."""
 
     def rule(arguments: list[str], value: str) -> tuple[str, str]:
         if not many and option in arguments:
             raise InputError(
                 f"{option} {_value(arguments, option)} says the same as what is retired: give one of the two"
             )
-        arguments += [option, form.format(value)]
-        return option, f"write {shlex.join(arguments[-2:])}"
+        arguments += (new := [*filter(None, [option]), form.format(value)])
+        return option, f"write {shlex.join(new)}"
 
     return rule
 
@@ -96,12 +96,6 @@ def _nothing(why: str) -> Rule:
     return lambda arguments, value: ("", why)
 
 
-def _key(arguments: list[str], value: str) -> tuple[str, str]:
-    """Put the baseline among the keys of a plan."""
-    arguments.append(f"baseline={value}")
-    return "", f"write {arguments[-1]}"
-
-
 _SEEN_BY_TWO = ("calibrate", "measure", "handeye")
 #: All of them.
 RETIRED = (
@@ -124,7 +118,7 @@ RETIRED = (
     Retired("--frames", ("handeye",), _into("--columns", "frames={}")),
     Retired("--scheduler", ("batch",), _into("--workers", many=False)),
     Retired("--run", ("budget",), _into("--rig", many=False)),
-    Retired("--baseline", ("budget",), _key),
+    Retired("--baseline", ("budget",), _into("", "baseline={}")),
     Retired("--ar4-offsets", ("board",), _into("--board", "ar4:{}", many=False)),
     Retired("--follow-rig", ("demo",), _nothing("in the demo no rig moves"), is_flag=True),
     Retired("--rectified", ("dense",), _nothing("a pair without a RIG.json is rectified"), is_flag=True),

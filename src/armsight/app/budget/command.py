@@ -18,15 +18,9 @@ from armsight.errors import InputError
 @click.option("--want", metavar="ERROR", help="What 95 % of the errors are to be within: 0.1mm, or 0.1mm,0.05deg.")
 @click.option("--camera", metavar="CLASS", help="A class of the catalogue, such as webcam-720p.")
 @click.option("--body", metavar="FILE|BOARD", help="What is measured: a body file, or chessboard:9x6:25mm.")
-@click.option(
-    "--rig",
-    metavar="RIG.json|RUN",
-    help="The budget of a rig that there is, or of a run's, beside what the run measured.",
-)
+@click.option("--rig", metavar="RIG.json|RUN", help="A rig that there is, or a run's, beside what the run measured.")
 @click.option("--arm", metavar="ARM", help="For the closed loop: a model's name or a file.")
-@click.option(
-    "--best", "optimise", is_flag=True, help="Choose what is left out so that it measures best, for each class."
-)
+@click.option("--best", "optimise", is_flag=True, help="Choose what is left out, for each class of cameras.")
 @click.option("-o", "--output", metavar="DIR", help="Write report.html, budget.json, the rig and the body to print.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
 def command(plan: Sequence[str], optimise: bool, output: str | None, as_json: bool, **options: str | None) -> int:
@@ -46,9 +40,8 @@ def command(plan: Sequence[str], optimise: bool, output: str | None, as_json: bo
         raise InputError(f"{more[0]}: {path} is the plan already: expected one PLAN.toml, and KEY=VALUE")
     given = options | RigPlan.of_text(each for each in plan if "=" in each)
     if output is not None:
-        check_folder(
-            output, holding=REPORT_FILES, apart_from=(path, *filter(None, map(given.get, ("rig", "arm", "body"))))
-        )
+        used = [path, *filter(None, map(given.get, ("rig", "arm", "body")))]
+        check_folder(output, holding=REPORT_FILES, apart_from=used)
     run = given.pop("rig") if Path(given["rig"] or "rig.json").is_dir() else None
     if run is not None and optimise:
         raise InputError(f"--rig {run}: a run's rig is chosen already: leave out --best")
@@ -58,13 +51,10 @@ def command(plan: Sequence[str], optimise: bool, output: str | None, as_json: bo
         from armsight.app.budget.run import motion_volume  # here and below: what a plan alone does not need
 
         given |= motion_volume(Path(motion), given["arm"]) | ({"speed": given["speed"]} if given["speed"] else {})
+    if run is not None:
+        from armsight.app.budget.run import run_plan
     with steps() as progress:
-        if run is None:
-            asked = RigPlan.read(path, **given)
-        else:
-            from armsight.app.budget.run import run_plan
-
-            asked = run_plan(Path(run), path, **given)
+        asked = RigPlan.read(path, **given) if run is None else run_plan(Path(run), path, **given)
         alternatives = best(asked, progress) if optimise else ()
         found = chosen(alternatives) if alternatives else RigBudget(asked, planned(asked))
         found.check()

@@ -87,11 +87,10 @@ def to_build(found: RigBudget) -> dict[str, str]:
 
 
 def _asked(plan: RigPlan) -> dict[str, Any]:
-    """Return what an optimised plan says, its focal length as a number."""
+    """Return what an optimised plan says, what follows from the rest as numbers."""
     keys = ("camera", "baseline", "distance", "focal_widths", "verging_deg", "body_scale", "pairs", "exposure_ms")
-    lens = round(plan.focal_px / plan.image_size_px[0], 3)
     return {key: getattr(plan, key) for key in keys} | {
-        "focal_widths": lens,
+        "focal_widths": round(plan.focal_px / plan.image_size_px[0], 3),
         "focal_mm": round(plan.focal_mm, 1),
         "verging_deg": round(plan.stereo_rig.convergence_deg, 1),
         "body_depth": plan.body_depth,
@@ -100,22 +99,20 @@ def _asked(plan: RigPlan) -> dict[str, Any]:
 
 
 def _compared(alternatives: Sequence[Alternative]) -> list[TextTable]:
-    """Return the table of alternatives; those of one group differ by less than the prediction is off."""
-    if not alternatives:
-        return []
-    reached, build = list[tuple[str, ...]](), list[tuple[str, ...]]()
+    """Return the tables of alternatives; those of one group differ by less than the prediction is off."""
+    reached, build, asked = list[tuple[str, ...]](), list[tuple[str, ...]](), dict[str, Any]()
     for one in alternatives:
-        asked = _asked(one.budget.plan)
+        move, asked = one.budget.moving, _asked(one.budget.plan)
         name, lens = asked.pop("camera"), f"{asked.pop('focal_widths')} ({asked.pop('focal_mm')} mm)"
-        move, group = one.budget.moving, "ABCDEFGHIJ"[one.group]
-        lost = f"{100 * move.lost_share:.0f} %"
-        reached.append((name, str(one.price), group, f"{move.mm:.2g}", f"{move.deg:.2g}", lost))
+        at = (f"{move.mm:.2g}", f"{move.deg:.2g}", f"{100 * move.lost_share:.0f} %")
+        reached.append((name, str(one.price), "ABCDEFGHIJ"[one.group], *at))
         build.append((name, lens, *map(str, asked.values())))
     title = "the best of each class, 95 % in motion; those of one group differ by less than predictions are off"
-    return [
+    tables = (
         TextTable(title, ("camera", "price class", "group", "mm", "deg", "lost"), tuple(reached)),
         TextTable("what to build for it", ("camera", "focal_widths", *asked), tuple(build)),
-    ]
+    )
+    return list(tables) if alternatives else []
 
 
 def _answer(found: RigBudget) -> tuple[Grade, str]:

@@ -86,7 +86,7 @@ def marker_noise(pipeline: CameraPipeline, kind: str, size_px: float, moved_px: 
 def _noise(pipeline: CameraPipeline, kind: str, size_px: float, moved_px: float) -> tuple[float, int, int]:
     """Render and detect charts until there are enough; return sigma, 0 where most are not found, the found and all."""
     size = _BOARD_PX if kind == "square" and size_px <= _SQUARE_PX else _SIZE_PX
-    imager = _imager(pipeline, size)
+    imager = SimulatedCamera(pipeline, size, seed=0)
     rng, off, asked = np.random.default_rng(42), list[Array](), 0
     for number in range(_MOST_IMAGES):
         chart, light, true = _shown(kind, size_px, number, pipeline.psf_sigma_px, size)
@@ -111,12 +111,6 @@ def _noise(pipeline: CameraPipeline, kind: str, size_px: float, moved_px: float)
     scale = float(np.median(np.abs(every)) / 0.6745)
     near = every[(np.abs(every) < _BLUNDER * max(scale, 1e-4)).all(axis=1)]
     return float(np.sqrt(chart.points * (near**2).mean())), len(every), asked
-
-
-@lru_cache(maxsize=1)
-def _imager(pipeline: CameraPipeline, size: tuple[int, int]) -> SimulatedCamera:
-    """Return the camera; its noise follows from the number of an image."""
-    return SimulatedCamera(pipeline, size, seed=0)
 
 
 @lru_cache(maxsize=12)  # 2 MB each

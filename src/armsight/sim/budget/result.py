@@ -120,15 +120,10 @@ class Improvement(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class RigBudget(Record):
-    """What a plan will measure, or a rig that there is; in mm and degrees: ``mm``, ``deg``, ``at_rest.mm``.
-
-    Attributes:
-        plan: the plan.
-        found: the covariances by cause and position, m and rad.
-    """
+    """What a plan will measure, or a rig that there is; in mm and degrees: ``mm``, ``deg``, ``at_rest.mm``."""
 
     plan: RigPlan
-    found: Budget
+    found: Budget  #: the covariances by cause and position, m and rad.
 
     def __repr__(self) -> str:
         """Return the answer in one line."""
@@ -216,16 +211,15 @@ class RigBudget(Record):
 
     def to_dict(self) -> dict[str, Any]:
         """Return what ``armsight budget --json`` prints, in m and rad."""
-        lateral, depth = self.found.along(self.found.cov())
+        found, whole = self.found, self.found.cov()
+        shares = {f"{share}_rms_m": found.rms(found.cov(of=share))[0] for share in ("precision", "trueness")}
         return {
             "plan": {each.name: getattr(self.plan, each.name) for each in self.plan.settings()},
             "focal_px": self.plan.focal_px,
             "results": {name: state._asdict() for name, state in self.states.items()},
-            "lost_share_in_motion": float(self.found.lost.mean()),
-            "precision_rms_m": self.found.rms(self.found.cov(of="precision"))[0],
-            "trueness_rms_m": self.found.rms(self.found.cov(of="trueness"))[0],
-            "lateral_rms_m": lateral,
-            "depth_rms_m": depth,
+            "lost_share_in_motion": float(found.lost.mean()),
+            **shares,
+            **dict(zip(("lateral_rms_m", "depth_rms_m"), found.along(whole), strict=True)),
             "causes": [cause._asdict() for cause in self.causes],
             "changes": [change._asdict() for change in self.changes],
             "not_modelled": list(NOT_MODELLED),
@@ -243,8 +237,7 @@ def budget(path: str = "", **plan: Any) -> RigBudget:  # noqa: ANN401
     Raises:
         InputError: an unknown key, a value that cannot be read, or a rig that cannot be built, with the nearest that can.
     """
-    given = RigPlan.read(path, **plan)
-    found = RigBudget(given, planned(given))
+    found = RigBudget(given := RigPlan.read(path, **plan), planned(given))
     found.check()
     return found
 
@@ -298,7 +291,7 @@ def _of_camera(plan: RigPlan, name: str) -> dict[str, Any]:
 def loss(plan: RigPlan) -> float:
     """Return what 95 % are within in motion over what was requested, or m; infinity for what cannot be built."""
     try:
-        return Accuracy.moving(planned(plan)).over(*plan.requested or ())
+        return Accuracy.moving(planned(replace(plan))).over(*plan.requested or ())  # a key that holds no views
     except InputError:
         return math.inf
 
