@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from armsight.errors import InputError
+from armsight.vision.blinking import WINDOW, window
 from armsight.vision.image import grey, read_image
 
 RNG = np.random.default_rng(0)
@@ -165,6 +166,12 @@ def test_grey_of_every_kind_of_image():
     for image in (GREY, GREY.astype(np.uint16), COLOUR):
         assert not grey(image).flags.writeable
     assert GREY.flags.writeable
+
+
+def test_a_dark_window_of_a_deep_image_has_the_grey_levels_of_the_whole():
+    deep = np.full((2 * WINDOW, 2 * WINDOW), 900, np.uint16)
+    deep[0, 0] = 4000
+    assert set(np.unique(window(deep, (WINDOW, WINDOW)))) == {round(900 * 255 / 4095)}
 
 
 @pytest.mark.parametrize(
