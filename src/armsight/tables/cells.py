@@ -192,11 +192,7 @@ def _of_file(path: Path, side: str, whose: str | None) -> Cells:
 
 def _delimited(path: Path, text: str, written: list[tuple[int, str]]) -> Cells:
     """Return the cells of a table, whatever separates them."""
-    cells = _separated(path, text.splitlines(), written[0][1] if written else "")
-    rows = [(line, [cell.strip() for cell in row]) for line, row in enumerate(cells, 1)]
-    rows = [(line, row) for line, row in rows if any(row) and not row[0].startswith("#")]
-    count = len(rows[0][1]) - (rows[0][1][-1] == "") if rows else 0
-    rows = [(line, row[:-1] if len(row) == count + 1 and row[-1] == "" else row) for line, row in rows]
+    rows = _with_content(_separated(path, text.splitlines(), written[0][1] if written else ""))
     if not rows:
         raise InputError(f"{path}: no rows; one line a pose is needed")
     head = rows[0][1]
@@ -209,6 +205,14 @@ def _delimited(path: Path, text: str, written: list[tuple[int, str]]) -> Cells:
             raise InputError(f"{path}: line {rows[0][0]} names a column twice: {twice}")
         return Cells(head, _even(path, rows[1:], len(head)))
     return _without_names(path, rows)
+
+
+def _with_content(cells: list[list[str]]) -> list[tuple[int, list[str]]]:
+    """Return the rows that are neither empty nor comments, with their lines; without an empty cell behind the last."""
+    rows = [(line, [cell.strip() for cell in row]) for line, row in enumerate(cells, 1)]
+    rows = [(line, row) for line, row in rows if any(row) and not row[0].startswith("#")]
+    count = len(rows[0][1]) - (rows[0][1][-1] == "") if rows else 0
+    return [(line, row[:-1] if len(row) == count + 1 and row[-1] == "" else row) for line, row in rows]
 
 
 def _separated(path: Path, lines: list[str], first: str) -> list[list[str]]:

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from armsight.errors import InputError
+
+if TYPE_CHECKING:
+    from armsight.sim.budget.plan import RigPlan
 
 
 @click.command("budget")
@@ -45,16 +49,8 @@ def command(plan: Sequence[str], optimise: bool, output: str | None, as_json: bo
     run = given.pop("rig") if Path(given["rig"] or "rig.json").is_dir() else None
     if run is not None and optimise:
         raise InputError(f"--rig {run}: a run's rig is chosen already: leave out --best")
-    if (motion := given["volume"] or "").endswith(".toml"):
-        if not given["arm"]:
-            raise InputError(f"volume {motion}: the arm that moves so is needed, too: --arm ar4")
-        from armsight.app.budget.run import motion_volume  # here and below: what a plan alone does not need
-
-        given |= motion_volume(Path(motion), given["arm"]) | ({"speed": given["speed"]} if given["speed"] else {})
-    if run is not None:
-        from armsight.app.budget.run import run_plan
     with steps() as progress:
-        asked = RigPlan.read(path, **given) if run is None else run_plan(Path(run), path, **given)
+        asked = _asked(path, run, given)
         alternatives = best(asked, progress) if optimise else ()
         found = chosen(alternatives) if alternatives else RigBudget(asked, planned(asked))
         found.check()
@@ -67,3 +63,19 @@ def command(plan: Sequence[str], optimise: bool, output: str | None, as_json: bo
         written = str(report.write(Path(output), {"budget.json": report.json_text(), **to_build(found)}))
         draw_body([found.plan.body or Path(output) / "body.toml"], Path(output) / "body.pdf", split=True)
     return report.echo(as_json=as_json, written=written) or int(not found.reached(found.moving))
+
+
+def _asked(path: str, run: str | None, given: dict[str, str | None]) -> RigPlan:
+    """Return the plan of a file and options: a motion gives volume and speed, a run what it measured."""
+    from armsight.sim.budget.plan import RigPlan
+
+    moves = (motion := given["volume"] or "").endswith(".toml")
+    if not moves and run is None:
+        return RigPlan.read(path, **given)
+    from armsight.app.budget.run import motion_volume, run_plan  # not above: what a plan alone does not need
+
+    if moves:
+        if not given["arm"]:
+            raise InputError(f"volume {motion}: the arm that moves so is needed, too: --arm ar4")
+        given |= motion_volume(Path(motion), given["arm"]) | ({"speed": given["speed"]} if given["speed"] else {})
+    return RigPlan.read(path, **given) if run is None else run_plan(Path(run), path, **given)

@@ -192,9 +192,9 @@ def _check(entry: Entry) -> tuple[dict[str, Any], list[str], list[str]]:
     from armsight.errors import InputError
     from armsight.loop.references.file import COLUMNS
     from armsight.loop.references.heading import check_unit
-    from armsight.loop.references.inertial import INERTIAL_CLASSES, Inertial
+    from armsight.loop.references.inertial import Inertial
     from armsight.loop.references.reference import STANDARD_GRAVITY_M_S2
-    from armsight.loop.references.stream import allan, check_stream, coefficients, settling
+    from armsight.loop.references.stream import check_stream, settling
 
     source, t_s, z = _recording(entry)
     name, stream = entry.reference.name, check_stream(t_s, z, str(source))
@@ -246,7 +246,19 @@ def _check(entry: Entry) -> tuple[dict[str, Any], list[str], list[str]]:
             f"{settled.frequency_hz:.3g} Hz, damped by {settled.damping:.2g} of critical, and settles in "
             f"{settled.time_s:.2f} s"
         )
-    tau, variance, freedom = allan(rest, 1.0 / stream.rate_hz)
+    noise, said, noisy = _noise(entry, rest, stream.rate_hz)
+    return values | noise, lines + said, weak + noisy
+
+
+def _noise(entry: Entry, rest: Any, rate_hz: float) -> tuple[dict[str, Any], list[str], list[str]]:  # noqa: ANN401 - imported late
+    """Return the noise of an inertial unit that rests, readings (N, 6), beside that of its class."""
+    import numpy as np
+
+    from armsight.loop.references.inertial import INERTIAL_CLASSES
+    from armsight.loop.references.stream import allan, coefficients
+
+    name, values, lines, weak = entry.reference.name, dict[str, Any](), list[str](), list[str]()
+    tau, variance, freedom = allan(rest, 1.0 / rate_hz)
     c = INERTIAL_CLASSES[entry.sensor_class]
     for sensor, rows, usual, unit in (
         ("gyro", slice(0, 3), c.gyro_noise, "rad/s"),
@@ -259,8 +271,8 @@ def _check(entry: Entry) -> tuple[dict[str, Any], list[str], list[str]]:
         ratio = density / usual
         values[sensor]["noise_over_class"] = ratio
         lines.append(
-            f"{name}: {sensor} noise {density:.3g} {unit}/sqrt(Hz) at rest for {values['rest_s']:.1f} s, {ratio:.2g} times "
-            f"that of {entry.sensor_class}"
+            f"{name}: {sensor} noise {density:.3g} {unit}/sqrt(Hz) at rest for {len(rest) / rate_hz:.1f} s, {ratio:.2g} "
+            f"times that of {entry.sensor_class}"
         )
         if ratio > NOISY:
             weak.append(
