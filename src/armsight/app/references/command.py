@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from armsight.app.show.report import Grade, Report
     from armsight.loop.references.calibrate import ReferenceCalibration
     from armsight.loop.references.file import Entry, Sensor
+    from armsight.loop.references.stream import StreamCheck
 
 #: A noise so many times that of its class is said.
 NOISY = 3.0
@@ -186,6 +187,18 @@ def _checked(entries: list[Entry]) -> Report:
     return Report(name, "References", "", "", sections, notes, {"references": found}, assessed=answer)
 
 
+def _weak_stream(entry: Entry, stream: StreamCheck, saturated: list[str]) -> list[str]:
+    """Return what is weak in how readings came, whatever they are."""
+    name, weak = entry.reference.name, []
+    if entry.rate_hz is not None and abs(stream.rate_hz / entry.rate_hz - 1) > RATE:
+        weak.append(f"{name}: the rate is {stream.rate_hz:.4g} Hz, not {entry.rate_hz:g} as the file says")
+    if stream.doubled > RATE:
+        weak.append(f"{name}: {100 * stream.doubled:.0f} % of the readings repeat the one before: it is read too often")
+    if stream.frozen_s:
+        weak.append(f"{name}: no value changes for {stream.frozen_s:.2f} s")
+    return weak + [f"{name}: {axis} stands at the end of its range: that is too small" for axis in saturated]
+
+
 def _check(entry: Entry) -> tuple[dict[str, Any], list[str], list[str]]:
     import numpy as np
 
@@ -213,14 +226,7 @@ def _check(entry: Entry) -> tuple[dict[str, Any], list[str], list[str]]:
         f"{name}: {len(t_s)} readings, {stream.rate_hz:.4g} Hz, jitter {1e3 * stream.jitter_s:.2g} ms, "
         f"{stream.gaps} gaps, the longest {1e3 * stream.longest_gap_s:.0f} ms"
     ]
-    weak = []
-    if entry.rate_hz is not None and abs(stream.rate_hz / entry.rate_hz - 1) > RATE:
-        weak.append(f"{name}: the rate is {stream.rate_hz:.4g} Hz, not {entry.rate_hz:g} as the file says")
-    if stream.doubled > RATE:
-        weak.append(f"{name}: {100 * stream.doubled:.0f} % of the readings repeat the one before: it is read too often")
-    if stream.frozen_s:
-        weak.append(f"{name}: no value changes for {stream.frozen_s:.2f} s")
-    weak += [f"{name}: {axis} stands at the end of its range: that is too small" for axis in values["saturated"]]
+    weak = _weak_stream(entry, stream, values["saturated"])
     if not isinstance(entry.reference, Inertial):
         check_unit(str(source), z)
     rest = z[stream.rest]
