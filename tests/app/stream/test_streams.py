@@ -5,14 +5,15 @@ import socket
 import struct
 import sys
 import time
+import weakref
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from armsight.app.stream.datum import Published
-from armsight.app.stream.igtl import crc64, message, position_body, status_body, transform_body
-from armsight.app.stream.network import open_json_tcp
+from armsight.app.stream.igtl import crc64, message, open_igtl, position_body, status_body, transform_body
+from armsight.app.stream.network import open_json_tcp, open_json_udp
 from armsight.app.stream.streams import open_streams
 from armsight.data import Missed, Shot
 from armsight.errors import InputError
@@ -72,6 +73,19 @@ def test_a_tcp_reader_that_does_not_read_is_not_waited_for():
         publish_until(sink, lambda: sink.dropped > 0, big)
     sink.close()
     assert sink.problem is None
+
+
+@pytest.mark.parametrize("opens", [open_json_tcp, open_igtl, lambda rest, of: open_json_udp(f"127.0.0.1:{rest}", of)])
+def test_images_do_not_wait_for_a_stream_that_writes_none(opens):
+    sink, kept = opens("0", Published()), []  # not started: everything waits
+    for _ in range(50):
+        images = [np.zeros((36, 64), np.uint8) for _ in "lr"]
+        kept += map(weakref.ref, images)
+        sink.put(ShotDatum(Shot("s", *images, 1.0, encoded=(b"left", b"right")), Missed("too dark")))
+    del images
+    assert sink.taken == 50
+    assert [each() for each in kept if each() is not None] == []
+    sink.finish()
 
 
 def test_json_over_udp_is_one_datagram_a_datum():

@@ -77,7 +77,7 @@ class TcpSink(Sink):
     """Sends bytes to every reader that has connected."""
 
     def __init__(self, published: Published, listener: socket.socket) -> None:
-        super().__init__()
+        super().__init__(images=False)
         self.published = published
         self._listener = listener
         self._listener.setblocking(False)
@@ -132,7 +132,7 @@ class UdpSink(Sink):
     """Sends one datagram a datum; one that is too large goes without its points."""
 
     def __init__(self, published: Published, address: tuple[str, int]) -> None:
-        super().__init__()
+        super().__init__(images=False)
         self._published, self._address = published, address
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setblocking(False)

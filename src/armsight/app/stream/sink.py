@@ -9,8 +9,9 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
+from dataclasses import replace
 
-from armsight.loop.running.data import Datum
+from armsight.loop.running.data import Datum, ShotDatum
 
 #: How often ``tick`` is called at least, s.
 TICK_S = 0.25
@@ -27,12 +28,14 @@ class Sink:
         wakes: so many that wait wake the thread; fewer wait for at most ``TICK_S``. A thread that is woken for every datum
             takes the interpreter from the loop as often.
         close_s: how long :meth:`close` waits for the thread, s.
+        images: whether it writes images; else none wait for its thread.
 
     Attributes:
         problem: what ended the publishing early; None where nothing did.
     """
 
-    def __init__(self, limit: int = 512, wakes: int = 1, close_s: float = _CLOSE_S) -> None:
+    def __init__(self, limit: int = 512, wakes: int = 1, close_s: float = _CLOSE_S, *, images: bool = True) -> None:
+        self._images = images
         self.taken = self.dropped = 0
         self.cpu_s = 0.0
         self.problem: str | None = None
@@ -50,6 +53,8 @@ class Sink:
 
     def put(self, datum: Datum) -> None:
         """Take a datum and return at once."""
+        if not self._images and isinstance(datum, ShotDatum):
+            datum = replace(datum, shot=replace(datum.shot, left=None, right=None, encoded=None))
         with self._changed:
             if self._closing or self.problem is not None:
                 return
