@@ -116,6 +116,10 @@ def test_a_motion_file_gives_volume_and_speed(armsight, tmp_path, monkeypatch):
     assert 0.02 < float(found["plan"]["speed"].removesuffix("m/s")) < 1.0
 
 
+def test_a_plan_in_a_folder_with_an_equals_sign_is_a_plan(armsight, tmp_path):
+    assert_rejected(armsight("budget", tmp_path / "seed=3" / "plan.toml"), f"{tmp_path}/seed=3/plan.toml: ")
+
+
 def test_wrong_units_are_one_line(armsight):
     assert_rejected(armsight("budget", "--volume", "400x400x300m"), "is it in mm")
 

@@ -374,6 +374,7 @@ def test_a_store_that_is_full_or_does_not_answer_is_one_line(tmp_path, armsight,
     assert_rejected(said, "silent://bucket: no answer for 0 s; started again it goes on where it was")
     said = armsight("hub", "push", folder, "full://archive", "--cell", "a")
     assert_rejected(said, "full://archive: No space left on device; started again it goes on where it was")
+    monkeypatch.setattr("armsight.app.hub.push._SLOWEST", 1e9)
     said = armsight("hub", "push", folder, "stalled://archive", "--cell", "a")
     ended.set()
     assert_rejected(said, "stalled://archive: no answer for 0 s; started again it goes on where it was")

@@ -39,10 +39,11 @@ def command(plan: Sequence[str], optimise: bool, output: str | None, as_json: bo
     from armsight.sim.budget.plan import RigPlan, planned
     from armsight.sim.budget.result import RigBudget, best, chosen
 
-    path, *more = [each for each in plan if "=" not in each] or [""]
+    settings = [each for each in plan if "=" in each and "/" not in each.partition("=")[0]]  # not runs/exp=3/plan.toml
+    path, *more = [each for each in plan if each not in settings] or [""]
     if more:
         raise InputError(f"{more[0]}: {path} is the plan already: expected one PLAN.toml, and KEY=VALUE")
-    given = options | RigPlan.of_text(each for each in plan if "=" in each)
+    given = options | RigPlan.of_text(settings)
     if output is not None:
         used = [path, *filter(None, map(given.get, ("rig", "arm", "body")))]
         check_folder(output, holding=REPORT_FILES, apart_from=used)

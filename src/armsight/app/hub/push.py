@@ -24,11 +24,14 @@ from armsight.errors import ArmsightError, InputError
 
 #: bytes that are read and sent at once; half: more calls, double: a coarser limit of the rate.
 _CHUNK = 1 << 20
-#: bytes of which a store makes a part; half: S3, with 10,000 parts, takes files of 80 GB, double: a slow network needs more
-#: than _ANSWER_S for one.
-_PART = 16 << 20
+#: bytes of which a store makes a part, and parts that S3 takes; half: S3 takes no less but the last, double: a slow network
+#: is silent for twice as long.
+_PART, _PARTS = 5 << 20, 10_000
 #: s that a store may take for an answer; half: a slow one is not used, double: a dead one keeps the cell longer.
 _ANSWER_S = 30.0
+#: bytes a second that a network carries at least; half: a store that is silent is given up later, double: 1 Mbit/s is no
+#: network.
+_SLOWEST = 50e3
 _MANIFEST = "manifest.json"
 
 
@@ -99,24 +102,25 @@ def _push_run(fs: Any, at: str, run: Path, done: Pushed, pace: Callable[[int], N
         done.complete_before += 1
         return
     for name, digest in manifest.items():
-        target = f"{at}/{name}"
+        target, part = f"{at}/{name}", max(_PART, 2 * digest["bytes"] // _PARTS)
+        slow_s = _ANSWER_S + part / _SLOWEST
         if _answer(fs.exists, target) and _answer(fs.size, target) == digest["bytes"]:
-            with _answer(fs.open, target, "rb", block_size=_PART) as there:
-                if _digest(partial(_answer, there.read)) == digest:
+            with _answer(fs.open, target, "rb", block_size=part) as there:
+                if _digest(partial(_answer, there.read, within_s=slow_s)) == digest:
                     continue
         _answer(fs.makedirs, target.rpartition("/")[0], exist_ok=True)
         with (run / name).open("rb") as source:
-            sink = _answer(fs.open, target, "wb", block_size=_PART)
+            sink = _answer(fs.open, target, "wb", block_size=part)
             while piece := source.read(_CHUNK):
                 pace(len(piece))
-                _answer(sink.write, piece)
-            _answer(sink.close)  # not by `with`: that would wait for a store that is silent
+                _answer(sink.write, piece, within_s=slow_s)
+            _answer(sink.close, within_s=slow_s)  # not by `with`: that would wait for a store that is silent
         done.files += 1
     _answer(fs.pipe_file, last, expected)
     done.runs += 1
 
 
-def _answer(call: Callable[..., Any], *given: Any, **named: Any) -> Any:  # noqa: ANN401 - of fsspec
+def _answer(call: Callable[..., Any], *given: Any, within_s: float | None = None, **named: Any) -> Any:  # noqa: ANN401 - of fsspec
     """Return what a call to the store returns; by themselves s3fs and its like wait for many minutes.
 
     Raises:
@@ -131,10 +135,11 @@ def _answer(call: Callable[..., Any], *given: Any, **named: Any) -> Any:  # noqa
             answers.put((None, error))
 
     threading.Thread(target=work, daemon=True).start()
+    limit_s = within_s or _ANSWER_S
     try:
-        value, error = answers.get(timeout=_ANSWER_S)
+        value, error = answers.get(timeout=limit_s)
     except queue.Empty:
-        raise TimeoutError(f"no answer for {_ANSWER_S:.0f} s") from None
+        raise TimeoutError(f"no answer for {limit_s:.0f} s") from None
     if error is not None:
         raise error
     return value
