@@ -7,15 +7,15 @@ import json
 import re
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 from click.core import ParameterSource
 
 from armsight.app.board.flash import FLASHED, PROGRAMMERS
-from armsight.app.options import PATH
+from armsight.app.options import PATH, output
 from armsight.app.show.messages import UNTRUSTED
 from armsight.errors import DeviceError, InputError
 
@@ -39,12 +39,6 @@ STEPS = {
 }
 
 
-def _path(*names: str, metavar: str = "FILE", default: str | None = None, **given: Any) -> Callable[..., Any]:  # noqa: ANN401
-    start = None if default is None else Path(default)
-    kind, shown = PATH, default is not None
-    return click.option(*names, metavar=metavar, type=kind, default=start, show_default=shown, **given)
-
-
 def _new_offsets_file() -> Path:
     """Return where old offsets are kept: a file that is not there yet."""
     from armsight.files import unused
@@ -62,7 +56,7 @@ _board = click.option(
     "behind a port.",
 )
 _compiler = click.option("--compiler", metavar="NAME", help="zig or gcc; by default the first one that is installed.")
-_folder = _path("-o", "--output", metavar="DIR", default="firmware-build")
+_folder = output("DIR", "Where the image is written.", default="firmware-build")
 _yes = click.option("--yes", is_flag=True, help="Do not ask.")
 
 
@@ -232,11 +226,11 @@ def selftest_(name: str, drives: bool, as_json: bool) -> int:
 
 @command.command()
 @_board
-@_path(
-    *("-o", "--output", "folder"),
-    metavar="DIR",
+@output(
+    "DIR",
+    "Folder of board.toml, report.html, and bringup.json, where what was found is kept.",
+    "folder",
     default="bringup",
-    help="Folder of board.toml, report.html, and bringup.json, where what was found is kept.",
 )
 @click.option(
     "--step", "steps", multiple=True, type=click.Choice(tuple(STEPS)), help="Only this step; may be repeated."
@@ -411,7 +405,7 @@ def release(name: str, as_json: bool) -> None:
 @click.option(
     "--further", metavar="DEG,...", help="Correct by these: true angle less reported one of each joint, degrees."
 )
-@_path("--restore", help="Write back what --keep has kept.")
+@click.option("--restore", metavar="FILE", type=PATH, help="Write back what --keep has kept.")
 @click.option(
     "--keep",
     metavar="FILE",
@@ -515,7 +509,7 @@ def config() -> None:
 
 @config.command()
 @_board
-@_path("-o", "--output", help="Write it there.")
+@output("FILE", "Write it there.")
 @_JSON
 def get(name: str, output: Path | None, as_json: bool) -> None:
     """Print the configuration in use as a board.toml, or write it to a file."""

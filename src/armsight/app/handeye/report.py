@@ -14,7 +14,9 @@ from armsight.app.show.plotting import BLUE, INK, MUTED, ORANGE, RED, new_figure
 from armsight.app.show.report import Block, Fact, Grade, Lines, Report, Section, figures
 from armsight.app.show.table import TextTable
 from armsight.data import Array, Record
+from armsight.files import table_text
 from armsight.geometry.pose import inverse, log_se3, mean_pose, transform
+from armsight.geometry.rotation import quaternion_wxyz
 from armsight.loop.handeye.handeye import TRUSTED_M, TRUSTED_RAD, HandEye, known_where_seen
 from armsight.loop.handeye.recording import PairedPoses
 from armsight.loop.handeye.sources import OF_THE_ARM
@@ -300,11 +302,8 @@ def _angles_deg(T: Array) -> Array:
 
 def plan_csv(plan: MountingPlan) -> str:
     """Return the next poses as a table that the command reads."""
-    lines = ["x_m,y_m,z_m,qw,qx,qy,qz"]
-    for T in plan.Ts_base_flange:
-        x, y, z, w = Rotation.from_matrix(np.array(T[:3, :3])).as_quat()
-        lines.append(",".join(f"{v:.9g}" for v in (*T[:3, 3], w, x, y, z)))
-    return "\n".join(lines) + "\n"
+    rows = [[f"{v:.9g}" for v in (*T[:3, 3], *quaternion_wxyz(T[:3, :3]))] for T in plan.Ts_base_flange]
+    return table_text(["x_m", "y_m", "z_m", "qw", "qx", "qy", "qz"], rows)
 
 
 def errors_figure(run: HandEyeAnswer) -> Figure:

@@ -308,11 +308,11 @@ def _picture(result: RunResult) -> Image | None:
     return overlaid(result.rig, grey(shot.left), pose)
 
 
-def overlaid(rig: StereoRig, image: Image, estimate: PoseEstimate, axis_m: float = 0.05) -> Image:
+def overlaid(rig: StereoRig, image: Image, estimate: PoseEstimate) -> Image:
     """Return a left image (H, W), grey, with a pose overlaid as (H, W, 3) BGR: points as circles, axes red, green, blue."""
     canvas = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
     T, shift = estimate.T_left_body, 4
-    ends = np.concatenate([T[:3, 3][None], T[:3, 3] + axis_m * T[:3, :3].T, estimate.points.p_left])
+    ends = np.concatenate([T[:3, 3][None], T[:3, 3] + 0.05 * T[:3, :3].T, estimate.points.p_left])
     uv = np.round(rig.left.project(ends) * 2**shift).astype(int)
     for i, colour in enumerate(((60, 60, 230), (80, 200, 80), (230, 120, 40)), start=1):
         cv2.arrowedLine(canvas, tuple(uv[0].tolist()), tuple(uv[i].tolist()), colour, 2, cv2.LINE_AA, shift, 0.12)

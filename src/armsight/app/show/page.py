@@ -151,14 +151,14 @@ def html_page(title: str, heading: str, sub: str, sections: Mapping[str, tuple[s
     )
 
 
-def writable_folder(directory: str | Path, contents: str, advice: str = "") -> Path:
+def writable_folder(directory: str | Path, contents: str) -> Path:
     """Make a folder and check that files can be written to it, before long work begins."""
     folder = Path(directory).expanduser()
     try:
         folder.mkdir(parents=True, exist_ok=True)
         try_writing(folder)
     except OSError as error:
-        raise InputError(f"{folder}: {contents} can be written here: {error.strerror}{advice}") from None
+        raise InputError(f"{folder}: {contents} can be written here: {error.strerror}") from None
     return folder
 
 
