@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from armsight.errors import InputError
 from armsight.robot.arm_file import open_arm
+from armsight.tables.cells import read_cells
 from armsight.tables.lengths import number
 from armsight.tables.nested import has_both
 from armsight.tables.poses import read_pose_table
@@ -213,6 +214,16 @@ FORMS = {
         {"columns": "_,_,_,x_m,y_m,z_m,qx,qy,qz,qw"},
     ),
     "pandas' names of columns without names": ("n.csv", csv("0,1,2,3,4,5,6", P, XYZW), {"rotation": "xyzw"}),
+    "a time and numbered columns": (
+        "n.csv",
+        csv("time,0,1,2,3,4,5,6", np.arange(N), P, XYZW),
+        {"columns": "t_s=time,x_m=0,y_m=1,z_m=2,qx=3,qy=4,qz=5,qw=6"},
+    ),
+    "numbered columns that --columns names": (
+        "n.csv",
+        csv("0,1,2,3,4,5,6", P, XYZW),
+        {"columns": "x_m=0,y_m=1,z_m=2,qx=3,qy=4,qz=5,qw=6"},
+    ),
     "pandas' names and index of columns without names": (
         "i.csv",
         csv(",0,1,2,3,4,5,6", np.arange(N), P, XYZW),
@@ -465,6 +476,14 @@ def test_each_program_gives_the_same_poses(tmp_path, form):
     name, text, options = FORMS[form]
     (tmp_path / name).write_text(text)
     np.testing.assert_allclose(read_pose_table(tmp_path / name, **options).Ts, A, atol=1e-8)
+
+
+def test_a_first_row_with_a_word_above_numbers_names_columns(tmp_path):
+    (tmp_path / "h.csv").write_text(csv("time,1,2,3,4,5,6,7", np.arange(N), P, XYZW))
+    assert read_cells(tmp_path / "h.csv").head == ["time", *"1234567"]
+    (tmp_path / "h.csv").write_text(csv("x,y,z,nan,nan,nan,nan", P, XYZW))
+    with pytest.raises(InputError, match="line 1 names a column twice: nan"):
+        read_cells(tmp_path / "h.csv")
 
 
 @pytest.mark.parametrize("suffix", ["npy", "npz"])

@@ -136,7 +136,7 @@ def read_cells(path: Path, columns: Mapping[str, str] | Sequence[str] = (), side
     if any(mark in path.name for mark in "*?") and not path.exists():
         cells = _of_files(path, side, whose)
     else:
-        cells = _of_file(path, side, whose)
+        cells = _of_file(path, side, whose, names)
     if names:
         head = renamed(path, cells.head, names, 1 if isinstance(names, Mapping) else cells.rows[0][0])
         cells = cells._replace(head=head)
@@ -169,7 +169,7 @@ def _of_files(path: Path, side: str, whose: str | None) -> Cells:
     return each[0]._replace(head=["name", *each[0].head], rows=rows)
 
 
-def _of_file(path: Path, side: str, whose: str | None) -> Cells:
+def _of_file(path: Path, side: str, whose: str | None, names: Mapping[str, str] | Sequence[str] = ()) -> Cells:
     """Return what one file holds, its names as they stand there."""
     packed = path.suffix.lower() in PACKED or is_packed(path)
     text = "" if packed else read_text(path, TABLE_MB).removeprefix("\ufeff")
@@ -187,19 +187,24 @@ def _of_file(path: Path, side: str, whose: str | None) -> Cells:
             f"{path}: {written[0][1][:40]!r} begins no table: write one pose a line, a matrix of 16 numbers or columns "
             "such as x_mm,y_mm,z_mm,qw,qx,qy,qz"
         )
-    return _delimited(path, text, written)
+    return _delimited(path, text, written, names.values() if isinstance(names, Mapping) else ())
 
 
-def _delimited(path: Path, text: str, written: list[tuple[int, str]]) -> Cells:
+def _delimited(path: Path, text: str, written: list[tuple[int, str]], named: Collection[str]) -> Cells:
     """Return the cells of a table, whatever separates them."""
     rows = _with_content(_separated(path, text.splitlines(), written[0][1] if written else ""))
     if not rows:
         raise InputError(f"{path}: no rows; one line a pose is needed")
     head = rows[0][1]
     numbered = [str(k) for k in range(len(head))]
-    if len(rows) > 1 and head in (numbered, ["", *numbered[:-1]]):  # pandas' names of none, with its index or without
+    is_named = bool(named) and set(named) <= set(head)
+    # pandas' names of none, with its index or without
+    if not is_named and len(rows) > 1 and head in (numbered, ["", *numbered[:-1]]):
         return _without_names(path, [(line, row[head[0] == "" :]) for line, row in rows[1:]])
-    if 2 * sum(number(cell) is not None for cell in head) < len(head):
+    words = [k for k, cell in enumerate(head) if number(cell) is None]
+    below = [row[k] for k in words if head[k][:1].isalpha() for _, row in rows[1:] if k < len(row)]
+    # names stand above numbers; what one message after another holds, a frame's name, above itself
+    if is_named or 2 * len(words) > len(head) or any(number(cell) is not None for cell in below):
         twice = next((name for name in head if name and head.count(name) > 1), None)
         if twice is not None:
             raise InputError(f"{path}: line {rows[0][0]} names a column twice: {twice}")

@@ -364,3 +364,19 @@ def test_markers_of_another_size_at_the_right_positions_are_named_with_the_size_
             r"have another size than its file says: T0 (44\.9\d*|45[.0-9]*) mm instead of 52\.5,", found[1].reason
         )
         assert "its points lie 0.857 times as far apart" in found[2].reason  # all of it is larger
+
+
+def test_a_wrong_size_is_asked_for_however_noisy_the_rig_is():
+    rig, rng = replace(rig_of(), sigma_px=1.2), np.random.default_rng(14)
+    points = np.array([(x, y, 0) for x in range(-60, 61, 20) for y in range(-60, 61, 20)]) / 1e3
+    found = [
+        locate(
+            rig, body_of(points), triangulate(rig, body_of(points), seen(rig, points / 1.2, pose, sigma=0.1, rng=rng))
+        )
+        for pose in (somewhere(rng) for _ in range(5))
+    ]
+    reasons = [each.reason for each in found if isinstance(each, Missed)]
+    assert reasons
+    assert all(
+        "is the size in the target right" in reason and "between the two exposures" in reason for reason in reasons
+    )

@@ -97,17 +97,14 @@ def _wrong_size(rig: StereoRig, body: Body, points: Points, T_left_body: Array) 
         return f"markers of {body.name} have another size than its file says: {named}{more}; correct the file"
     if abs(scale - 1) <= max(_SIZE_TOLERANCE, _SIZE_SIGMAS * sigma):
         return None
-    from armsight.vision.pose.shutter import LOOSE_PX  # not above: it locates
-
     off = f"its points lie {scale:.3f} times as far apart as those of {body.name}"
     moved = (
         f"it moved by about {1e3 * abs(scale - 1) * rig.baseline_m:.2g} mm along the baseline between the two exposures"
     )
-    if rig.sigma_px >= LOOSE_PX:  # exposures are known to be apart
-        return f"{off}, as if {moved}: start both cameras by one trigger, or measure slower"
     return (
         f"{off}: is the size in the target right (of a square, a tag, the body file's unit), is it the target the rig sees"
-        f", are the images as the calibration had them, not cropped, shifted or scaled since, or is it that {moved}?"
+        f", are the images as the calibration had them, not cropped, shifted or scaled since, or is it that {moved}"
+        " (one trigger for both cameras prevents that)?"
     )
 
 

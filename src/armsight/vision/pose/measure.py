@@ -43,7 +43,6 @@ from armsight.vision.markers.marker import Target
 from armsight.vision.match import gate, join, match
 from armsight.vision.pose.assign import candidates, instances, plain
 from armsight.vision.pose.locate import locate
-from armsight.vision.pose.shutter import LOOSE_PX
 from armsight.vision.rig import StereoRig
 from armsight.vision.triangulate import triangulate
 
@@ -222,8 +221,10 @@ def locate_composite(
         reasons = [f"{side}: {d.problem}" for side, d in zip(SIDES, coded, strict=True) if d.problem]
         reasons += [by_code.reason] if by_code is not None and not reasons else []
         reasons = [*(reasons if len(body.points) > len(target.body.points) else []), found.reason]
-        if rig.sigma_px >= LOOSE_PX and min(len(seen.uv) for seen in discs) >= len(target.radii_m):
-            reasons.append("or it moved too far between the two exposures, which are apart: start both by one trigger")
+        if min(len(seen.uv) for seen in discs) >= len(target.radii_m):
+            reasons.append(
+                "or it moved too far between the two exposures, if they are apart: start both by one trigger"
+            )
         return Missed("; ".join(reasons))
     return locate_discs(rig, body, target, names, found.seen, found.T_left_body)
 
