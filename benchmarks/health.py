@@ -109,7 +109,7 @@ def print_cases() -> Iterator[Case]:
     for radius_m in (5.0, 10.0):
         shift = faults.strained(np.zeros((3, 3)), 1.0 / radius_m)
         yield Case(f"body bent to a cylinder of {radius_m:g} m", {"shift": shift}, "body")
-    for hz in (0.7, 1.5, 3.0, 7.0):
+    for hz in (0.1, 0.3, 0.7, 1.5, 3.0, 7.0):
         for side, word in enumerate(("left", "right")):
             for axis, name in zip((x, y), "xy", strict=True):
                 nod = {"nod": (side, 0.03 * DEG * axis, hz)}

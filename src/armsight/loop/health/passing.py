@@ -60,8 +60,8 @@ _DATED_S = 2.0
 _LEAST = 2
 #: Of the columns of a shot those of times: of the right camera, of the rows of the right and of the left one; acceleration.
 _TIMES = [0, 7, 8, 9]
-#: Row of a test's focal length after the parameters; its share of a variance against what stays.
-_FOCAL_ROW, _FOCAL_VARIANCE = 7, 0.01
+#: First rows of a camera's rotation and of a test's focal length after the parameters; the latter's share of a variance.
+_ROTATION_ROW, _FOCAL_ROW, _FOCAL_VARIANCE = 2, 7, 0.01
 #: Newest doubtful tests explained together; half: slow breathing is taken for a change that stays, double: more time.
 TOGETHER = 12
 #: Newest tests listed in which something passed; half: hours of it are sized a little worse, double: 0.3 MB more.
@@ -78,6 +78,10 @@ _USUAL = 30.0
 
 Passes = Literal["time", "lens", "rig"]
 _PASSES: tuple[Passes, ...] = ("time", "lens", "rig")
+#: Mean (4,) and second moment (4, 4) of what the shots of a test say of what moves to and fro.
+Swing = tuple[Array, Array]
+#: A test's sums with another rotation of a camera in each shot eliminated, twice the log of what chance explains with it.
+Nods = tuple[ResidualSums, float, Swing]
 #: Returns the log-evidence of what stays, of sums and a variance of the noise, and whether with a skew; 0 of nothing.
 Staying = Callable[[ResidualSums, float, bool], float]
 
@@ -208,27 +212,38 @@ class _Doubtful:
     rests: dict[Passes, _Rest]
     times: Times | None
     focal_share: float
+    swing: Swing | None = None
     counted: Passes | None = None
 
     @classmethod
-    def of(
-        cls, every: ResidualSums, size: int, times: Times | None, nods: tuple[ResidualSums, float] | None
-    ) -> _Doubtful:
+    def of(cls, every: ResidualSums, size: int, times: Times | None, nods: Nods | None) -> _Doubtful:
         """Return a test; ``size``: how many parameters there are, which are eliminated."""
         M, row, cost = eliminated(every.M, slice(1, 1 + size)), 1 + _FOCAL_ROW, _left(every, size)
-        focal = every.without(size + _FOCAL_ROW, _FOCAL_VARIANCE)
+        focal = every.without(size + _FOCAL_ROW, _FOCAL_VARIANCE * np.eye(1))
         occam = math.log1p(_FOCAL_VARIANCE * float(M[row, row]))
         rests: dict[Passes, _Rest] = {"lens": _Rest(focal, cost - _left(focal, size), occam)}
         if times is not None:
             occam = times.found.occam - _occam(times.found.information)
             rests["time"] = _Rest(times.rest, cost - _left(times.rest, size), occam)
-        if nods is not None:
-            rests["rig"] = _Rest(nods[0], cost - _left(nods[0], size), nods[1])
-        return cls(every, rests, times, FOCAL_SHARE * float(M[0, row] / (M[row, row] + 1.0)))
+        if nods is not None:  # of a fast nod each shot has a rotation of its own, of a slow one the test as a whole
+            found = (nods[:2], _swayed(*nods[:2], size), _swayed(every, 0.0, size))
+            nodded = (_Rest(rest, cost - _left(rest, size), occam) for rest, occam in found)
+            rests["rig"] = max(nodded, key=lambda each: each.beyond)
+        focal_share = FOCAL_SHARE * float(M[0, row] / (M[row, row] + 1.0))
+        return cls(every, rests, times, focal_share, nods and nods[2])
 
     def shows(self, cause: Passes | None, excess: float) -> bool:
         """Return whether a cause explains more than chance, of a noise whose variance is so many times larger."""
         return cause in self.rests and (cause == "rig" or self.rests[cause].shows(excess))
+
+
+def _swayed(sums: ResidualSums, occam: float, size: int) -> tuple[ResidualSums, float]:
+    """Return a test's sums without a rotation of its own, and twice the log of what chance explains with that, too."""
+    rotation = sums.reduced(size).among(_ROTATION_ROW + np.arange(3))
+    best = int(np.argmax(evidence_of_scales(rotation.M, np.array(_NOD_RAD))))
+    cov = _NOD_RAD[best] ** 2 * np.eye(3)
+    occam += float(np.linalg.slogdet(np.eye(3) + cov @ rotation.H)[1])
+    return sums.without(size + _ROTATION_ROW, cov), occam
 
 
 def _occam(information: Array) -> float:
@@ -336,6 +351,7 @@ class Passing:
         apart_s: standard deviation of the times in the newest test, those that its shots share included, s.
         focal_share: the focal length's change in it.
         unsure: causes that explained the newest doubtful test nearly as well as what was taken.
+        open: whether something explains much that what stays does not: the next test is looked at, too.
         cost_m: by how much a pose was displaced at most, one sigma, m.
     """
 
@@ -345,6 +361,7 @@ class Passing:
     apart_s: float = 0.0
     focal_share: float = 0.0
     unsure: tuple[str, ...] = ()
+    open: bool = False
     cost_m: float = 0.0
     _doubtful: list[_Doubtful] = field(default_factory=list)
     _counted: Passes | None = None
@@ -353,6 +370,11 @@ class Passing:
     def now(self) -> bool:
         """Whether the newest test showed something."""
         return self._counted is not None
+
+    @property
+    def swings(self) -> tuple[Swing, ...]:
+        """What the tests say of a camera that nods now."""
+        return tuple(each.swing for each in self._doubtful if self._counted == each.counted == "rig" and each.swing)
 
     @property
     def nodded(self) -> bool:
@@ -365,15 +387,14 @@ class Passing:
         stays: Staying,
         size: int,
         times: Times | None,
-        nods: tuple[ResidualSums, float] | None,
+        nods: Nods | None,
     ) -> tuple[Passes | None, tuple[float, ...]]:
         """Decide what explains the doubtful tests best, all together: what stays has one value in them, what passes many.
 
         What was decided of earlier ones of them is taken back where another cause explains all of them better.
 
         ``every``: the sums of the newest: parameters, seven numbers, candidates, the first of which is a focal length.
-        ``times``: of exposure that explain it; None without. ``nods``: its sums with another rotation of a camera in
-        each shot eliminated, and twice the logarithm of what chance explains with that; None without.
+        ``times``: of exposure that explain it; None without. ``nods``: of a camera; None without.
 
         Returns:
             What explains the newest test, None where it is something that stays; and when those tests began, s, that were
@@ -388,7 +409,7 @@ class Passing:
                 others = [*tests[:odd], *tests[odd + 1 :]]
                 weighed = _Weighed.of(others, stays, size) if others and cause is not None else weighed
                 cause = cause if others and weighed.best(self._counted, one=len(others) == 1) == cause else None
-        self._counted = cause
+        self._counted, self.open = cause, cause is not None or max(weighed.ahead.values()) > _AHEAD
         near = max(_PASSES, key=weighed.explained.__getitem__)
         alike = weighed.explained[near] > max(_AHEAD, weighed.stays - ALIKE / 2.0)
         self.unsure = (near,) if cause is None and alike and len(tests) > 1 else ()

@@ -339,10 +339,11 @@ class ResidualSums:
         """Return these of residuals whose noise has a variance."""
         return replace(self, M=self.M / variance)
 
-    def without(self, row: int, variance: float = 1.0) -> ResidualSums:
-        """Return these with a parameter eliminated, which has a prior of a variance; its row is of no use."""
-        column = self.M[1 + row]
-        return replace(self, M=self.M - np.outer(column, column) * (variance / (1.0 + variance * column[1 + row])))
+    def without(self, row: int, cov: Array) -> ResidualSums:
+        """Return these where D parameters, from a row on, vary besides by a covariance (D, D): that is eliminated."""
+        varied = slice(1 + row, 1 + row + len(cov))
+        inner = np.eye(len(cov)) + cov @ self.M[varied, varied]
+        return replace(self, M=self.M - self.M[varied].T @ np.linalg.solve(inner, cov @ self.M[varied]))
 
 
 def eliminated(M: Array, rows: slice) -> Array:

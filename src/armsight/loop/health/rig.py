@@ -244,8 +244,7 @@ class RigWatch:
         self._onset, self._since_s = Onset(0.0), 0.0
         self._found: RigChange | None = None
         self.noise, self._unrest, self._newest_added = np.zeros((6, 6)), Unrest(4), np.zeros((6, 6))
-        # Means and second moments of what moved to and fro in the newest tests that this explains; its covariance.
-        self._swings, self._swung = deque[tuple[Array, Array]](maxlen=TOGETHER), np.zeros((4, 4))
+        self._swung = np.zeros((4, 4))  # covariance of what moved to and fro in the newest tests that this explains
         self._images: dict[bytes, None] = {}  # detections of shots that were summed, the newest last
 
     def take(self, estimate: PoseEstimate, t_s: float | None) -> Array:
@@ -308,7 +307,7 @@ class RigWatch:
     @property
     def _to_and_fro_cov(self) -> Array:
         """Covariance (4, 4) of what moves to and fro, from test to test or within a second."""
-        return np.asarray(self._swung if self._swings else self._unrest.cov)
+        return np.asarray(self._swung if self.passing.swings else self._unrest.cov)
 
     def _scattered(self, stays: Sequence[Sequence[ShotResiduals]]) -> tuple[Array, Array, Array, float]:
         """Return of a test times (N,), s, what its shots say of what moves to and fro (N, 4), noise, and Birge's ratio."""
@@ -327,14 +326,10 @@ class RigWatch:
         self._unrest.take(*self._scattered(stays))
         return rested and bool(self._unrest.cov.any())
 
-    def _swing(self, stays: Sequence[Sequence[ShotResiduals]]) -> None:
-        """Take all that the shots of a test say of what moves to and fro, too slowly for one second to show it."""
-        _, d, noise, excess = self._scattered(stays)
-        self._swings.append((d.mean(axis=0), d.T @ d / len(d) - excess * noise.mean(axis=0)))
-        means, squares = (np.mean(each, axis=0) for each in zip(*self._swings, strict=True))
-        values, vectors = np.linalg.eigh(
-            squares - np.outer(means, means)
-        )  # the mean is that of the calibration's error
+    def _swing(self) -> None:
+        """Estimate what moves to and fro, too slowly for one second to show it, from all tests that this explains."""
+        means, squares = (np.mean(each, axis=0) for each in zip(*self.passing.swings, strict=True))
+        values, vectors = np.linalg.eigh(squares - np.outer(means, means))  # without the calibration's own error
         self._swung = (vectors * np.maximum(values, 0.0)) @ vectors.T
 
     def _unrest_weighed(self, rows: Array, other: Array | None = None, *, cov: Array | None = None) -> Array:
@@ -523,7 +518,7 @@ class RigWatch:
         self._keep(newest, again=False)
         change = self._doubted()
         known = self._alarms > FRESH and self._fits[0].count % STEPS > 0  # what stays did explain some tests
-        if not self.passing.now and (known or change.chi_square <= _SUSPECTED):
+        if not self.passing.open and (known or change.chi_square <= _SUSPECTED):
             return newest, change
         passes, own = self._passes(stays, every)
         if passes is not None:
@@ -546,11 +541,14 @@ class RigWatch:
             usual = (
                 whole.plus(self._summed(odd, every=every, own=own, cov=cov).by(self._with_lens), -1.0) if odd else whole
             )
+            if cov is not None:  # of a slow nod all shots share one rotation
+                whole, usual = (each.without(self._size + _ROTATIONS.start, cov[:3, :3]) for each in (whole, usual))
             sums.append((whole, usual))
         (whole, usual), of_every = sums[0], sums[-1]
         fitting = sums[0]
         if passes == "lens":
-            fitting = whole.without(self._size + len(_WIDE)), usual.without(self._size + len(_WIDE))
+            row = self._size + len(_WIDE)
+            fitting = whole.without(row, np.eye(1)), usual.without(row, np.eye(1))
         share, seven = len(stays) / sum(map(len, stays)), slice(1 + self._size, 1 + self._size + len(_WIDE))
         noise, evidence = self._leftover.seen(fitting[0], LENS, 3 * len(self.reader.points), seven, share)
         fits = self._without_lens(fitting, noise)
@@ -571,18 +569,19 @@ class RigWatch:
             parts = self._weighed_parts(stays, every=False)
             found = apart([(rows[:, 0], moved, weight) for rows, moved, weight in parts])
             moving = [(shot.rows[:, 0], self._moving(shot.rows), 1.0 / len(stay)) for stay in stays for shot in stay]
-            cov, _, occam = nodding(moving, self._swung if self._swings else None)
-            nods = self._summed(stays, cov=cov).by(self._with_lens), occam
+            cov, _, occam = nodding(moving, self._swung if self.passing.swings else None)
+            _, d, noise, excess = self._scattered(stays)
+            swing = d.mean(axis=0), d.T @ d / len(d) - excess * noise.mean(axis=0)
+            nods = self._summed(stays, cov=cov).by(self._with_lens), occam, swing
             sums, shared = eliminate(found, parts, self._summed(stays))
             shared = np.hstack([shared[:, :1], shared[:, 1:] @ self._with_lens])
             times = Times(found, shared, sums.by(self._with_lens))
         cause, taken_back = self.passing.decide(every, self._staying, self._size, times, nods)
-        if taken_back:
-            self._take_back(taken_back)
+        if taken_back:  # of a nod those between them, too, which were not looked at
+            since = [each.begin_s for each in self._fits[0].kept[:-1] if each.begin_s >= taken_back[0]]
+            self._take_back(since if cause == "rig" else taken_back)
         if cause == "rig":
-            self._swing(stays)
-        else:
-            self._swings.clear()
+            self._swing()
         return cause, found
 
     def _staying(self, sums: ResidualSums, excess: float, skewed: bool) -> float:
@@ -707,7 +706,7 @@ class RigWatch:
                 if cost_m > COSTS_M
                 else ()
             )
-        return (*(self._changed() if self.alarmed else ()), *self._nods())
+        return _once((*(self._changed() if self.alarmed else ()), *self._nods()))
 
     def _nods(self) -> tuple[HealthFinding, ...]:
         """Return the finding of a camera that nods or a lens that breathes, where that displaces poses by what matters."""
@@ -752,7 +751,7 @@ class RigWatch:
         copied = copy(self)
         copied._fits = copy(self._fits[0]), copy(self._fits[1])
         copied._every = copied._fits if self._every is self._fits else (copy(self._every[0]), copy(self._every[1]))
-        for name in ("_shape", "passing", "_unrest", "_wholes", "_swings", "_leftover"):
+        for name in ("_shape", "passing", "_unrest", "_wholes", "_leftover"):
             setattr(copied, name, copy(getattr(self, name)))
         copied._stays = [stay.copy() for stay in self._stays]
         return copied
@@ -790,6 +789,15 @@ class RigWatch:
 def _misfit(stay: Sequence[ShotResiduals]) -> float:
     """Return by how much the squared residuals of a stay exceed their number, mean of its shots."""
     return sum(float(each.every[:, 0] @ each.every[:, 0]) - len(each.every) for each in stay) / len(stay)
+
+
+def _once(found: Sequence[HealthFinding]) -> tuple[HealthFinding, ...]:
+    """Return findings, those of a cause as one: the costliest, which says what the others do."""
+    causes = dict[str, HealthFinding]()
+    for each in found:
+        less, more = sorted((causes.get(each.cause, each), each), key=lambda one: one.cost_mm or 0.0)
+        causes[each.cause] = more if less is more else replace(more, what=f"{more.what}; {less.what}")
+    return tuple(causes.values())
 
 
 def _certain(change: RigChange) -> bool:
