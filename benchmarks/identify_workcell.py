@@ -29,9 +29,9 @@ from armsight.robot.boards.emulators import open_emulator
 from armsight.robot.kinematics.arm import Arm
 from armsight.robot.trajectories import point_to_point
 from armsight.sim.workcell.arm import imperfections, sample_arm
-from armsight.sim.workcell.board import configuration, gravity_duty
 from armsight.sim.workcell.motors import chosen, solids
 from armsight.sim.workcell.plant import ArmPlant
+from armsight.sim.workcell.workcell import configuration, gravity_duty
 
 POSES, PLANNED, UNSEEN, REACH_RAD, HIGH_M = 60, 30, 200, 0.9, 0.1
 BACK_RAD, CREEP_S, SETTLE_S, LOOK_S, PERIOD_S = np.radians(0.6), 1.5, 0.3, 0.1, 0.004

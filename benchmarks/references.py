@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from armsight.app.demo import demo
-from armsight.app.demo.studies import true_track
+from armsight.app.demo.demo import true_track
 from armsight.app.replay.open import Request, replay
 from armsight.app.run.experiment import run_experiment
 from armsight.app.run.metrics import track_metrics

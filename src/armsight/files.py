@@ -34,7 +34,6 @@ TABLE_MB = 64  # half: an hour of a run is rejected; double: twice the memory
 LONG_TABLE_MB = 2000  # of a table that is read piece by piece; half: 2 hours of a run are rejected; double: nothing
 #: Cells and lines of a table, of up to 72 bytes each; half: 5 minutes of detections are rejected; double: 700 MB.
 _TABLE_CELLS = 5_000_000
-_LONGEST_LINE = 1_000_000  # characters of a table's line; half, double: the same, no table has such lines
 _MB = 1_000_000
 _KINDS = ((stat.S_ISDIR, "a folder"), (stat.S_ISFIFO, "a pipe"), (stat.S_ISSOCK, "a socket"))
 
@@ -248,7 +247,7 @@ def read_table(path: str | Path) -> list[list[str]]:
 def is_long(path: str | Path) -> bool:
     """Return whether a table is one of numbers between commas, so long that it is to be read piece by piece."""
     with opened(path, LONG_TABLE_MB) as file:
-        size, head = os.fstat(file.fileno()).st_size, file.read(_LONGEST_LINE).partition(b"\n")[0]
+        size, head = os.fstat(file.fileno()).st_size, file.read(_MB).partition(b"\n")[0]
     return size > DOCUMENT_MB * _MB and b"," in head and head.isascii()
 
 
@@ -270,9 +269,9 @@ def _lines(path: str | Path) -> Iterator[str]:
 def _bounded(path: str | Path, file: io.TextIOWrapper) -> Iterator[str]:
     """Yield the lines of a text file, none of them longer than a table's."""
     try:
-        while line := file.readline(_LONGEST_LINE + 1):
-            if len(line) > _LONGEST_LINE:
-                raise InputError(f"{path}: a line of more than {_LONGEST_LINE} characters: not a table")
+        while line := file.readline(_MB + 1):
+            if len(line) > _MB:
+                raise InputError(f"{path}: a line of more than {_MB} characters: not a table")
             yield line
     except UnicodeDecodeError as error:
         raise InputError(_no_text(path, error)) from None

@@ -175,15 +175,6 @@ def test_a_board_that_faults(tmp_path, monkeypatch):
     assert "supply too low" in said
 
 
-def test_a_demo_where_a_file_stands(armsight, tmp_path):
-    (tmp_path / "demo").write_text("mine")
-    said = armsight("demo", "-o", tmp_path / "demo")
-    assert said.code == 2
-    assert len(said.err.splitlines()) == 1
-    assert str(tmp_path / "demo") in said.err
-    assert (tmp_path / "demo").read_text() == "mine"
-
-
 @pytest.mark.parametrize(
     "options", [("--seed", "-1"), ("--seed", "many"), ("--speed", "9"), ("--board", "serial:x"), ("--layout", "round")]
 )

@@ -8,9 +8,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from armsight.app.demo import demo, studies
-from armsight.app.demo.demo import Demo
-from armsight.app.demo.studies import vision_studies
+from armsight.app.demo import demo
+from armsight.app.demo.demo import Demo, vision_studies
 from armsight.data import Missed, PoseEstimate
 from armsight.geometry.pose import pose
 
@@ -57,12 +56,12 @@ class MadeUp:
 def by_law():
     law, said = MadeUp(), []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(studies, "open_board", lambda spec: SimpleNamespace(detect=lambda image: None))
-        patch.setattr(studies, "Pair", lambda *what: what)
-        patch.setattr(studies, "calibrate_boards", law.calibrate_boards)
-        patch.setattr(studies, "plain", lambda size, rng: None)
-        patch.setattr(studies, "render_pair", law.render_pair)
-        patch.setattr(studies, "measure", law.measure)
+        patch.setattr(demo, "open_board", lambda spec: SimpleNamespace(detect=lambda image: None))
+        patch.setattr(demo, "Pair", lambda *what: what)
+        patch.setattr(demo, "calibrate_boards", law.calibrate_boards)
+        patch.setattr(demo, "plain", lambda size, rng: None)
+        patch.setattr(demo, "render_pair", law.render_pair)
+        patch.setattr(demo, "measure", law.measure)
         found = vision_studies(seed=3, shots=SHOTS, progress=said.append)
     return {study.name: study for study in found}, said
 
@@ -114,7 +113,7 @@ def test_a_larger_calibration_errs_less_and_all_its_shots_count_as_one(by_law):
 def test_rendered_shots_are_measured_as_well_as_predicted():
     """One shot of every setup, rendered and measured as it is: the line from a setup to a study is whole."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(studies, "_calibration_study", lambda *arguments: None)
+        patch.setattr(demo, "_calibration_study", lambda *arguments: None)
         found = vision_studies(seed=3, shots=1)[:-1]
     for study in found:
         assert not study.missed.any()

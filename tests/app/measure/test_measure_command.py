@@ -295,25 +295,6 @@ def test_a_rig_of_another_image_size(start, arm, armsight):
     assert_rejected(armsight(*start, *images(arm)), "320x180", "640x360", "rig.json")
 
 
-def test_an_empty_glob(start, tmp_path, armsight):
-    assert_rejected(armsight(*start, *images(tmp_path)), "left*.png", "no such file")
-
-
-def test_a_missing_source(start, tmp_path, armsight):
-    assert_rejected(armsight(*start, "--source", tmp_path / "nowhere"), "nowhere")
-
-
-@pytest.mark.parametrize("text", ["pairs:a*.png", "pairs:,b*.png", "pairs:a,b,c"])
-def test_pairs_are_two_globs(start, armsight, text):
-    assert_rejected(armsight(*start, "--source", text), "two globs are needed")
-
-
-def test_half_a_rig(rendered, arm, tmp_path, armsight):
-    path, text = tmp_path / "rig.json", rendered.rig.read_text()
-    path.write_text(text[: len(text) // 2])
-    assert_rejected(armsight("measure", path, "--target", rendered.plate, *images(arm)), path, "not JSON")
-
-
 @pytest.mark.parametrize("target", ["", "plate", "nowhere.toml", "nowhere.csv", "chessboard:9x6", "tag:1:2"])
 def test_a_target_that_is_none(rendered, arm, armsight, target):
     assert_rejected(armsight("measure", rendered.rig, "--target", target, *images(arm)))
@@ -322,11 +303,6 @@ def test_a_target_that_is_none(rendered, arm, armsight, target):
 def test_a_csv_body_cannot_be_found_in_images(rendered, arm, tmp_path, armsight):
     save_body_csv(open_body(str(rendered.plate)), tmp_path / "plate.csv")
     assert_rejected(armsight("measure", rendered.rig, "--target", tmp_path / "plate.csv", *images(arm)), "detections")
-
-
-def test_no_folder_for_the_result(start, arm, tmp_path, armsight):
-    out = tmp_path / "nowhere" / "poses.csv"
-    assert_rejected(armsight(*start, *images(arm), "-o", out), out, "there is no folder")
 
 
 def test_a_full_disk(start, arm, armsight, full_disk):

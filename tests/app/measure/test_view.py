@@ -10,11 +10,19 @@ import pytest
 
 from armsight.app.measure import shots as measure_module
 from armsight.app.measure import view as view_module
-from armsight.app.measure.chart import SHOT, TIME, _intervals, chart, chart_data
 from armsight.app.measure.picture import WIDTH, _Panel, ascii_text, draw_shot, ellipse, header, marks_of, wrapped
-from armsight.app.measure.view import CHART, EACH_UP_TO, PictureFolder, view_folder
+from armsight.app.measure.view import (
+    CHART,
+    EACH_UP_TO,
+    SHOT,
+    TIME,
+    PictureFolder,
+    _intervals,
+    chart,
+    chart_data,
+    view_folder,
+)
 from armsight.data import SIDES, Detections, Dropped, Missed, PoseEstimate, Shot
-from armsight.errors import InputError
 from armsight.geometry.pose import inverse, transform
 from armsight.geometry.rotation import euler_zyx, exp_so3
 from armsight.vision.discs.bias import expect
@@ -402,26 +410,6 @@ def test_without_matplotlib_nothing_is_begun(start, arm, armsight, tmp_path, mon
         armsight(*start, *images(arm), "--view", tmp_path / "v"), "pip install", "armsight[report]", "--view"
     )
     assert not (tmp_path / "v").exists()
-
-
-def test_a_folder_that_cannot_be(start, arm, armsight, tmp_path):
-    (tmp_path / "file").write_text("mine")
-    for folder in (tmp_path / "file", tmp_path / "file" / "v"):
-        assert_rejected(armsight(*start, *images(arm), "--view", folder), folder, "no pictures can be written here")
-    assert (tmp_path / "file").read_text() == "mine"
-
-
-def test_a_folder_without_leave_to_write(tmp_path, monkeypatch):
-    def no(**_):
-        raise PermissionError(13, "Permission denied")
-
-    monkeypatch.setattr("tempfile.TemporaryFile", no)
-    with pytest.raises(InputError, match="no pictures can be written here: Permission denied"):
-        view_folder(tmp_path / "v")
-
-
-def test_the_poses_may_not_be_the_chart(start, arm, armsight, tmp_path):
-    assert_rejected(armsight(*start, *images(arm), "--view", tmp_path, "-o", tmp_path / CHART), CHART, "given twice")
 
 
 def test_a_full_disk_leaves_nothing_by_half(start, arm, armsight, full_disk):

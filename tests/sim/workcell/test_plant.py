@@ -11,9 +11,9 @@ from armsight.robot.boards.link import TICK_S
 from armsight.robot.models import MODELS
 from armsight.sim.workcell import plant as module
 from armsight.sim.workcell.arm import PRESETS, pot_travel, sample_arm
-from armsight.sim.workcell.board import gravity_duty
 from armsight.sim.workcell.motors import GRAVITY_M_S2, SUPPLY_V, chosen, gravity_torque, row_frames, solids
 from armsight.sim.workcell.plant import ArmPlant, mjcf
+from armsight.sim.workcell.workcell import gravity_duty
 
 MODEL = open_arm("six_r")
 OFF = np.zeros(6)

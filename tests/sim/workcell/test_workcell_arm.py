@@ -6,8 +6,8 @@ import pytest
 from armsight.errors import InputError
 from armsight.robot.arm_file import open_arm
 from armsight.sim.workcell.arm import PRESETS, imperfections, sample_arm
-from armsight.sim.workcell.board import configuration
 from armsight.sim.workcell.motors import chosen, solids
+from armsight.sim.workcell.workcell import configuration
 
 MODEL = open_arm("six_r")
 

@@ -4,7 +4,7 @@ from scipy.optimize import least_squares
 
 from armsight.geometry.pose import exp_se3, inverse, log_se3, transform
 from armsight.vision.pose import posefit
-from armsight.vision.pose.bundle import CAUCHY_SCALE, BundleModel, BundleState, Observations, minimise
+from armsight.vision.pose.bundle import CAUCHY_SCALE
 from armsight.vision.pose.posefit import PixelObservations, fit_pose
 from asserts import assert_jacobian
 from strategies import ordinary_rig
@@ -62,34 +62,6 @@ def test_the_minimum_is_that_of_scipy(model, robust):
     assert gap @ fast.information @ gap < 1e-8 * fast.cost
     d = whitened(rig, points, observations, fast.T_left_body)
     assert fast.distance2 == pytest.approx((d**2).sum(axis=1), rel=1e-9)
-
-
-@pytest.mark.parametrize("model", ["brown5", "fisheye"])
-@pytest.mark.parametrize("robust", [False, True])
-def test_bundle_adjustment_finds_the_same(model, robust):
-    rig, points, T_true, observations, rng = shot(model, 2)
-    start = T_true @ exp_se3(0.02 * rng.normal(size=6))
-    order = np.lexsort((observations.point, observations.camera))
-    flattened = Observations(
-        np.zeros(len(order), np.int64), observations.camera[order], observations.point[order], observations.uv[order],
-        observations.cov_uv[order] - SIGMA_PX**2 * np.eye(2), 1,
-    )  # fmt: skip
-    state = BundleState(rig.cameras, rig.T_left_right, start[None], np.zeros(0))
-    held = np.zeros(sum(camera.parameters.size for camera in rig.cameras) + 6, bool)
-    model_ = BundleModel(points, np.zeros((0, len(points), 3)), 1.0, False)
-    slow = minimise(model_, state, flattened, SIGMA_PX, robust=robust, free=held)
-    fast = fit_pose(rig.cameras, rig.T_left_right, points, observations, start, robust=robust)
-    assert fast.cost == pytest.approx(slow.cost, rel=1e-7)
-    gap = log_se3(inverse(slow.state.Ts_left_body[0]) @ fast.T_left_body)
-    assert gap @ fast.information @ gap < 1e-7 * fast.cost
-
-
-def test_without_noise_the_pose_is_exact():
-    rig, points, T_true, _, rng = shot("brown8", 3)
-    exact = PixelObservations.of(seen(rig, points, T_true), 0.1)
-    start = T_true @ exp_se3(0.02 * rng.normal(size=6))
-    fit = fit_pose(rig.cameras, rig.T_left_right, points, exact, start, robust=False)
-    assert fit.T_left_body == pytest.approx(T_true, abs=1e-9)
 
 
 def test_the_information_is_that_of_the_minimum():

@@ -272,26 +272,14 @@ def test_opencv_reads_back_what_was_exported(tmp_path):
     assert R1.shape == (3, 3)
 
 
-@pytest.mark.parametrize(
-    ("key", "said"),
-    [
-        ("M1", "has no camera matrix of both cameras"),
-        ("M2", "has no camera matrix of both cameras"),
-        ("D1", "has no distortion of both cameras"),
-        ("D2", "has no distortion of both cameras"),
-        ("R", "has no R, the rotation between"),
-        ("T", "has no T, the translation between"),
-    ],
-)
-def test_opencv_missing_entries(tmp_path, key, said):
-    with pytest.raises(InputError, match=f"{said}.*; there are .*Q 4x4"):
-        import_rig("opencv", stereo_calib(tmp_path, **{key: None}), unit_m=1.0, image_size_px=(1280, 720))
-
-
 @pytest.mark.opencv
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
+        ({"M1": None}, "has no camera matrix of both cameras.*; there are .*Q 4x4"),
+        ({"D2": None}, "has no distortion of both cameras.*; there are .*Q 4x4"),
+        ({"R": None}, "has no R, the rotation between.*; there are .*Q 4x4"),
+        ({"T": None}, "has no T, the translation between.*; there are .*Q 4x4"),
         ({"M1": np.eye(2)}, "M1 and D1: K has shape"),
         ({"M1": np.array([[800.0, 1, 600], [0, 800, 300], [0, 0, 1]])}, "skew is not supported"),
         ({"M2": np.full((3, 3), np.nan)}, "M2 and D2: K contains NaN"),
@@ -305,7 +293,7 @@ def test_opencv_missing_entries(tmp_path, key, said):
         ({"distortion_model": "omni"}, "distortion_model 'omni' is not supported"),
         ({"distortion_model": "fisheye"}, "fisheye camera has"),
         ({"R": 2 * np.eye(3)}, "R is not a rotation"),
-        ({"R": np.diag([1.0, 1, -1])}, "R is not a rotation"),
+        ({"R": np.diag([1.0, 1, -1])}, "left-handed"),
         ({"R": np.zeros((4, 1))}, "R has shape"),
         ({"T": np.zeros((2, 1))}, "translation of R has shape"),
         ({"T": np.zeros((3, 1))}, "baseline 0"),
@@ -335,25 +323,6 @@ def test_opencv_says_where_the_parser_stopped(tmp_path):
     given[1].write_text(text.replace("rows: 3", "rows: 4", 1))
     with pytest.raises(InputError, match=r"extrinsics\.yml: R is damaged"):
         import_rig("opencv", given, unit_m=1.0, image_size_px=(1280, 720))
-
-
-@pytest.mark.parametrize("text", ["", "hello", "%YAML:1.0\n---\n- 1\n", "%YAML:1.0\n---\nM1: [1, 2", "\x00\x01"])
-def test_opencv_other_files(tmp_path, text):
-    path = tmp_path / "both.yml"
-    path.write_text(text)
-    with pytest.raises(InputError, match=r"both\.yml: (line 3: not YAML|not YAML|holds )") as caught:
-        import_rig("opencv", [path], unit_m=1.0, image_size_px=(1280, 720))
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.opencv
-def test_opencv_truncations_are_reported(tmp_path):
-    (path,) = stereo_calib(tmp_path, files=1)
-    whole = path.read_text()
-    for length in range(0, whole.index("R1:") - 40, 61):
-        path.write_text(whole[:length])
-        with pytest.raises(InputError, match=r"intrinsics\.yml"):
-            import_rig("opencv", [path], unit_m=1.0, image_size_px=(1280, 720))
 
 
 # --- ROS -------------------------------------------------------------------------------------------------------------
@@ -489,11 +458,11 @@ def test_ros_damage(tmp_path, changes, said):
 
 
 @pytest.mark.parametrize("text", ["", "3", "- 1\n- 2\n", "a: [1, 2", "a: b: c", "\x00"])
-@pytest.mark.parametrize("name", ["ros", "kalibr"])
+@pytest.mark.parametrize("name", EXPORTED)
 def test_other_yaml_files(tmp_path, name, text):
     for path in paths(tmp_path, name):
         path.write_text(text)
-    with pytest.raises(InputError, match=r"(left|camchain)\.yaml: .*YAML") as caught:
+    with pytest.raises(InputError, match=r"(left|camchain|intrinsics)\.ya?ml: .*(YAML|holds )") as caught:
         import_rig(name, paths(tmp_path, name))
     assert "\n" not in str(caught.value)
 
@@ -688,12 +657,3 @@ def test_a_number_k1_is_no_camera_matrix(tmp_path):
         )
     with pytest.raises(InputError, match=r"no camera matrix of both|no calibration of two cameras"):
         import_rig(None, paths)
-
-
-def test_a_mirrored_rotation_is_called_so(tmp_path):
-    path = tmp_path / "rig.json"
-    K = [[500.0, 0, 320], [0, 500, 240], [0, 0, 1]]
-    cameras = {"K1": K, "K2": K, "D1": [0.0] * 5, "D2": [0.0] * 5, "image_size": [640, 480]}
-    path.write_text(json.dumps({**cameras, "R": np.diag([1.0, 1, -1]).tolist(), "T": [-0.06, 0, 0]}))
-    with pytest.raises(InputError, match="left-handed"):
-        import_rig(None, [path])

@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.app.check.evaluate import evaluate
+from armsight.app.check.rows import NAMED
 from armsight.app.check.run_folder import WINDOW_S, JointTrack, Noise, attained_in, joint_track, noise_of, segments_of
 from armsight.app.run.tracks import read_track
 from armsight.app.show.encode import json_of
@@ -43,7 +44,6 @@ from armsight.robot.arm_file import open_arm
 from armsight.robot.kinematics.arm import Arm
 from armsight.tables.columns import Columns
 
-_NAMED = 5  # so many rests that were left out are named
 VERSION = 1  # version of report.json
 #: Fewest rests, and shots of one.
 MIN_RESTS, _SHOTS = 12, 2
@@ -230,8 +230,8 @@ def evaluate_arm(folder: Path, arm: Arm, *, progress: Callable[[str], None] = la
     kept = rests.rows(found.solution.used)
     notes = []
     if len(found.left_out):
-        times = ", ".join(f"{t:.0f}" for t in rests.t_s[found.left_out][:_NAMED])
-        more = ", ..." if len(found.left_out) > _NAMED else ""
+        times = ", ".join(f"{t:.0f}" for t in rests.t_s[found.left_out][:NAMED])
+        more = ", ..." if len(found.left_out) > NAMED else ""
         notes.append(
             f"left out as mistakes: {len(found.left_out)} of {len(rests.q)} rests, at {times}{more} s of the run"
         )

@@ -35,7 +35,7 @@ from armsight.app.show.messages import weak
 from armsight.app.show.page import PAGE, bullets, table, text
 from armsight.app.show.report import Block, Html, Plot, Report, Section, Text, figure_files
 from armsight.app.show.table import TextTable, plain_text
-from armsight.geometry.pose import exp_se3
+from armsight.geometry.pose import left_jacobian
 from armsight.geometry.rotation import log_so3
 from armsight.vision.calibrate.result import Calibration, corner_variance_px2
 from armsight.vision.calibrate.screen import merged_notes
@@ -45,7 +45,6 @@ from armsight.vision.rig import StereoRig
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_STEP_RAD = 1e-6
 _ROUNDING = 1e-12
 #: Why the reprojection RMS may be far below the epipolar RMS of the same fit.
 MOTION_FITTED = (
@@ -107,13 +106,11 @@ def cameras_table(rig: StereoRig) -> str:
 def pose_table(rig: StereoRig) -> str:
     """Return the pose of the right camera in the left one's frame, mm and degrees, with sigmas."""
     cov, T = rig.cov[-6:, -6:], rig.T_left_right
-    ends = [
-        [log_so3((T @ exp_se3(h * axis))[:3, :3]) for axis in np.eye(6)] for h in (_STEP_RAD, -_STEP_RAD)
-    ]  # by finite differences
-    J = (np.array(ends[0]) - ends[1]).T / (2 * _STEP_RAD)
     cov_t = T[:3, :3] @ cov[:3, :3] @ T[:3, :3].T  # the tangent's translation is along the right camera's axes
-    rotation = np.degrees(log_so3(T[:3, :3]))
-    sigma_mm, sigma_deg = 1e3 * np.sqrt(np.diag(cov_t)), np.degrees(np.sqrt(np.diag(J @ cov @ J.T)))
+    phi = log_so3(T[:3, :3])
+    J = np.linalg.inv(left_jacobian(-phi))  # of the rotation vector, by a rotation on the right
+    rotation = np.degrees(phi)
+    sigma_mm, sigma_deg = 1e3 * np.sqrt(np.diag(cov_t)), np.degrees(np.sqrt(np.diag(J @ cov[3:, 3:] @ J.T)))
     rows = [
         ("baseline, mm", _with_sigma(1e3 * rig.baseline_m, 1e3 * rig.baseline_sigma_m)),
         *((f"{axis}, mm", _with_sigma(1e3 * T[k, 3], sigma_mm[k])) for k, axis in enumerate("XYZ")),

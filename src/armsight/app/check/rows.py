@@ -25,7 +25,7 @@ NEEDED = ("pose", *_POSITION, *_COMMAND[:3])
 #: Groups of columns: a row has all of a group or none of it.
 _TOGETHER = (_QUATERNION, _COMMAND[3:], _SIGMA, _COMMON)
 #: So many things that were left out are named.
-_NAMED = 5
+NAMED = 5
 #: Half of the rows further off their commands than this, m, are an error: units or frames are mixed up.
 _FAR_M = 0.1
 #: Commands of one pose differ by rounding at most: by this much, m, and in their rotation matrices.
@@ -151,8 +151,8 @@ def _pose(where: str, numbers: dict[str, float], prefix: str) -> Array:
 
 def first_few(notes: list[str], what: str) -> list[str]:
     """Return the first notes on what was left out, and how many more there are."""
-    more = [f"left out: {len(notes) - _NAMED} more {what}"] if len(notes) > _NAMED else []
-    return notes[:_NAMED] + more
+    more = [f"left out: {len(notes) - NAMED} more {what}"] if len(notes) > NAMED else []
+    return notes[:NAMED] + more
 
 
 def rows_csv(rows: list[Row]) -> str:

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from armsight.app.show.plotting import INK, bgr
 from armsight.data import Image
 from armsight.errors import InputError
 from armsight.files import replacing
@@ -22,7 +23,7 @@ from armsight.vision.rectify import Rectification
 
 #: Width of the scale, of the space for its numbers, and height of the caption, px.
 _BAR_PX, _MARGIN_PX, _CAPTION_PX = 18, 62, 26
-_INK, _PAPER = (41, 31, 31), (255, 255, 255)
+_INK, _PAPER = bgr(INK), (255, 255, 255)
 _FONT, _SIZE = cv2.FONT_HERSHEY_SIMPLEX, 0.42
 #: Colours (BGR) of an error map: right, off by more than each threshold, and no truth.
 _RIGHT, _OFF_1, _OFF_2, _OFF_4, _UNKNOWN = (225, 225, 225), (120, 200, 250), (40, 130, 235), (30, 30, 170), (90, 60, 40)

@@ -35,7 +35,7 @@ _STEEP = 4.0
 #: s after which a cell that is gone is not shown; half: a cell of a holiday is missing, double: dismantled ones stay.
 _FORGOTTEN_S = 14 * 86400.0
 #: s for which a message that cannot be read is worth a look; half: missed by who looks away, double: long past.
-_REJECTED_S = 60.0
+REJECTED_S = 60.0
 #: s by which a cell's clock may differ from the hub's; half: a slow network is called a clock, double: times are
 #: compared wrongly.
 _CLOCK_S = 2.0
@@ -234,7 +234,7 @@ class CellView:
             return f"error {error:.2f} mm, more than its limit of {limit:.2f}"
         if missed is not None and missed > _MISSED:
             return f"{100 * missed:.0f} % of the shots miss the body"
-        if now_s - self.rejected_s < _REJECTED_S:
+        if now_s - self.rejected_s < REJECTED_S:
             return f"a message could not be read: {self.why_rejected}"
         return ""
 

@@ -14,7 +14,7 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
-from armsight.app.hub.cells import LOOK_S, CellView, look_for_drifts, number, ranked
+from armsight.app.hub.cells import LOOK_S, REJECTED_S, CellView, look_for_drifts, number, ranked
 from armsight.app.hub.keys import HUB, site_of
 from armsight.app.hub.router import Heard, Link, Router, parsed
 from armsight.app.hub.sparkplug import Node, check_address
@@ -38,8 +38,6 @@ _GAUGES = {
     "cell_clock_seconds": ("clock_s", "the cell's clock less the hub's"),
 }
 _OF_HUB = {"hub_events": ("gauge", "events"), "hub_dropped_total": ("counter", "states dropped: too many waited")}
-#: s between two events of rejected connections; half: twice as many from a cell with a wrong key, double: counted later.
-_REJECTED_S = 60.0
 #: s after which a cell that did not say who it is is asked again; half: nothing, double: its limit is missing longer.
 _ASK_AGAIN_S = 10.0
 #: Texts that a cell says of itself.
@@ -110,7 +108,7 @@ class Hub:
     def rejected(self, why: str) -> None:
         """Say and keep that a connection was rejected, and how many were since the last time."""
         self._rejected += 1
-        if time.monotonic() - self._rejected_s < _REJECTED_S:
+        if time.monotonic() - self._rejected_s < REJECTED_S:
             return
         text = f"{self._rejected} connections rejected: no valid key of this site (the last: {why})"
         self._rejected, self._rejected_s = 0, time.monotonic()

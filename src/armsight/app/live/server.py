@@ -42,7 +42,7 @@ from urllib.parse import parse_qs, urlsplit
 import cv2
 
 from armsight.app.live.capture import LiveShot
-from armsight.app.live.records import command_of, json_text
+from armsight.app.live.records import LONGEST, command_of, json_text
 from armsight.app.live.session import LOG, LiveSession
 from armsight.app.live.step import why
 from armsight.errors import ArmsightError, DeviceError, InputError
@@ -60,8 +60,7 @@ _STATE_S, _POLL_S = 0.1, 0.01
 _JPEG, _SIDE_PX = 72, 1280
 #: A page that commands and says nothing for so long is gone, s; pages say something twice a second.
 SILENT_S = 1.5
-#: Longest message from a page, bytes; so many malformed ones end its connection.
-_LONGEST, _MALFORMED = 8192, 200
+_MALFORMED = 200  # messages from a page that end its connection
 _MALFORMED_BEGIN = ("a command ", "no command ")
 _HEADER = struct.Struct("<BI")
 _CSP = (
@@ -154,7 +153,7 @@ class LiveServer:
                 self.host,
                 self.port,
                 process_request=self._request,
-                max_size=_LONGEST,
+                max_size=2 * LONGEST,
                 max_queue=16,
                 compression=None,
                 ping_interval=5,

@@ -16,7 +16,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from armsight.app.show.plotting import nice, plain
+from armsight.app.show import plotting
+from armsight.app.show.plotting import bgr, nice, plain
 from armsight.data import SIDES, Array, Body, Image, PoseEstimate, Record
 from armsight.geometry.pose import transform
 from armsight.vision.discs.bias import expect
@@ -29,9 +30,7 @@ Canvas = NDArray[np.uint8]
 Colour = tuple[int, int, int]
 
 PAPER: Colour = (255, 255, 255)
-INK: Colour = (41, 32, 26)
-MUTED: Colour = (124, 110, 97)
-RED: Colour = (40, 40, 200)
+INK, MUTED, RED = (bgr(colour) for colour in (plotting.INK, plotting.MUTED, plotting.RED))
 BLANK = 200  # grey value where there is no image
 LINE = 24  # height of a line of text, px
 _FONT = cv2.FONT_HERSHEY_SIMPLEX

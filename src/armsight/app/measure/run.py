@@ -16,7 +16,7 @@ import numpy as np
 from armsight.app.measure.command import MeasureOptions
 from armsight.app.measure.moving import Requested, requested_shutters
 from armsight.app.measure.picture import SINGULAR
-from armsight.app.measure.shots import NAMED, DetectedShots, ImageShots, NamedShots, Result, open_shots
+from armsight.app.measure.shots import DetectedShots, ImageShots, NamedShots, Result, open_shots
 from armsight.app.measure.view import CHART, PictureFolder, view_folder
 from armsight.app.options import DETECTIONS
 from armsight.app.progress import bar
@@ -28,6 +28,7 @@ from armsight.files import RowFile, check_writable
 from armsight.loop.finding import make_finding
 from armsight.loop.health import HealthFinding, HealthMonitor, health_lines, unseen_lines
 from armsight.loop.running.data import Fanout, HealthNotes, Publisher, ShotDatum
+from armsight.vision.detections import NAMED
 from armsight.vision.follow.follower import measurer
 from armsight.vision.markers.marker import Target
 from armsight.vision.markers.targets import open_fixed

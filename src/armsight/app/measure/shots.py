@@ -17,7 +17,7 @@ from armsight.data import SIDES, Body, Image, Missed, PoseEstimate, Shot
 from armsight.errors import InputError
 from armsight.files import check_writable
 from armsight.loop.health import HealthFinding
-from armsight.vision.detections import SeenShot, read_detections
+from armsight.vision.detections import NAMED, SeenShot, read_detections
 from armsight.vision.follow.follower import Follower, follows
 from armsight.vision.image import one_image
 from armsight.vision.markers.calibrated_board import is_print
@@ -33,8 +33,6 @@ from armsight.vision.sources import Source, notes_of, open_source
 from armsight.vision.sources.folder import INDEX
 from armsight.vision.sources.pairs import StoredSource
 
-#: So many shots that fit badly are named.
-NAMED = 3  # half: fewer are looked at, double: longer lines
 #: So much a board that looks the same when it is rotated may be rotated less than by that, degrees.
 _ROTATED_SPARE_DEG = 35.0
 

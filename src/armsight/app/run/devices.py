@@ -26,6 +26,7 @@ from armsight.loop.running.setup import Fused, HostClock, LiveShots, Setup, fuse
 from armsight.robot.board_registry import EMULATED, check_board, emulator_name, open_motion_board, slowed
 from armsight.robot.boards.board import Board
 from armsight.robot.boards.contract import MotionBoard
+from armsight.robot.boards.serial import BAUD
 from armsight.robot.kinematics.arm import Arm
 from armsight.sim.references.heading import MagneticUnit
 from armsight.sim.references.inertial import InertialErrors, InertialUnit
@@ -41,7 +42,6 @@ _UNIT_HZ, _FIELDS_HZ = 1000.0, 50.0  # of an inertial unit, a magnetometer in th
 _RATE_HZ = 60.0  # of cameras whose times show none; half: the loop expects shots late, double: early
 
 
-BAUD = 921_600
 #: A first reading is waited for so long, s; half: slow sensors are missed, double: a wrong port is said late.
 FIRST_S = 3.0
 _WAIT_S = 0.1  # for a line: so soon a thread sees that it is to end

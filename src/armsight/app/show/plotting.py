@@ -44,6 +44,12 @@ STYLE: dict[str, Any] = {
 }
 
 
+def bgr(colour: str) -> tuple[int, int, int]:
+    """Return a colour such as #1f2933 as OpenCV takes it."""
+    red, green, blue = bytes.fromhex(colour.removeprefix("#"))
+    return blue, green, red
+
+
 @contextlib.contextmanager
 def drawing() -> Iterator[None]:
     """Plot within this block in the style of the reports, whatever the user's matplotlib settings, without a display."""

@@ -37,7 +37,7 @@ from armsight.app.stream.cell_file import (
 )
 from armsight.app.stream.datum import Published, json_text
 from armsight.app.stream.outbox import Outbox, state_folder
-from armsight.app.stream.sink import Sink
+from armsight.app.stream.sink import CLOSE_S, Sink
 from armsight.data import Array, PoseEstimate, Shot
 from armsight.errors import InputError
 from armsight.loop.running.data import Datum, NoteDatum, ShotDatum
@@ -63,8 +63,6 @@ _SIDE_PX, _JPEG = 480, 70
 _SHOT_S, _SHOTS, _ASKED_S = 0.2, 5, 10.0
 #: findings that a state names at most; half: less is seen at once, double: a state of 2 kB.
 _FINDINGS = 5
-#: s that closing may take; half: a slow hub aborts the process, double: the same.
-_CLOSE_S = 5.0
 #: Times the rig's held-out error that is a limit; half: good cells are yellow, double: bad ones are not.
 _LIMIT = 3.0
 
@@ -129,7 +127,7 @@ class CellSink(Sink):
     """Sends what a command measures to the hub of its site."""
 
     def __init__(self, cell: Cell, published: Published, mode: str) -> None:
-        super().__init__(wakes=256, close_s=_CLOSE_S)
+        super().__init__(wakes=256)
         self._config = zenoh_config("client", cell.router, (cell.ca, cell.certificate, cell.key))
         self._cell, self._published, self._mode = cell, published, mode
         self._outbox = Outbox(state_folder() / "cells" / cell.site / cell.name, cell.name)
@@ -161,7 +159,7 @@ class CellSink(Sink):
         self._close_s = 0.0
 
         def end(code: int, wrong: str) -> None:
-            self._exit, self._close_s = (code, wrong), _CLOSE_S
+            self._exit, self._close_s = (code, wrong), CLOSE_S
             self._exited.set()
             self.close()
 

@@ -18,7 +18,7 @@ TICK_S = 0.25
 #: A sink that has this share of what may wait does not pause: before data are dropped a command may come late.
 _BEHIND = 0.25
 #: How long :meth:`Sink.close` waits for the thread, s, where nothing else is said.
-_CLOSE_S = 10.0
+CLOSE_S = 10.0
 
 
 class Sink:
@@ -34,7 +34,7 @@ class Sink:
         problem: what ended the publishing early; None where nothing did.
     """
 
-    def __init__(self, limit: int = 512, wakes: int = 1, close_s: float = _CLOSE_S, *, images: bool = True) -> None:
+    def __init__(self, limit: int = 512, wakes: int = 1, close_s: float = CLOSE_S, *, images: bool = True) -> None:
         self._images = images
         self.taken = self.dropped = 0
         self.cpu_s = 0.0

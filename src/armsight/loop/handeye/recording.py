@@ -29,7 +29,6 @@ STILL_M, STILL_RAD = 1e-4, 1e-3
 STOPPED, STOPPED_M = 3, 0.01
 #: Poses of one TCP agree within this, m and rad, with a constant transform from the model's flange.
 TCP_M, TCP_RAD = 5e-3, 0.02
-STEP_RAD = 1e-6  # step of a joint for differences, rad
 
 
 @dataclass(frozen=True, eq=False)
@@ -372,8 +371,7 @@ def links_of(robot: PoseTable, arm: Arm | None, at: Array) -> Callable[[Array], 
         goal = Ts @ inverse(T_flange_tcp)
         for _ in range(2):
             back = inverse(np.asarray(arm.forward(q)))
-            by = [log_se3(back @ np.asarray(arm.forward(q + STEP_RAD * one))) / STEP_RAD for one in np.eye(q.shape[1])]
-            q = q + np.einsum("nji,ni->nj", np.linalg.pinv(np.stack(by, axis=2), rcond=1e-2), log_se3(back @ goal))
+            q = q + np.einsum("nji,ni->nj", np.linalg.pinv(arm.jacobian(q, "tool"), rcond=1e-2), log_se3(back @ goal))
 
     def links(between: Array) -> Array:
         joints = np.stack([np.interp(between, at, column) for column in q.T], axis=1)

@@ -491,8 +491,8 @@ SCALE_OFF = 0.2  # a scale off by more than this is a unit
 BAD_RAD = 2 * np.sqrt(6) * np.hypot(SIGMA["offset"], SIGMA["alpha"])
 #: Poses looked at, those that every order and sign is tried on, and the fewest that shifted rows do not fit by chance.
 POSES, FEW, FEWEST = 80, 24, 12
-#: Poses on either side of a step, RMS of what is looked into, m, length of a body's axes, m, and step of differences, rad.
-FEWEST_A_PART, LEAST_M, AXES_M, STEP_RAD = 6, 2e-4, 0.1, 1e-6
+#: Poses on either side of a step, RMS of what is looked into, m, and length of a body's axes, m.
+FEWEST_A_PART, LEAST_M, AXES_M = 6, 2e-4, 0.1
 SIMPLER = 1.2  # one joint is preferred to the whole base where it explains all but this many times as well
 CHANCE = 1e-8  # a step is one where chance explains as much with this probability at most, by one row and one joint
 MAX_JOINT_ORDERS = 40  # orders whose signs are tried, best first
@@ -731,7 +731,8 @@ def find_step(arm: Arm, measured: Measured) -> Step | None:
     M, _, t, _ = rigid_placement(T[:, :3, :3], T[:, :3, 3], p)
     here, there = p @ M.T, _points(T, t)
     here += (there - here).mean(axis=(0, 1))
-    joints = [(_points(arm.forward(q + STEP_RAD * one), t) - there) / STEP_RAD for one in np.eye(arm.joints)]
+    J, arms = arm.jacobian(q)[:, None], there - T[:, None, :3, 3]
+    joints = [J[..., :3, j] + np.cross(J[..., 3:, j], arms) for j in range(arm.joints)]
     base = [*np.broadcast_to(np.eye(3)[:, None, None], (3, n, K, 3)), *(np.cross(axis, here) for axis in np.eye(3))]
     tool = [np.eye(K)[k][:, None] * T[:, None, :3, i] for k in range(K) for i in range(3)]
     common = np.stack([*base, *tool, *joints]).reshape(-1, n * K * 3).T

@@ -33,7 +33,7 @@ from armsight.robot.trajectories.trajectory import CHECK_RATE_HZ, Joints, check_
 if TYPE_CHECKING:
     from armsight.robot.kinematics.arm import Arm
 
-ROUNDS = 12  # rounds of scaling a single law; from rest the second is exact up to where the samples fall
+ROUNDS = 12  # rounds of scaling a law until its limits hold; from rest the second is exact up to where samples fall
 #: Relative distance from its limit to which the fastest joint is brought; smaller: faster motions, more rounds.
 CLOSE = 1e-3
 #: Proportions of speed, acceleration and jerk, of what the joints could do at most, that are tried for a motion from rest.

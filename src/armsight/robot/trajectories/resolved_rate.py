@@ -20,6 +20,7 @@ from scipy.interpolate import CubicSpline
 from armsight.data import Array
 from armsight.errors import InputError
 from armsight.geometry.rotation import log_so3
+from armsight.robot.trajectories.law import ROUNDS
 from armsight.robot.trajectories.limits import ROUNDING, Worst, outside, start_state, worst
 from armsight.robot.trajectories.lookahead import behind
 from armsight.robot.trajectories.path import Path, PathPoints
@@ -38,7 +39,6 @@ SETTLED, SETTLE_S = 2e-6, 2.0
 LONGEST_S = 300.0  # the longest motion that may be asked for, s: each second of it is a thousand steps
 #: How far from the path a start's speeds may point, of their limits, and its accelerations, rad/s^2 at the arm's size.
 ALONG = 1e-5
-ROUNDS = 12  # rounds of slowing down until the limits hold
 _RANK = 1e-9  # a singular value below this is none
 #: How the share of the way moves, in units of its duration: limits of speed, acceleration and jerk.
 SHAPE = (1.6, 8.0, 80.0)
