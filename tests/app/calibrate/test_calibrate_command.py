@@ -300,21 +300,6 @@ def test_options_that_do_not_go_together(armsight, tmp_path, options):
     assert_rejected(armsight("calibrate", *options, "-o", tmp_path / "rig.json"))
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        ("calibrat",),
-        ("calibrate", "--no-such-option"),
-        ("calibrate",),
-        ("calibrate", "-o", "rig.json", "--folds", "1"),
-        ("calibrate", "-o", "rig.json", "--folds", "many"),
-        ("calibrate", "-o", "rig.json", "--model", "pinhole"),
-    ],
-)
-def test_what_is_typed_wrong(armsight, arguments):
-    assert_rejected(armsight(*arguments), "the usage is in: armsight")
-
-
 # Where a real process, or a real file system, matters.
 
 

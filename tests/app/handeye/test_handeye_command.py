@@ -135,37 +135,6 @@ def test_a_unit_or_a_rotation_that_is_given_counts(tmp_path):
     assert "about fixed x, y and z" in read_pose_table(euler).notes[0]
 
 
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("DECL PDAT PPDAT1={VEL 100.0,ACC 100.0}\n", "begins no table"),
-        ("- effector_wrt_world: [1, 0, 0, 0]\n", "holds a list of 1, and no poses: expected a list of matrices"),
-        ("[[[1, 0, 0, 0.1], [0, 1, 0, 0.2]]]\n", "holds a list of 1, and no poses: expected a list of matrices"),
-        ("j1,j2,j3,j4,j5,j6\n1,2,3,4,5,6\n", "joints without a unit: name them q1_deg"),
-    ],
-)
-def test_what_is_no_table_is_said_in_one_line(armsight, tmp_path, seen, text, said):
-    (tmp_path / "robot.txt").write_text(text)
-    result = armsight("handeye", "--robot", tmp_path / "robot.txt", "--seen", seen, "--eye", "in-hand")
-    assert result.code == 2
-    assert said in result.err
-    assert len(result.err.strip().splitlines()) == 1
-
-
-def test_the_poses_that_measure_wrote_are_read_with_the_shots_it_missed(armsight, tmp_path):
-    _, A, B = motion()
-    rows = [
-        [f"s{k}", "ok", "", "", *map(repr, map(float, (*T[:3, 3], *q)))]
-        for k, (T, q) in enumerate(zip(B, quaternions(B), strict=True))
-    ]
-    rows[4] = ["s4", "missed", "no board", *[""] * 8]
-    seen = named(tmp_path / "poses.csv", "shot,status,reason,t_s,x_m,y_m,z_m,qw,qx,qy,qz", rows)
-    document, said = found(armsight, matrices(tmp_path / "robot.txt", A), seen)
-    assert_right(document)
-    assert len(document["poses"]) == len(A) - 1
-    assert "no target in s4 (no board)" in said
-
-
 def test_where_the_arms_geometry_is_off_the_error_is_of_the_transforms_that_are_given(tmp_path):
     q, _, _ = motion(16)
     off = q + np.array([0.0, 0.02, -0.02, 0.02, -0.02, 0.0])
@@ -577,6 +546,10 @@ def test_a_tcp_taken_for_the_flange_is_noted_where_the_joints_are_known(armsight
         ("1 0 0 0 0 1 0 0 0 0 1.5 0\n", ["line 1", "no rotation"]),
         ("0 0 0 1 0 0 0\n", ["rotation=wxyz or rotation=xyzw"]),
         ("", ["no rows"]),
+        ("DECL PDAT PPDAT1={VEL 100.0,ACC 100.0}\n", ["begins no table"]),
+        ("- effector_wrt_world: [1, 0, 0, 0]\n", ["holds a list of 1, and no poses: expected a list of matrices"]),
+        ("[[[1, 0, 0, 0.1], [0, 1, 0, 0.2]]]\n", ["holds a list of 1, and no poses: expected a list of matrices"]),
+        ("j1,j2,j3,j4,j5,j6\n1,2,3,4,5,6\n", ["joints without a unit: name them q1_deg"]),
     ],
 )
 def test_a_damaged_table_is_one_line(armsight, tmp_path, seen, text, words):

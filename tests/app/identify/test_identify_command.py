@@ -27,7 +27,7 @@ from armsight.loop.identify.identify import Errors, Validation
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.model import Model
 from armsight.loop.identify.read import read_measured, read_poses
-from armsight.robot.arm_file import open_arm, read_arm_toml
+from armsight.robot.arm_file import open_arm
 from armsight.robot.models import MODELS
 from cli_runs import assert_rejected, run, said_of
 
@@ -300,13 +300,6 @@ def test_what_is_wrong_in_an_arm_file_is_reported(tmp_path, capsys, change, part
     path.write_text(change(path.read_text()))
     data = poses_csv(tmp_path / "p.csv")
     assert_rejected(said(capsys, "--arm", path, "--data", data), "arm.toml", *parts)
-
-
-def test_an_arm_file_is_the_arm(tmp_path):
-    arm = open_arm("puma560")
-    read = read_arm_toml(arm_toml(tmp_path / "arm.toml", arm))
-    q = np.linspace(-1, 1, 6)
-    np.testing.assert_allclose(read.forward(q), arm.forward(q), atol=1e-12)
 
 
 def test_full_poses_with_covariance_are_read(tmp_path):

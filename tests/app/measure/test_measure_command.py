@@ -289,12 +289,6 @@ def test_left_and_right_exchanged_is_the_reason(start, arm, armsight):
     assert "rotated" not in said.err  # which parallel cameras' images nearly are, too
 
 
-def test_a_rig_of_another_image_size(start, arm, armsight):
-    for path in arm.glob("*.png"):
-        cv2.imwrite(str(path), cv2.resize(cv2.imread(str(path)), (320, 180)))
-    assert_rejected(armsight(*start, *images(arm)), "320x180", "640x360", "rig.json")
-
-
 @pytest.mark.parametrize("target", ["", "plate", "nowhere.toml", "nowhere.csv", "chessboard:9x6", "tag:1:2"])
 def test_a_target_that_is_none(rendered, arm, armsight, target):
     assert_rejected(armsight("measure", rendered.rig, "--target", target, *images(arm)))

@@ -10,7 +10,7 @@ import pytest
 
 from armsight.app.measure import shots as measure_module
 from armsight.app.measure import view as view_module
-from armsight.app.measure.picture import WIDTH, _Panel, ascii_text, draw_shot, ellipse, header, marks_of, wrapped
+from armsight.app.measure.picture import RED, WIDTH, _Panel, ascii_text, draw_shot, ellipse, header, marks_of, wrapped
 from armsight.app.measure.view import (
     CHART,
     EACH_UP_TO,
@@ -107,7 +107,7 @@ def test_a_disc_that_one_camera_does_not_see_is_shown_with_its_reason():
     assert marks.dropped.sum() == 1
     canvas = draw_shot(["P2 is hidden"], None, (blank(), blank()), (SIZE, SIZE), marks)
     assert canvas.shape[1] == WIDTH
-    assert (canvas == (40, 40, 200)).all(axis=2).any(), "something is red"
+    assert (canvas == RED).all(axis=2).any(), "something is red"
 
 
 def test_what_neither_camera_sees_is_shown_too_but_not_on_the_far_side():
@@ -154,7 +154,7 @@ def test_a_missed_shot_is_shown_with_its_reason_in_red_and_without_images_too():
         assert canvas.shape[1] == WIDTH
         # OpenCV 4 blends letters with the ground, and none of their pixels is quite as red.
         blended = 0 if int(cv2.__version__.split(".")[0]) >= 5 else 39
-        assert (np.abs(canvas.astype(int) - (40, 40, 200)).max(axis=2) <= blended).any()
+        assert (np.abs(canvas.astype(int) - RED).max(axis=2) <= blended).any()
 
 
 @pytest.mark.opencv

@@ -112,13 +112,19 @@ def test_a_file_of_version_2_is_read_unfaded_with_a_note(arm, tmp_path):
 
 
 def test_a_file_of_version_1_is_read(arm, tmp_path):
-    """It had other names of the kinds of gravity, and [[cause]] tables."""
-    x = arm.x.copy()
+    """It said no version, had other names of the kinds of gravity, and [[cause]] tables; here of an arm of any name."""
+    x, name = arm.x.copy(), '\U0001f9be "worn\\ \x7f'
     x[[arm.model.names.index(name) for name in ("gravity_backlash3", "compliance2_3")]] = 2e-3, 1e-3
-    arm = replace(arm, x=x)
+    arm = replace(arm, x=x, model=replace(arm.model, arm=replace(arm.model.arm, name=name)))
     text = table_text(arm).replace("version = 3\n", "").replace("[[error_source]]", "[[cause]]")
     old = tmp_path / "old.toml"
-    old.write_text(text.replace('"gravity_backlash3"', '"slack3"').replace('"compliance2_3"', '"sag2_3"'))
+    old.write_text(
+        text.replace('"gravity_backlash3"', '"slack3"').replace('"compliance2_3"', '"sag2_3"'), encoding="utf-8"
+    )
+    arm.save(tmp_path / "new.toml")
+    new, first = (armsight.open_arm(tmp_path / file) for file in ("new.toml", "old.toml"))
+    assert new.name == first.name == name
+    np.testing.assert_array_equal(new.table, first.table)
     q = np.random.default_rng(2).uniform(-1, 1, (20, 6))
     back = armsight.open_corrected(old)
     np.testing.assert_allclose(back.joint_corrections(q), arm.joint_corrections(q), rtol=0, atol=1e-12)

@@ -41,6 +41,7 @@ def written(tmp_path, positions, more="", **looks):
         (((-0.055, 0, 0), (0.055, 0, 0), (0, 0.085, 0)), {}, ["(P2)", "0.11 mm from P1", "mm?"]),
         (((-55e3, 0, 0), (55e3, 0, 0), (0, 85e3, 0)), {}, ["(P2)", "110 m from P1", "mm?"]),
         (TRIANGLE, {"radius": 0.0}, ["(P1)", "radius_mm", "0.0"]),
+        (TRIANGLE, {"radius": "8, bright = 1"}, ["(P1)", "bright", "true or false"]),
         (TRIANGLE, {"radius": -8.0}, ["(P1)", "radius_mm", "-8.0"]),
         (TRIANGLE, {"radius": 8000.0}, ["(P1)", "8000", "16 m across", "mm?"]),
     ],
