@@ -6,6 +6,7 @@ Poses are sampled from a seed and kept when the whole pattern is in view of both
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +24,7 @@ from armsight.vision.camera import Camera
 from armsight.vision.rig import StereoRig
 
 _TRIES = 400  # for one pose before giving up
-_AT_ONCE = 16  # of them; half: more calls, double: more that are not used
+_AT_ONCE = 32  # of them; half: more calls, double: more that are not used
 _SLANT_MAX = np.radians(62.0)  # beyond it a board is hard to read
 _MARGIN_PX = 4.0
 
@@ -66,15 +67,16 @@ def example_rig(
 
 def in_view(rig: StereoRig, Ts_left_pattern: Array, pattern: Pattern) -> NDArray[np.bool_]:
     """Return for poses (A, 4, 4) whether both cameras see all of a pattern, at a readable slant: (A,)."""
-    p_pattern = np.column_stack([outline(pattern), np.zeros(4 * OUTLINE)])
-    rows = np.arange(len(Ts_left_pattern))
-    for camera, T_camera_left in ((rig.left, np.eye(4)), (rig.right, inverse(rig.T_left_right))):
+    whole, rows = np.column_stack([outline(pattern), np.zeros(4 * OUTLINE)]), np.arange(len(Ts_left_pattern))
+    cameras = (rig.left, np.eye(4)), (rig.right, inverse(rig.T_left_right))
+    # The corners first: most poses that are tried fail there already.
+    for points, (camera, T_camera_left) in product((whole[::OUTLINE], whole), cameras):
         Ts = T_camera_left @ Ts_left_pattern[rows]
-        p = transform(Ts[:, None], p_pattern)
+        p = transform(Ts[:, None], points)
         uv = camera.project(p.reshape(-1, 3)).reshape(*p.shape[:2], 2)
         high = np.array(camera.image_size_px) - 1 - _MARGIN_PX
-        away = p / np.linalg.norm(p, axis=-1, keepdims=True)
-        slant = (away * Ts[:, None, :3, 2]).sum(axis=-1).min(axis=1)
+        away = p / np.sqrt(np.einsum("api,api->ap", p, p))[..., None]
+        slant = np.einsum("api,ai->ap", away, Ts[:, :3, 2]).min(axis=1)
         inside = ((uv >= _MARGIN_PX) & (uv <= high)).all(axis=(1, 2)) & (slant >= np.cos(_SLANT_MAX))
         rows, uv, away = rows[inside], uv[inside], away[inside]
         # Where a distortion polynomial folds back, a point far outside is projected inside: its ray shows that.
@@ -123,15 +125,9 @@ def board_poses(
 
 
 def _tried(
-    draws: Array,
-    rig: StereoRig,
-    pattern: Pattern,
-    number: int,
-    side: int,
-    first: int,
-    fill: tuple[float, float],
-    tilt_deg: float,
-) -> Array:
+    draws: Array, rig: StereoRig, pattern: Pattern, number: int, side: int, first: int,
+    fill: tuple[float, float], tilt_deg: float,
+) -> Array:  # fmt: skip
     """Return poses (A, 4, 4) of a pattern in a cell of the image of one side, of draws (A, 6) in 0 to 1.
 
     The image is divided into 4 x 3 cells; the poses of later attempts, of which ``first`` is the first's number, are
@@ -196,18 +192,14 @@ def path(
 
 def tag_plate() -> tuple[tuple[Pattern, ...], str]:
     """Return the demo's end-effector: its patterns, and the text of the body file that describes it."""
-    patterns, lines = [plate(*PLATE_M, value=0.12)], ["version = 2", 'name = "plate"']
+    patterns, text = [plate(*PLATE_M, value=0.12)], 'version = 2\nname = "plate"\n'
     for k, (x, y) in enumerate(TAG_MIDDLES_M):
         patterns.append(tag(marker_bits(TAG_FAMILY, k), TAG_M).on_body(pose(np.eye(3), np.array([x, y, 0.0]))))
-        lines += [
-            "",
-            "[[markers]]",
-            f'name = "T{k}"',
-            f"position_mm = [{x * 1e3:g}, {y * 1e3:g}, 0.0]",
-            "euler_zyx_deg = [0.0, 0.0, 0.0]",
-            f'tag = {{ family = "{TAG_FAMILY}", id = {k}, size_mm = {TAG_M * 1e3:g} }}',
-        ]
-    return tuple(patterns), "\n".join(lines) + "\n"
+        text += (
+            f'\n[[markers]]\nname = "T{k}"\nposition_mm = [{x * 1e3:g}, {y * 1e3:g}, 0.0]\n'
+            f'euler_zyx_deg = [0.0, 0.0, 0.0]\ntag = {{ family = "{TAG_FAMILY}", id = {k}, size_mm = {TAG_M * 1e3:g} }}\n'
+        )
+    return tuple(patterns), text
 
 
 def demo_recording(

@@ -49,8 +49,9 @@ def test_a_wish_that_is_not_reached_is_exit_code_1(armsight, monkeypatch):
 def test_a_wish_below_the_print_is_rejected_with_the_nearest(armsight):
     said = armsight("budget", *SMALL, "--want", "0.02mm")
     assert_rejected(said, "the print of the body alone costs", "can be had")
-    nearest = re.search(r"([0-9.]+mm) can be had", said.err)[1]
-    assert armsight("budget", *SMALL, "--want", nearest).code == 1  # the print allows it, the cameras do not
+    moving, resting = re.search(r": (\S+deg) at \S+, (\S+deg) at rest can be had", said.err).groups()
+    assert armsight("budget", *SMALL, "--want", moving).code == 0
+    assert armsight("budget", *SMALL, "--want", resting, "--speed", "0m/s").code == 0
     assert_rejected(armsight("budget", *SMALL, "--want", "5mm,0.001deg"), "deg, no camera reaches 0.001")
 
 

@@ -113,6 +113,12 @@ def _noise(pipeline: CameraPipeline, kind: str, size_px: float, moved_px: float)
     return float(np.sqrt(chart.points * (near**2).mean())), len(every), asked
 
 
+@lru_cache(maxsize=2)
+def _camera(size: tuple[int, int]) -> Camera:
+    """Return a chart's camera, one of a size: the renderer keeps 12 MB of rays for each."""
+    return Camera(size, "none", np.array([_FOCAL_PX, _FOCAL_PX, *((n - 1) / 2 for n in size)]), np.zeros(0))
+
+
 @lru_cache(maxsize=12)  # 2 MB each
 def _shown(
     kind: str, size_px: float, number: int, psf_sigma_px: float, size: tuple[int, int]
@@ -121,8 +127,7 @@ def _shown(
     rng = np.random.default_rng((42, number))
     chart = _CHARTS[kind](size_px / _FOCAL_PX, rng)
     T = pose(exp_so3(np.array([0.0, 0.0, rng.uniform(-0.3, 0.3)])), np.array([0.0, 0.0, 1.0]))
-    camera = Camera(size, "none", np.array([_FOCAL_PX, _FOCAL_PX, *((n - 1) / 2 for n in size)]), np.zeros(0))
-    light = radiance(camera, [PosedBody(chart.patterns, T)], psf_sigma_px=psf_sigma_px)
+    light = radiance(camera := _camera(size), [PosedBody(chart.patterns, T)], psf_sigma_px=psf_sigma_px)
     return chart, light, camera.project(transform(T, np.column_stack([chart.spots, np.zeros(len(chart.spots))])))
 
 

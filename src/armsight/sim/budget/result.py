@@ -177,13 +177,18 @@ class RigBudget(Record):
     def check(self) -> None:
         """Raise an InputError where the print of the body alone costs more than what was requested: no camera helps."""
         floor = self.found.at_level(self.found.cov(of="print of the body"))
+        had = ", ".join(
+            f"{up(each.mm)}mm,{up(each.deg)}deg {when}"
+            for each, when in ((self.moving, f"at {self.plan.speed}"), (self.at_rest, "at rest"))
+            if each.lost_share <= MOST_LOST
+        )
         units = ("mm", 1e3), ("deg", 180 / math.pi)
         for least, most, (unit, scale) in zip(floor, self.plan.requested or (0.0, 0.0), units, strict=True):
             if 0 < most < least.max():
                 raise InputError(
                     f"want {self.plan.want}: the print of the body alone costs {scale * least.max():.2g} {unit}, no "
-                    f"camera reaches {scale * most:g}: {up(scale * least.max())}{unit} can be had, or less with its "
-                    "markers measured after printing: body_print, body_bent, body_size"
+                    f"camera reaches {scale * most:g}: {had} can be had with this plan, less with the body's markers "
+                    "measured after printing: body_print, body_bent, body_size"
                 )
 
     def worst_m(self, cause: str) -> float:
