@@ -131,10 +131,8 @@ def _likeliest(found: Budget, which: Array, e: Array, share: str) -> dict[str, f
     """Return causes and their factors: the one that raises the likelihood most, then the next, until chance explains it."""
     changed, high = dict[str, float](), _FITS[share][1]
     chance = 3 * (high**2 - 1 - 2 * math.log(high))  # what the last factor that fits gains, in all three axes
-    free, likely = (
-        [c for c in found.factors if CAUSES[c].common == (share == "trueness")],
-        _fit(found, which, e, share)[1],
-    )
+    free = [cause for cause in found.factors if CAUSES[cause].common == (share == "trueness")]
+    likely = _fit(found, which, e, share)[1]
     while len(changed) < len(free):
         tried = {
             (cause, factor): _fit(_scaled(found, {cause: factor}), which, e, share)[1]

@@ -55,9 +55,8 @@ from armsight.vision.rig import StereoRig
 #: are lost, double: bodies twice as large are asked for.
 _LEAST_PX = {"disc": 8.0, "tag": 24.0, "square": 8.0}
 MOST_SQUARE_PX = 60.0  # px; larger squares' corners are no better; half: their noise is a tenth too large
-_SETS = (
-    3  # of poses of the board, whose mean is taken; half: sigma differs by 10 % by chance, double: half a second more
-)
+#: Sets of poses of the board, whose mean is taken; half: sigma differs by 10 % by chance, double: half a second more.
+_SETS = 3
 #: Lengths that a table-top cell has, m: what lies outside is mm given as m.
 _LEAST_M, _MOST_M = 0.001, 20.0
 _LEAST_APART_M = 0.01  # m; half: endoscopes pass, double: the smallest camera modules are rejected
