@@ -45,9 +45,12 @@ def objects_of(value, at=""):
             yield from objects_of(value[key], f"{at}.{name}")
 
 
-def hold_keys(arguments, out):
-    """Hold JSON to the keys that programs read. After new ones: ``rm json_keys.json; ARMSIGHT_KEYS=1 pytest -n 0 app``."""
-    command = " ".join(takewhile(str.isalpha, map(str, arguments)))
+def hold_keys(arguments, out, kind=""):
+    """Hold JSON to the keys that programs read, those of each kind of a sensor by themselves.
+
+    After new ones: ``rm json_keys.json; ARMSIGHT_KEYS=1 pytest -n 0 app``.
+    """
+    command = " ".join([*takewhile(str.isalpha, map(str, arguments)), kind]).strip()
     known = json.loads(KEYS.read_text()) if KEYS.exists() else {}
     held = known.setdefault(command, {})
     new = "ARMSIGHT_KEYS" in os.environ
@@ -67,12 +70,12 @@ def run(*arguments):
     return end.value.code
 
 
-def said_of(capsys, *arguments):
+def said_of(capsys, *arguments, kind=""):
     """Run ``armsight`` and return what it printed; its JSON must have the keys that are known."""
     capsys.readouterr()
     said = Said(run(*arguments), *capsys.readouterr())
     if "--json" in arguments and said.code in (0, 3):
-        hold_keys(arguments, said.out)
+        hold_keys(arguments, said.out, kind)
     return said
 
 

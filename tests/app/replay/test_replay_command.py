@@ -61,14 +61,14 @@ def known_unit():
     return *record(t_s, Ts, errors, np.random.default_rng(1)), known
 
 
-def made(folder, text=""):
-    """Write a run to a folder and return that; with the text of references.toml its unit was fused."""
+def made(folder, text="", readings=None):
+    """Write a run to a folder and return that; with the text of references.toml it had that sensor, these its readings."""
     from armsight.loop.references.file import entries_of
-    from armsight.loop.running.setup import Fused
+    from armsight.loop.running.setup import fused
     from strategies import ordinary_rig
 
-    stamps, z, _ = known_unit()
-    unit = Fused(entries_of(text, folder)[0]) if text else None
+    stamps, z = readings or known_unit()[:2]
+    unit = fused(entries_of(text, folder)[0]) if text else None
     more = {"references.toml": text} if text else {}
 
     rig = ordinary_rig("brown5")
@@ -100,7 +100,7 @@ def made(folder, text=""):
         rows = (stamps > t_s[0] - 1e-3) & (stamps <= t_s[-1])
         felt = None if unit is None else unit.give(estimator, stamps[rows], z[rows])
         now = estimator.estimate()
-        felt = None if felt is None else ("imu", felt)
+        felt = None if felt is None else (unit.entry.reference.name, felt)
         sink.put(JointsDatum(states, now.T_base_tool, now.cov, now.vision_age_s, felt))
         if k % 4 == 3:
             shot = Shot(f"{k:06d}", None, None, float(t_s[0]))
@@ -213,6 +213,62 @@ def test_a_run_with_a_unit_is_the_same_to_the_last_digit_and_holds_ros_messages(
     (tmp_path / "r.toml").write_text(text)
     (beside,) = armsight("replay", tmp_path, "--references", tmp_path / "r.toml", "--json").lines
     assert beside["reference"]["moved_rms_m"] < 1e-6  # the same readings, given in other batches
+
+
+def known_field(noise_t=0.3e-6):
+    """The readings of a magnetometer on the tool of the run, and its calibration."""
+    from armsight.loop.references.heading import Magnetometer
+    from armsight.loop.references.reference import ToolMotion
+
+    t_s, rng = 0.02 * np.arange(1, 36), np.random.default_rng(3)
+    known = replace(Magnetometer.of("compass").moved(np.r_[0.1, -0.2, 0.3, np.zeros(6), 1e-5, 0, 0, 0, 9e-6, -42e-6]),
+                    cov=np.diag(np.full(15, 1e-16)))  # fmt: skip
+    Ts = ARM.forward(ARM.home + 0.3 * np.sin(t_s)[:, None] * np.linspace(0.5, 1, 6))
+    z = np.array([known.expected(ToolMotion(T), 0).z for T in Ts]) + rng.normal(0.0, noise_t, (len(t_s), 3))
+    return t_s, z, known
+
+
+def test_a_magnetometer_is_recorded_and_compared_and_says_nothing_where_it_cannot(armsight, run, tmp_path):
+    from armsight.geometry.rotation import exp_so3
+    from armsight.loop.references.file import COLUMNS, Entry, read_recording, written
+    from armsight.loop.references.heading import Magnetometer
+    from armsight.vision.sources.bag import Bag
+
+    stamps, z, known = known_field()
+    table, file = tmp_path / "field.csv", tmp_path / "references.toml"
+    text = written(Entry(known, "mpu-6050", table, None, None, True), tmp_path)
+    file.write_text(text)
+    made(tmp_path, text, (stamps, z))
+    assert armsight("replay", tmp_path, "--json").lines[0]["same"] is True
+    t_s, values = read_recording(tmp_path / "run.mcap", Magnetometer)
+    np.testing.assert_array_equal(values, z[: len(values)])
+    (message, *_) = Bag(tmp_path / "run.mcap").messages(["/magnetic_field"])
+    at, decoded = message.decode().magnetic_field, message.decode()
+    assert [at.x, at.y, at.z] == values[0].tolist()
+    assert (decoded.header.frame_id, message.stamp_ns()) == ("compass", round(1e9 * t_s[0]))
+
+    def beside(field):
+        rows = np.column_stack([stamps, field])
+        np.savetxt(table, rows, delimiter=",", header=",".join(["t_s", *COLUMNS[Magnetometer]]), comments="")
+        return armsight("replay", run, "--references", file, "--json", kind="magnetometer")
+
+    answer = beside(z).lines[0]["reference"]
+    assert answer["agrees"] is True
+    assert abs(answer["heading_off_rad"]) < 3 * answer["sigma_rad"] < np.radians(9)
+    rotated = replace(known, field_t=exp_so3(np.array([0.0, 0.0, -0.7])) @ known.field_t)
+    file.write_text(written(Entry(rotated, "mpu-6050", table, None, None, True), tmp_path))
+    answer = beside(z).lines[0]["reference"]
+    assert answer["agrees"] is False
+    assert abs(abs(answer["heading_off_rad"]) - 0.7) < 0.1
+    file.write_text(text)
+    assert beside(known_field(2e-5)[1]).lines[0]["reference"]["agrees"] is None
+    answer = beside(z[np.minimum(np.arange(len(z)), 12)]).lines[0]["reference"]
+    assert answer["agrees"] is None
+    assert "stood still while the tool was rotated" in answer["losses"][0]
+    assert "it says nothing" in armsight("replay", run, "--references", file).out
+    assert_rejected(beside(z[:1].repeat(len(z), 0)), "[compass]", "two that differ", "stood still")
+    for scale in (1e6, 1e7, 1e4):
+        assert_rejected(beside(scale * z), "[compass]", "give T, not uT, mG or gauss")
 
 
 def test_what_a_run_does_not_hold_is_named(armsight, run, tmp_path):

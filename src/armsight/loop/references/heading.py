@@ -26,7 +26,10 @@ EARTH_T = 45e-6
 NOISE_T = 0.5e-6
 #: A field that rotates with the tool by less, T, is none; half: dead sensors pass, double: weak fields are rejected.
 LEAST_T = 5e-6
-_MOST_T = 5e-3  # ranges of chips end there; half, double: nothing
+#: No field is larger, T, as ranges of chips end there; half, double: nothing.
+MOST_T = 5e-3
+#: Fields are compared so far apart, s; half: a motor counts twice, double: sweeps are short of attitudes.
+FIELDS_S = 0.2
 #: One sigma before a calibration: soft iron, relative; hard iron and field, T; half, double: nothing.
 _SOFT, _HARD_T, _FIELD_T = 0.3, 200e-6, 30e-6
 #: Attitudes for 10 unknowns a row at least; singular value, last over first, below which they do not span the space.
@@ -133,7 +136,7 @@ class Magnetometer(Reference):
 def check_unit(where: str, z: Array) -> None:
     """Raise an InputError where fields (N, 3) are so large that they are no tesla."""
     size = float(np.median(np.linalg.norm(z, axis=1))) if len(z) else 0.0
-    if size > _MOST_T:
+    if size > MOST_T:
         raise InputError(f"{where}: the field is {size:.3g} T, as if in uT, mG or gauss; give T (1 G is 1e-4 T)")
 
 

@@ -22,7 +22,7 @@ from armsight.estimate.solve import squares_of
 from armsight.loop.estimators.estimator import Estimator, Innovation, Outcome
 from armsight.loop.estimators.kalman import KalmanEstimator
 from armsight.loop.references.file import Entry, read_recording
-from armsight.loop.references.heading import NOISE_T, Magnetometer, heading_off
+from armsight.loop.references.heading import FIELDS_S, LEAST_T, MOST_T, NOISE_T, Magnetometer, heading_off
 from armsight.loop.references.inertial import INERTIAL_CLASSES, Inertial
 from armsight.loop.references.reference import Reading, ToolMotion
 from armsight.loop.references.strapdown import GAP_S, Samples
@@ -123,8 +123,9 @@ MOST = 1000
 #: Outliers so close together are one impact, s; half: one that rings counts twice, double: two knocks count once.
 APART_S = 0.3
 _SAID = 5  # impacts in a line
-#: Fields are compared so far apart, s; half: a motor counts twice, double: less is averaged. Sigmas that agree at most.
-FIELDS_S, AGREES = 0.2, 3.0
+#: Sigmas below which a heading agrees, and the sigma, rad, above which it then says nothing. Half: chance disagrees, few
+#: magnetometers say anything; double: a base that was rotated by 15 degrees agrees.
+AGREES, SAYS_RAD = 3.0, math.radians(3.0)
 #: Returns times (N,), s, and readings (N, 6) up to a time, s, that were not returned before.
 ReadingsSource = Callable[[float], tuple[Array, Array]]
 
@@ -171,18 +172,19 @@ class HeadingRow:
     """How the arm's heading agrees with a magnetometer's."""
 
     name: str  #: of the reference
-    readings: int  #: that were compared, ``FIELDS_S`` apart
+    readings: int  #: that were compared, ``FIELDS_S`` apart or more
     begin_s: float  #: of the first, s
     heading_off_rad: float  #: rotation of the base about its z, or of joint 1's zero, since the calibration
     sigma_rad: float  #: of that, motors and calibration included
-    agrees: bool  #: whether it is below ``AGREES`` sigma
+    agrees: bool | None  #: whether it is below ``AGREES`` sigma; None: its sigma is large, or its value stood still
     disturbance_t: float  #: median field of motors and iron, T, as far as it shows
     losses: tuple[str, ...]  #: what was lost of it; empty where nothing was
 
     @property
     def line(self) -> str:
         """It as a line for people."""
-        found = "agrees" if self.agrees else "disagrees: was the base rotated, or is a magnet near?"
+        disagrees = "disagrees: was the base rotated, or is a magnet near?"
+        found = "says nothing" if self.agrees is None else "agrees" if self.agrees else disagrees
         return (
             f"heading by {self.name} since {self.begin_s:.1f} s: off by {np.degrees(self.heading_off_rad):.2f} deg, sigma "
             f"{np.degrees(self.sigma_rad):.2f}, motors disturb it by {1e6 * self.disturbance_t:.2g} uT; it {found}"
@@ -286,7 +288,9 @@ class Fused:
             return "was recorded alone: armsight references calibrate finds its parameters"
         if np.isnan(self._newest_s):
             return "no reading is of the run's times; do both have one clock?"
-        if self._apart_s > GAP_S and isinstance(self.entry.reference, Inertial):
+        if not isinstance(self.entry.reference, Inertial):
+            return f"{self.windows} of its readings could be compared; two that differ are needed"
+        if self._apart_s > GAP_S:
             return (
                 f"samples are {1e3 * self._apart_s:.0f} ms apart, at most {1e3 * GAP_S:.0f} are integrated over; record "
                 "faster"
@@ -295,16 +299,36 @@ class Fused:
 
 
 class Witness(Fused):
-    """A magnetometer: it is compared with the estimates and changes none, as motors disturb it for seconds."""
+    """A magnetometer: it is compared with the estimates and changes none, as motors disturb it for seconds.
+
+    A reading is left out where it is no field in T, or where its value first came before the tool was rotated, or is known.
+    """
+
+    _looked_s, _since_s, _stuck, _value = -np.inf, -np.inf, False, np.empty(0)
 
     def _take(self, estimator: KalmanEstimator, samples: Samples) -> None:
+        sensor, (begin, end) = self.entry.reference, estimator.span_s
         for t, z in zip(samples.t_s.tolist(), samples.z, strict=True):
-            at = t - self.entry.reference.delay_s
-            begin, end = estimator.span_s
-            if begin <= at <= end and (not self._compared or t - self._compared[-1][0].t_s >= FIELDS_S):
-                T = estimator.track(np.array([at])).Ts_base_tool[0]
-                self._compared.append((Reading(t, 0, z, NOISE_T**2 * np.eye(3)), T))
-                self.begin_s, self.windows = min(self.begin_s, at), self.windows + 1
+            if not np.array_equal(z, self._value):
+                self._value, self._since_s = z, t
+            at = t - sensor.delay_s
+            if not begin <= at <= end or t - self._looked_s < FIELDS_S:
+                continue
+            self._looked_s = t
+            if not np.linalg.norm(z) < MOST_T:
+                self._losses[f"a field above {1e3 * MOST_T:g} mT was left out: give T, not uT, mG or gauss"] += 1
+                continue
+            was, T = estimator.track(np.array([max(self._since_s - sensor.delay_s, begin), at])).Ts_base_tool
+            if known := bool(self._compared) and self._compared[-1][0].t_s >= self._since_s:
+                was = self._compared[-1][1]
+            first, now = (sensor.expected(ToolMotion(each), 0).z for each in (was, T))
+            self._stuck = bool(np.linalg.norm(now - first) > LEAST_T)
+            if self._stuck:
+                self._losses["its value stood still while the tool was rotated"] += 1
+            if self._stuck or known:
+                continue
+            self._compared.append((Reading(t, 0, z, NOISE_T**2 * np.eye(3)), T))
+            self.begin_s, self.windows = min(self.begin_s, at), self.windows + 1
 
     def row(self, covs: Array, before: tuple[float, float] | None = None) -> FusedRow | HeadingRow:
         """Return how the heading of the arm agrees with that of the field; ``before`` does not matter."""
@@ -314,9 +338,17 @@ class Witness(Fused):
         poses = {each.t_s - sensor.delay_s: T for each, T in self._compared}
         off = heading_off(sensor, [each for each, _ in self._compared], lambda t: ToolMotion(poses[t]))
         agrees = abs(off.angle_rad) < AGREES * off.sigma_rad
+        says = not self._stuck and (off.sigma_rad < SAYS_RAD or not agrees)
         disturbed = float(np.median(off.disturbance_t))
         return HeadingRow(
-            sensor.name, self.windows, self.begin_s, off.angle_rad, off.sigma_rad, agrees, disturbed, self.losses
+            sensor.name,
+            self.windows,
+            self.begin_s,
+            off.angle_rad,
+            off.sigma_rad,
+            agrees if says else None,
+            disturbed,
+            self.losses,
         )
 
 
