@@ -12,11 +12,16 @@ from armsight.app.board.readings import BoardReadings
 from armsight.data import JointStates
 from armsight.errors import DeviceError, InputError
 from armsight.loop.running.data import JointsDatum
+from armsight.robot.boards.ar4.board import Ar4Board
+from armsight.sim.boards.ar4 import Ar4Teensy
+from armsight.sim.boards.device import SteppedLink
 from cli_runs import assert_rejected
 
 
 class FakeBoard:
     """Reads twice, with what it is given as faults, and is then gone; its clock begins at 0 with each."""
+
+    homed = True
 
     def __init__(self, faults=()):
         self.status = SimpleNamespace(faults=faults)
@@ -70,6 +75,44 @@ def test_a_lost_board_is_opened_again_and_each_loss_is_said_once(monkeypatch):
         "error",
     ]
     assert all(each.closed for each in boards)
+
+
+def test_an_arm_that_is_not_homed_gives_no_angles_until_it_is(monkeypatch):
+    """Its port is free meanwhile for who homes it; a Teensy that restarts has lost its zeros again."""
+    teensy, data, lines, opened = Ar4Teensy(homing_s=0.2), [], [], []
+
+    def connect():
+        link = SteppedLink(teensy)
+        return Ar4Board.connect(link, now=link.now)
+
+    def open_any(name):
+        opened.append(sum(isinstance(each, JointsDatum) for each in data))
+        if len(opened) == 4:
+            with connect() as board:
+                board.home()
+        return connect()
+
+    def put(datum):
+        data.append(datum)
+        if isinstance(datum, JointsDatum):
+            teensy.restart()
+        elif len(opened) == 5:
+            again.set()
+
+    again = threading.Event()
+    monkeypatch.setattr(readings, "open_any", open_any)
+    monkeypatch.setattr(readings, "is_real", lambda name: True)
+    monkeypatch.setattr(readings, "_PAUSE_S", 0.001)
+    board = BoardReadings("ar4:/dev/none")
+    board.start(put, lines.append)
+    assert again.wait(20)
+    board.close()
+    unhomed = f"board: ar4:/dev/none: {readings.NOT_HOMED}; trying again"
+    assert "nothing answers" in lines[2]  # no model is set in a Teensy that begins
+    assert lines == [unhomed, "board: connected", lines[2], unhomed]
+    assert opened[:5] == [0, 0, 0, 0, 1]
+    q = np.vstack([each.states.q for each in data if isinstance(each, JointsDatum)])
+    assert np.abs(q).max() < np.radians(0.1)  # at rest after homing; unhomed it reads up to -170 degrees
 
 
 def test_an_emulated_board_is_read_in_real_time_until_it_is_closed():

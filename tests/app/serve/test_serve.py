@@ -104,7 +104,7 @@ def test_an_interrupt_ends_the_child(serving):
 
 
 def test_a_board_that_is_lost_and_back_is_said_once(tmp_path):
-    """Also where the child that reads it begins anew meanwhile, and says so itself."""
+    """And where another reason shows; also where the child that reads it begins anew meanwhile, and says so itself."""
     events = []
     served = Service(ServeConfig(("--board=feetech:arm",), tmp_path, http="", log="log"), events.append)
 
@@ -123,11 +123,15 @@ def test_a_board_that_is_lost_and_back_is_said_once(tmp_path):
         log("board: arm: no such port; trying again", "error")
     assert (served.state()["healthy"], served.state()["why"]) == (False, "board: arm: no such port; trying again")
     assert (served.values()["board_up"], served.values()["up"]) == (0, 1)
+    served._began -= 3600.0  # shots go on since then
+    assert served.state()["for_s"] < 60.0  # the board's own time
+    log("board: arm: not homed; trying again", "error")
+    assert served.state()["why"] == "board: arm: not homed; trying again"
     log("board: connected", "info")
     log("board: joint 2: hot", "warning")
     log("no board", "error")
     assert served.state()["healthy"]
-    assert [each["event"] for each in events] == ["measuring", "board lost", "board back"]
+    assert [each["event"] for each in events] == ["measuring", "board lost", "board lost", "board back"]
     assert served.values()["board_losses_total"] == 1
     said = (tmp_path / "log").read_text()
     assert (said.count("no such port"), said.count("joint 2: hot")) == (1, 1)

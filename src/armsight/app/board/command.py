@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 _JSON = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 _FILE = click.argument("file", type=PATH)
+NOT_HOMED = "not homed since switched on: its readings are not the arm's angles (armsight board home)"
 #: The steps of a bring-up, in their order, and what each finds of a joint (``found.JointFound``).
 STEPS = {
     "readings": "noise_counts",
@@ -147,15 +148,13 @@ def monitor(name: str, seconds: float | None, every: float, as_json: bool) -> No
     """
     from armsight.app.board import text
     from armsight.robot.board_registry import is_real
-    from armsight.robot.boards.ar4.board import Ar4Board
 
     if click.get_current_context().get_parameter_source("name") is ParameterSource.DEFAULT:
         click.echo(f"note: no --board: this one is {name}, a program; --board serial:PORT is a board", err=True)
     with open_any(name) as board:
         click.echo(text.welcome_text(board), err=True)
-        if isinstance(board, Ar4Board) and not board.homed:
-            angles = "these are not the arm's angles (armsight board home)"
-            click.echo(f"note: not homed since switched on: {angles}", err=True)
+        if not board.homed:
+            click.echo(f"note: {NOT_HOMED}", err=True)
         passed = 0.0
         while seconds is None or passed < seconds - 1e-9:
             states = board.receive(every)

@@ -1,5 +1,6 @@
 """A board's joint readings beside the shots of live cameras, on their clock; a board that is lost is opened again.
 
+A board that is not homed gives none. Its port is left alone between two looks, so that `armsight board home` gets it.
 Nothing is commanded: the drives stay as they are, and so does the arm, also when the readings end.
 """
 
@@ -12,10 +13,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from armsight.app.board.command import open_any
+from armsight.app.board.command import NOT_HOMED, open_any
 from armsight.app.options import BOARD
 from armsight.data import JointStates
-from armsight.errors import DeviceError
+from armsight.errors import DeviceError, InputError
 from armsight.loop.running.data import Datum, JointsDatum, NoteDatum
 from armsight.loop.running.setup import HostClock
 from armsight.robot.board_registry import check_board, is_real
@@ -39,7 +40,8 @@ class BoardReadings:
             check_board(name)
         self._name, self._ended = name, threading.Event()
         self._thread = threading.Thread(target=self._run, name="board", daemon=True)
-        self._newest_s, self._faults, self._lost = -np.inf, tuple[str, ...](), False
+        self._newest_s, self._faults = -np.inf, tuple[str, ...]()
+        self._lost: type[Exception] | None = None  # by what kind of error
 
     def start(self, put: Callable[[Datum], None], say: Callable[[str], None]) -> None:
         """Begin: hand readings and notes to ``put``, and the notes to ``say`` as lines."""
@@ -52,13 +54,15 @@ class BoardReadings:
             pause_s = min(max(2 * pause_s, _PAUSE_S), _LONGEST_S)
             try:
                 with open_any(self._name) as board:
-                    self._lost, pause_s = False, _PAUSE_S
+                    if not board.homed:
+                        raise InputError(f"{self._name}: {NOT_HOMED}")
+                    self._lost, pause_s = None, _PAUSE_S
                     self._note("connected", "info")
                     self._read(board)
             except Exception as error:  # noqa: BLE001 - nobody else watches this thread; the board is read again
-                if not self._lost:
+                if self._lost is not type(error):  # each kind of reason is said once
                     self._note(f"{error}; trying again", "error")
-                self._lost = True
+                self._lost = type(error)
 
     def _read(self, board: MotionBoard) -> None:
         """Publish what a board reads until the end; its readings are on the clock of live cameras."""

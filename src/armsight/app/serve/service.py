@@ -113,11 +113,13 @@ class Service:
     def state(self) -> dict[str, Any]:
         """Return what /healthz shows."""
         now = time.monotonic()
-        lost, board = self._lost_since, None if self._board_lost is None else self._board_lost[1]
+        since, why = self._began if self._lost_since is None else self._lost_since, self._why
+        if not why and self._board_lost is not None:
+            since, why = self._board_lost
         return {
-            "healthy": not self._why and board is None,
-            "why": self._why or board,
-            "for_s": round(now - (self._began if lost is None else lost), 1),
+            "healthy": not why,
+            "why": why or None,
+            "for_s": round(now - since, 1),
             "shot_age_s": round(now - self._newest, 2) if self._counts["shots_total"] else None,
             "tries": self._tries,
         }
@@ -210,11 +212,13 @@ class Service:
             self._tries = 0
 
     def _said_of_board(self, text: str, level: str) -> None:
-        """Log what the child says of its board; a loss and the return from it once, whichever child notices them."""
-        if level == "error" and self._board_lost is None:
-            self._board_lost = time.monotonic(), text
-            self._counts["board_losses_total"] += 1
-            self._event("board lost", text, why=text)
+        """Log what the child says of its board; a loss once and where another reason shows, whichever child notices."""
+        if level == "error":
+            since, why = self._board_lost or (time.monotonic(), "")
+            self._board_lost = since, text
+            self._counts["board_losses_total"] += not why
+            if text != why:
+                self._event("board lost", text, why=text)
         elif level == "info" and self._board_lost is not None:
             gone_s = time.monotonic() - self._board_lost[0]
             self._board_lost = None

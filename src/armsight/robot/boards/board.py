@@ -71,6 +71,7 @@ class Board:
     status: BoardStatus  #: its newest status
     joints: JointReport  #: its newest report of how the joints are driven
     abilities: Abilities  #: what it can do
+    homed = True  #: of its encoders that count it does not say so: with them enabling is rejected
 
     def __init__(self, link: Link, name: str) -> None:
         self.name, self._link, self._wire = name, link, Wire(link)

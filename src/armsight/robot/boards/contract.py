@@ -90,6 +90,11 @@ class MotionBoard(Protocol):
         """Number of broken or missing messages from it."""
         ...
 
+    @property
+    def homed(self) -> bool:
+        """False where it is known that its readings are not the arm's angles: it was not homed since it was switched on."""
+        ...
+
     def soft_limits(self) -> tuple[Array, Array]:
         """Return the lower and the upper limits (n,) that it keeps the joints within, rad."""
         ...
@@ -146,6 +151,11 @@ class PolledBoard:
         self.name, self.abilities, self.welcome, self._now = name, abilities, welcome, now
         self._sent, self._enabled, self._t_s = 0, False, 0.0
         self._goal, self._goal_speed = np.zeros(abilities.joints), np.zeros(abilities.joints)
+
+    @property
+    def homed(self) -> bool:
+        """Whether its readings are the arm's angles; sensors that are absolute need no homing."""
+        return True
 
     def _wait(self, wait_s: float) -> None:
         raise NotImplementedError

@@ -52,6 +52,7 @@ class StoppableBoard:
     status: BoardStatus = _of_board("status")
     joints: JointReport = _of_board("joints")
     broken_messages: int = _of_board("broken_messages")
+    homed: bool = _of_board("homed")
 
     @contextmanager
     def _held(self) -> Iterator[MotionBoard]:
