@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from worn_arm import worn
 
 import armsight
-from armsight.app.identify.report import headline
+from armsight.app.identify.report import assess, headline
 from armsight.errors import InputError
 from armsight.geometry.pose import pose
 from armsight.loop.identify.corrected import Corrected
@@ -85,13 +85,24 @@ def test_a_person_reads_a_sentence_and_the_held_out_line_first(tmp_path, capsys)
     assert f"joint 1  {q1_deg.min():.1f} to {q1_deg.max():.1f} deg" in everything
 
 
-def test_an_identified_arm_that_is_no_better_is_said_so():
-    small, large = (Errors(np.full((3, 1), error), np.zeros(0)) for error in (1e-3, 2e-3))
-    lines = [
-        headline(SimpleNamespace(held_out=Validation(*arms, False, 1.0), how="3 poses"))
-        for arms in ((large, small), (small, large))
-    ]
-    assert ["no better than the nominal arm" in line for line in lines] == [False, True]
+def test_an_identified_arm_is_better_only_where_it_corrects_something_by_more_than_chance():
+    noise = -np.random.default_rng(0).normal(0.0, 1e-4, (40, 1))  # of the difference, m
+
+    def grade(less_m, fitted, poses=40):
+        off = (2e-3 + noise[:poses], 2e-3 - less_m + 0 * noise[:poses])
+        held_out = Validation(*(Errors(each, np.zeros(0)) for each in off), False, 1.0)
+        model = SimpleNamespace(parameters=[SimpleNamespace(kind="a")])
+        found = SimpleNamespace(
+            model=model, solution=SimpleNamespace(free=np.array([fitted])), moved_all_over=lambda: (1.0, 0.0)
+        )
+        run = SimpleNamespace(held_out=held_out, how="poses", found=found, arm=SimpleNamespace(name="a"), notes=())
+        result = assess(run)[0]
+        assert ("no better than the nominal arm" in headline(run)) == (result == "poor")
+        return result
+
+    assert noise.mean() > 0  # by chance the mean error alone is less
+    assert [grade(0.0, True), grade(1e-4, True), grade(1.5e-3, True)] == ["poor", "fair", "good"]
+    assert [grade(1e-4, False), grade(1.5e-3, True, poses=1)] == ["poor", "poor"]
 
 
 def test_a_written_urdf_is_the_identified_arm():

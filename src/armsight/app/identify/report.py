@@ -241,14 +241,18 @@ def identify_report(run: Identification, *, everything: bool = False) -> Report:
     )
 
 
+def _is_better(run: Identification) -> bool:
+    """Return whether something was corrected, and lowers the held-out error by more than chance does (2 sigma)."""
+    gain, sigma = run.held_out.gain()
+    return bool(_fitted(run)) and gain > 2 * sigma
+
+
 def assess(run: Identification) -> tuple[Grade, str]:
     """Return the grade of an identification, and in one sentence what to do with it."""
     before, after = (1e3 * e.summary()["mean_m"] for e in (run.held_out.nominal, run.held_out.identified))
-    if after >= before:
-        return (
-            "poor",
-            f"Do not use this identification: the nominal arm of {run.arm.name} predicts as well; take more poses.",
-        )
+    if not _is_better(run):
+        why = f"the nominal arm of {run.arm.name} predicts as well"
+        return "poor", f"Do not use this identification: {why}; take more poses."
     said = f"the corrected {run.arm.name} is off by {after:.2f} mm where the nominal one is by {before:.2f}"
     if elsewhere := undetermined(*run.found.moved_all_over()):
         return "fair", f"Usable near these poses only: there {said}; {elsewhere}."
@@ -327,8 +331,9 @@ def headline(run: Identification) -> str:
     line += f", {1e3 * after['max_m']:.2f} mm largest ({1e3 * before['max_m']:.2f})"
     if "mean_rad" in after:
         line += f", {np.degrees(after['mean_rad']):.3f} deg mean ({np.degrees(before['mean_rad']):.3f})"
-    no_better = "; no better than the nominal arm: keep that one, or take more poses"
-    return f"{line}, on {run.how}{no_better if after['mean_m'] >= before['mean_m'] else ''}"
+    gain, sigma = (1e3 * each for each in run.held_out.gain())
+    no_better = f"; no better than the nominal arm (by {gain:.2f} +- {sigma:.2f} mm): keep that one, or take more poses"
+    return f"{line}, on {run.how}{'' if _is_better(run) else no_better}"
 
 
 def _in_short(backlashes: Sequence[JointBacklash], pairs: int) -> str:
