@@ -28,6 +28,7 @@ from scipy.optimize import differential_evolution
 from scipy.stats import norm, qmc
 
 import armsight
+from armsight.app.budget.report import THREE_WORSE
 from armsight.data import Array, PoseEstimate, Shot
 from armsight.files import write_text
 from armsight.geometry.pose import exp_se3, inverse, log_se3, pose, transform
@@ -321,7 +322,8 @@ def buying_page() -> str:
     )
     printed = (
         "Print the board with `armsight body draw chessboard:9x6:25mm -o board.pdf` and glue it to a stiff plate. "
-        "`armsight budget -o kit` draws the body. Measure both after printing: that gains more than better cameras."
+        "`armsight budget -o kit` draws the body. Measure both after printing: that gains more than better cameras. "
+        f"Three cameras may be worse than two, as {THREE_WORSE}."
     )
     head = (
         "| kit | price class | lens | at rest | in motion | mostly due to | at rest, print measured | "

@@ -6,6 +6,7 @@ import re
 import numpy as np
 import pytest
 
+from armsight.app.budget.report import THREE_WORSE
 from armsight.sim.budget import result
 from armsight.sim.budget.plan import RigPlan
 from armsight.sim.workcell.body import body_target, body_text
@@ -66,9 +67,30 @@ def test_a_body_of_its_own_and_keys_behind_the_plan(armsight, tmp_path, monkeypa
     (tmp_path / "plate.toml").write_text(body_text(0.8))
     (tmp_path / "plan.toml").write_text('body = "plate.toml"\ncamera = "machine-vision-2mp"\n')  # beside the plan
     assert armsight("budget", *given).code == 0
-    assert_rejected(armsight("budget", *given, "pairs=many"), "pairs=many: expected a number")
+    assert_rejected(armsight("budget", *given[:1], "pairs=many"), "pairs=many: expected a number")
     assert_rejected(armsight("budget", *given, "pears=3"), "did you mean pairs")
     assert_rejected(armsight("budget", *given, "other.toml"), "expected one PLAN.toml")
+    assert_rejected(
+        armsight("budget", tmp_path / "plan.toml", "pairs", "40"), "plan.toml pairs 40: expected pairs=VALUE"
+    )
+
+
+@pytest.mark.parametrize(
+    "given", [("speed=0.3m/s", "--speed", "0.1m/s"), ("pairs=9", "pairs=9"), ("want=5mm", "--want=1mm")]
+)
+def test_a_value_given_twice_is_one_line(armsight, given):
+    assert_rejected(armsight("budget", *given), "is given twice; give it once")
+
+
+def test_three_cameras_worse_than_two_are_explained(armsight, monkeypatch):
+    monkeypatch.setattr(result, "CHANGES", {})
+    for camera, size in (("webcam-720p", "0.2"), ("machine-vision-2mp", "0.1")):
+        said = armsight("budget", "--volume", f"{size}x{size}x{size}m", "--distance", "0.7m", "--camera", camera)
+        one, two, three = (
+            float(re.search(rf"{word} (\S+) mm", said.out)[1]) for word in ("at rest", "; two", "; three")
+        )
+        assert (THREE_WORSE in said.out) == (three > two), said.out
+        assert ("two take the distance" in said.out) == (two > one)
 
 
 @pytest.mark.parametrize(("speed", "code"), [("0.3m/s", 0), ("1m/s", 1)])
@@ -126,7 +148,8 @@ def test_wrong_units_are_one_line(armsight):
 
 
 @pytest.mark.parametrize(
-    ("key", "value"), [("rate_hz", "0"), ("body_scale", "0"), ("warming_k", "nan"), ("pairs", "2"), ("skew_ms", "-5")]
+    ("key", "value"),
+    [("rate_hz", "0"), ("body_scale", "0"), ("warming_k", "nan"), ("pairs", "1000000"), ("skew_ms", "-5")],
 )
 def test_numbers_that_no_rig_has_are_named(armsight, tmp_path, key, value):
     (tmp_path / "plan.toml").write_text(f"{key} = {value}\n")

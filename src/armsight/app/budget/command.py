@@ -41,9 +41,12 @@ def command(plan: Sequence[str], optimise: bool, output: str | None, as_json: bo
 
     settings = [each for each in plan if "=" in each and "/" not in each.partition("=")[0]]  # not runs/exp=3/plan.toml
     path, *more = [each for each in plan if each not in settings] or [""]
+    if keys := {each.name for each in RigPlan.settings()} & {path, *more}:
+        raise InputError(f"{path} {' '.join(more)}: expected {min(keys)}=VALUE")
     if more:
         raise InputError(f"{more[0]}: {path} is the plan already: expected one PLAN.toml, and KEY=VALUE")
-    given = options | RigPlan.of_text(settings)
+    options_text = [f"{key}={value}" for key, value in options.items() if value is not None]
+    given = dict.fromkeys(options) | RigPlan.of_text([*settings, *options_text])
     if output is not None:
         used = [path, *filter(None, map(given.get, ("rig", "arm", "body")))]
         check_folder(output, holding=REPORT_FILES, apart_from=used)

@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _SHOWN = 0.01  # share of lost shots that is shown; half: one in 200 is, double: one in 50 is not
+#: Why three cameras come out worse than two.
+THREE_WORSE = "three pairs are weighed by pixel noise alone: their common calibration counts twice"
 #: Names of all files that a report has.
 REPORT_FILES = (PAGE, "budget.json", "rig.json", "body.toml", "body.pdf", *figure_files("budget", ("volume",)))
 
@@ -48,10 +50,10 @@ def budget_report(found: RigBudget, alternatives: Sequence[Alternative] = (), ru
     states = found.states
     others = f"one camera at rest {states['one_camera']}; two {states['at_rest']}; three {states['three_cameras']}"
     levels = [each.level_m for each in (states["one_camera"], found.at_rest, states["three_cameras"])]
-    if levels != sorted(levels, reverse=True):
-        others += (
-            ": two and three take the distance from the size of the calibration's board, one from that of the body"
-        )
+    if levels[1] > levels[0]:
+        others += "; two take the distance from the size of the calibration's board, one from that of the body"
+    if levels[2] > levels[1]:
+        others += f"; {THREE_WORSE}"
     rows = tuple(
         (each.cause, f"{1e3 * each.rms_m:.2g}", f"{math.degrees(each.rms_rad):.2g}")
         + (("loop", "") if each.loop else (f"{100 * each.share:.0f} %", f"{1e3 * each.halved_level_m:.2g} mm"))

@@ -200,9 +200,11 @@ class RigPlan:
 
     @staticmethod
     def of_text(pairs: Iterable[str]) -> dict[str, Any]:
-        """Return what KEY=VALUE say, a number where the key has one."""
+        """Return what KEY=VALUE say, each key once, a number where the key has one."""
         kinds, found = {each.name: type(each.default) for each in RigPlan.settings()}, dict[str, Any]()
         for key, _, value in (pair.partition("=") for pair in pairs):
+            if key in found:
+                raise InputError(f"{key}={value}: {key} is given twice; give it once")
             try:
                 found[key] = value if kinds.get(key, str) is str else float(value)
             except ValueError:
@@ -434,7 +436,7 @@ class RigPlan:
         for key, (least, most) in _RANGES.items():
             value = getattr(self, key)
             if value != getattr(RigPlan, key) and not least <= value <= most:
-                raise InputError(f"{key} is {value:g}: expected {least:g} to {most:g}")
+                raise InputError(f"{key} is {value}: expected {least:g} to {most:g}")
         if own := [key for key in self.named if key in self.of_rig]:
             raise InputError(f"{self.rig} has its own {', '.join(own)}: leave out what it says itself")
         for key in ("body_scale", "body_depth") if self.body else ():
