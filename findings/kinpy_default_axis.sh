@@ -1,8 +1,8 @@
 #!/bin/sh
 # kinpy 0.6.1: a URDF joint without <axis> rotates about z; URDF's default is x. Nothing says so.
 #
-# URDF (wiki.ros.org/urdf/XML/joint) leaves the axis out where it is (1, 0, 0), and hand-written files do. yourdfpy, like
-# MuJoCo, pinocchio and ikpy, rotates about x. kinpy takes the default of its own Joint, (0, 0, 1); its MJCF reader shares
+# URDF (wiki.ros.org/urdf/XML/joint) leaves the axis out where it is (1, 0, 0), and hand-written files do. yourdfpy
+# rotates about x. kinpy takes the default of its own Joint, (0, 0, 1); its MJCF reader shares
 # that class, and there z is right. pytorch-kinematics 0.10.0, whose readers are related, has the same lines (not run).
 #
 # Seen: a tool 0.1 m along y from such a joint at 90 degrees: yourdfpy (0, 0, 0.1), kinpy (-0.1, 0, 0).

@@ -2,11 +2,11 @@
 # ur_rtde 1.6.5: after the arm is gone, getActualQ() gives its last joints for ever, and no exception.
 #
 # RTDEReceiveInterface keeps the last values that came. Where the controller is switched off, or the cable is pulled, a
-# log goes on with fresh times of the computer and joints that stand; getTimestamp() stands, too. isConnected() is the only
-# sign, and it comes two to three seconds later: the rows in between are of an arm that may have moved on.
+# log goes on with fresh times of the computer and joints that stand; getTimestamp() stands, too. isConnected() turns false,
+# but one to four seconds later: the rows in between are of an arm that may have moved on.
 #
-# Seen, with a controller that sends 125 times a second and stops after 100 packages: joint 1 1.00 rad for ever after,
-# isConnected() true at first, false after 5 s.
+# Seen, with a controller that sends 125 times a second and after 100 packages falls silent, its line open: joint 1 1.00 rad
+# and the same getTimestamp() for 8 s; isConnected() true at first, false about 2.5 s after the last package.
 set -e
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
@@ -70,10 +70,11 @@ while head := line.recv(3, socket.MSG_WAITALL):
             package = b"\x01"
             for name in names:
                 form = kind(name)[1]
-                numbers = [k / 100 if name == "actual_q" else 0] * int(form[:-1] or 1)
+                numbers = [k / 100 if name in ("actual_q", "timestamp") else 0] * int(form[:-1] or 1)
                 package += struct.pack(">" + form, *numbers)
             send(ord("U"), package)
             time.sleep(0.008)
+        print("silent", flush=True)
         time.sleep(60)
 PYTHON
 "$folder/venv/bin/python" - <<'PYTHON'
@@ -87,15 +88,21 @@ robot = subprocess.Popen([sys.executable, "controller.py"], stdout=subprocess.PI
 try:
     robot.stdout.readline()
     arm = RTDEReceiveInterface("127.0.0.1")
-    time.sleep(1.5)
-    first = arm.getActualQ()[0], arm.isConnected()
-    time.sleep(5.0)
-    robot.kill()
-    time.sleep(1.0)
-    last = arm.getActualQ()[0], arm.isConnected()
+    assert robot.stdout.readline() == "silent\n"
+    silent = time.monotonic()
+    time.sleep(0.2)
+    first = arm.getActualQ()[0], arm.getTimestamp(), arm.isConnected()
+    lost_s = None
+    while (passed := time.monotonic() - silent) < 8.0:
+        if lost_s is None and not arm.isConnected():
+            lost_s = passed
+        assert (arm.getActualQ()[0], arm.getTimestamp()) == first[:2]
+        time.sleep(0.05)
+    assert robot.poll() is None  # the line was open all the time
 finally:
     robot.kill()
-print(f"the arm has stopped sending: joint 1 {first[0]:.2f} rad, connected {first[1]}; 6 s later {last[0]:.2f}, {last[1]}")
-assert first == (1.0, True)
-assert last == (1.0, False)
+joint, stamp, connected = first
+print(f"silent: joint 1 {joint:.2f} rad, timestamp {stamp:.2f} s, connected {connected}; false after {lost_s:.1f} s")
+assert first == (1.0, 1.0, True)
+assert lost_s is not None and 1.0 < lost_s < 4.0
 PYTHON

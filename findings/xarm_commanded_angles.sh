@@ -4,7 +4,7 @@
 # One request, number 42, has two answers: without data the controller's commanded angles, with the byte 01 those of the
 # joints' encoders. get_servo_angle() sends it without: an arm that is pushed, sags or lags is logged where it should be
 # (UFACTORY's answer in issue 73 of the SDK: is_real=True). The docstring names neither the parameter nor that the angles are
-# commanded. With firmware before 1.9.110 is_real=True is ignored without a word. An answer that does not come leaves the
+# commanded. With firmware 1.8.5 is_real=True is ignored without a word. An answer that does not come leaves the
 # angles of the time before, with a code that is not 0.
 #
 # Seen, with a controller that answers 0.1 rad commanded and 0.107 measured: get_servo_angle() 0.1, is_real=True 0.107; with
@@ -70,5 +70,5 @@ new.get_servo_angle()
 silent.set()
 code, angles = new.get_servo_angle()
 print(f"without an answer: code {code}, {angles[0]}")
-assert code != 0 and angles[0] == COMMANDED
+assert code == 3 and angles[0] == COMMANDED
 PYTHON
