@@ -7,9 +7,11 @@ import cv2
 import numpy as np
 import pytest
 
+from armsight.app.record.recording import record
 from armsight.errors import InputError
 from armsight.vision.blinking import WINDOW, window
-from armsight.vision.image import grey, read_image
+from armsight.vision.image import BitDepth, grey, read_image
+from armsight.vision.sources import FolderSource
 
 RNG = np.random.default_rng(0)
 GREY = RNG.integers(0, 256, (40, 60), dtype=np.uint8)
@@ -155,9 +157,9 @@ def test_grey_of_every_kind_of_image():
     np.testing.assert_array_equal(grey(GREY), GREY)
     np.testing.assert_array_equal(grey(GREY[:, :, None]), GREY)
     np.testing.assert_array_equal(grey(GREY.astype(np.uint16) * 257), GREY)
-    for bits in (10, 12, 14, 16):  # of a converter, at the low end
-        deep = np.arange(1 << bits, dtype=np.uint16)[None]
-        np.testing.assert_array_equal(grey(deep), np.rint(deep * (255 / (2**bits - 1))))
+    deep = np.arange(1 << 16, dtype=np.uint16)[None]
+    np.testing.assert_array_equal(grey(deep), np.rint(deep / 257))
+    np.testing.assert_array_equal(grey(deep[:, :1000]), grey(deep)[:, :1000])  # a dark image is dark
     expected = cv2.cvtColor(COLOUR, cv2.COLOR_BGR2GRAY)
     np.testing.assert_array_equal(grey(COLOUR), expected)
     np.testing.assert_array_equal(grey(np.dstack([COLOUR, GREY])), expected)
@@ -171,7 +173,37 @@ def test_grey_of_every_kind_of_image():
 def test_a_dark_window_of_a_deep_image_has_the_grey_levels_of_the_whole():
     deep = np.full((2 * WINDOW, 2 * WINDOW), 900, np.uint16)
     deep[0, 0] = 4000
-    assert set(np.unique(window(deep, (WINDOW, WINDOW)))) == {round(900 * 255 / 4095)}
+    assert set(np.unique(window(deep, (WINDOW, WINDOW)))) == {round(900 / 257)}
+
+
+@pytest.mark.parametrize("bits", [10, 12, 14, 16])
+def test_both_cameras_and_all_shots_of_a_source_have_one_depth(tmp_path, bits):
+    full = (1 << bits) - 1
+    for k, most in enumerate([full // 90, full // 30, full, full // 9]):
+        for side, share in (("left", 1.0), ("right", 0.5)):
+            image = np.rint(np.linspace(0, share * most, 256)).astype(np.uint16).reshape(16, 16)
+            cv2.imwrite(str(tmp_path / f"{side}{k}.png"), image)
+    source = FolderSource.open(tmp_path)
+    raw = [(read_image(pair.left), read_image(pair.right)) for pair in source.pairs]
+    part = list(source[1:2])
+    for shot, images in zip([*source, *part], [*raw, raw[1]], strict=True):
+        assert shot.bits == bits
+        for now, came in zip((shot.left, shot.right), images, strict=True):
+            np.testing.assert_allclose(grey(now), came * (255 / full), atol=0.75)
+    assert len(source.notes) == (bits != 16)
+    record(FolderSource.open(tmp_path), tmp_path / "again")  # keeps what came
+    for k, images in enumerate(raw):
+        for side, came in zip(("left", "right"), images, strict=True):
+            np.testing.assert_array_equal(read_image(tmp_path / "again" / f"{side}{k:06d}.png"), came)
+
+
+def test_a_depth_never_falls_and_says_when_it_rises():
+    depth, image = BitDepth(), np.full((4, 4), 1000, np.uint16)
+    assert depth.filled(image)[0][0, 0] == 1000 << 6
+    assert depth.filled(image * 4)[0][0, 0] == 1000 << 6
+    assert depth.filled(image)[0][0, 0] == 1000 << 4
+    assert [note.partition(",")[0][-7:] for note in depth.notes] == ["10 bits", "12 bits"]
+    assert depth.filled(GREY)[0] is GREY
 
 
 @pytest.mark.parametrize(

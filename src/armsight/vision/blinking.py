@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from armsight.data import Array, Image, Missed, Record
-from armsight.vision.image import eight_bits, grey
+from armsight.vision.image import grey
 
 #: Pixels on a side of a block, and of the window about a spot.
 BLOCK, WINDOW = 8, 32
@@ -93,8 +93,7 @@ def window(image: Image, corner: tuple[int, int]) -> Array:
 
 def _part(image: Image, corner: tuple[int, int], shape: tuple[int, ...]) -> Array:
     u, v = corner
-    whole = eight_bits(image)  # a part may be as dark as if it had fewer bits
-    return np.asarray(grey(whole[v : v + shape[0], u : u + shape[1]]))
+    return np.asarray(grey(image[v : v + shape[0], u : u + shape[1]]))
 
 
 def spot(pixels: Array, corner: tuple[int, int]) -> Spot | Missed:

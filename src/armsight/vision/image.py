@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import contextlib
 import io
+import itertools
 import os
 import struct
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
@@ -21,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight import MOST_PIXELS
-from armsight.data import Image
+from armsight.data import Image, Shot
 from armsight.errors import InputError
 from armsight.files import opened, read_bytes
 
@@ -197,11 +199,68 @@ def grey(image: Image) -> NDArray[np.uint8]:
 
 
 def eight_bits(image: Image) -> NDArray[np.uint8]:
-    """Return an image, uint8 or uint16, as uint8, scaled from the least of 10, 12, 14 and 16 bits that hold its pixels.
+    """Return an image, uint8 or uint16, as uint8; 65535 is 255, so shift an array of 12 bits first: ``image << 4``.
+
+    One image does not show how many bits its camera has; sources fill all 16 (:class:`BitDepth`).
+    """
+    return image if image.dtype == np.uint8 else np.rint(image / 257.0).astype(np.uint8)
+
+
+#: Images of a recording that are looked at for its bits; half: a bright one is missed sooner; double: a slower start.
+DEPTH_IMAGES = 16
+
+
+@dataclass(frozen=True, eq=False)
+class DeepShot(Shot):
+    """A shot with uint16 images.
+
+    Attributes:
+        bits: how many the cameras have; the images are shifted up to fill all 16.
+    """
+
+    bits: int = 16
+
+
+class BitDepth:
+    """The bits of a source's uint16 images: the least of 10, 12, 14 and 16 that hold every pixel of both cameras so far.
 
     Converters of fewer than 16 bits leave the high ones empty (GenICam's PFNC: Mono12), and the file does not say so.
+
+    Args:
+        first: images that are looked at before the first uint16 image is scaled, so that the scale stays.
     """
-    if image.dtype == np.uint8:
-        return image
-    full = next((1 << bits) - 1 for bits in (10, 12, 14, 16) if not int(image.max()) >> bits)
-    return np.rint(image * (255.0 / full)).astype(np.uint8)
+
+    def __init__(self, first: Callable[[], Iterable[Image]] = tuple) -> None:
+        self.bits = 0  #: 0 before the first uint16 image
+        self.notes: tuple[str, ...] = ()  #: what it took the images for, where that is not 16 bits from the first on
+        self._first = first
+
+    @classmethod
+    def of_files(cls, files: Sequence[Path]) -> BitDepth:
+        """Return that of the images of one camera."""
+        return cls(lambda: map(read_image, files[:: -(-len(files) // DEPTH_IMAGES)]))
+
+    def filled(self, *images: Image) -> tuple[Image, ...]:
+        """Return images shifted up so that they fill 16 bits; uint8 as they are."""
+        deep = [image for image in images if image.dtype == np.uint16]
+        if deep:
+            seen = deep if self.bits else [*deep, *itertools.islice(self._first(), DEPTH_IMAGES)]
+            most = max(int(image.max()) for image in seen if image.dtype == np.uint16)
+            bits = max(self.bits, next(bits for bits in (10, 12, 14, 16) if not most >> bits))
+            if bits != (self.bits or 16):
+                after = f", from a later shot on, brighter than {self.bits}" if self.bits else ""
+                self.notes += (f"its 16-bit images are read as {bits} bits, which hold their pixels{after}",)
+            self.bits = bits
+        return tuple(image << (16 - self.bits) if image.dtype == np.uint16 else image for image in images)
+
+    def shot(self, shot: Shot) -> Shot:
+        """Return a shot with filled images."""
+        if shot.left is None or shot.right is None or shot.left.dtype == shot.right.dtype == np.uint8:
+            return shot
+        left, right = self.filled(shot.left, shot.right)
+        return DeepShot(shot.name, left, right, shot.t_s, shot.problem, shot.encoded, self.bits)
+
+
+def images_of(shots: Iterable[Shot]) -> Iterator[Image]:
+    """Yield the left and the right image of each shot that has them."""
+    return (image for shot in shots for image in (shot.left, shot.right) if image is not None)

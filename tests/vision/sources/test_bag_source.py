@@ -100,6 +100,11 @@ def test_ros_encodings_become_grey_or_bgr(tmp_path):
     sent = [Sent(t, EPOCH_NS + k * STEP_NS, Pixels(deep)) for k in range(2) for t in (LEFT, RIGHT)]
     found, _ = shots(f"bag:{write_bag(tmp_path / 'b', 'mcap', sent)}")
     np.testing.assert_array_equal(found[1].right, deep)
+    dark_first = [deep // 300, deep // 300, deep // 6, deep // 6]  # 12 bits; by themselves the first would be 10
+    sent = [Sent(t, EPOCH_NS + k // 2 * STEP_NS, Pixels(dark_first[k])) for k, t in enumerate([LEFT, RIGHT] * 2)]
+    found, notes = shots(f"bag:{write_bag(tmp_path / 'd', 'ros1', sent)}")
+    np.testing.assert_array_equal(found[0].right, dark_first[1] << 4)
+    assert "its 16-bit images are read as 12 bits, which hold their pixels" in notes
     sent = [
         Sent(t, EPOCH_NS + k, Pixels(rgb), options={"encoding": "nv24"}) for k in (0, STEP_NS) for t in (LEFT, RIGHT)
     ]

@@ -29,7 +29,7 @@ from armsight.vision.calibrate.result import Calibration
 from armsight.vision.calibrate.weak import contradicted
 from armsight.vision.camera_file import read_cameras
 from armsight.vision.detections import read_detections
-from armsight.vision.image import darkness, grey, one_image, read_image
+from armsight.vision.image import BitDepth, darkness, grey, one_image, read_image
 from armsight.vision.markers.aruco import FAMILIES, detect_markers, family_size
 from armsight.vision.markers.board import open_board
 from armsight.vision.markers.body_file import load_body_csv, save_body_csv
@@ -163,8 +163,9 @@ class GivenImages:
                     unseen.keep(images, pairs[-1])
                 times.append(shot.t_s)
                 advance()
+            depth = BitDepth.of_files([path for _, path in self._alone])
             for side, path in self._alone if sizes is not None else ():
-                singles.append(_single(path, target, side, sizes[side] if sizes is not None else (0, 0)))
+                singles.append(_single(path, depth, target, side, sizes[side] if sizes is not None else (0, 0)))
                 advance()
         if sizes is None:
             why = f"none of {len(pairs)} pairs can be read; {pairs[0].name}: {pairs[0].left.problem}" if pairs else ""
@@ -200,9 +201,9 @@ def _files_of(pattern: str) -> list[Path]:
     return files
 
 
-def _single(path: Path, target: CalibrationBoard, side: int, size: tuple[int, int]) -> Pair:
+def _single(path: Path, depth: BitDepth, target: CalibrationBoard, side: int, size: tuple[int, int]) -> Pair:
     """Detect the target in an image of one camera alone; its pixels are converted to those of the pairs."""
-    image = grey(read_image(path))
+    image = grey(*depth.filled(read_image(path)))
     height, width = image.shape
     scale = size[0] / width
     if abs(height * scale - size[1]) > 0.5 * max(scale, 1.0):
@@ -270,8 +271,7 @@ class _Unseen:
 def _shots(source: Source) -> Iterator[tuple[Shot, tuple[Path | str, Path | str]]]:
     """Yield the shots of a source with the names of what they come from, for messages."""
     if isinstance(source, StoredSource):
-        for stored in source.pairs:
-            shot = stored.load()
+        for stored, shot in zip(source.pairs, source, strict=True):
             yield shot, (stored.left or shot.name, stored.right or shot.name)
         return
     while (next_one := source.read()) is not None:

@@ -18,7 +18,7 @@ from armsight.files import made_folder
 from armsight.vision.dense.method import NOTHING, Disparity, Method, Search
 from armsight.vision.dense.middlebury import read_pfm, read_tiff
 from armsight.vision.dense.rectified import match_pair, plain_grey
-from armsight.vision.image import read_image
+from armsight.vision.image import BitDepth, read_image
 from armsight.vision.rectify import Rectification
 
 #: Without a nearest depth or a greatest disparity: the nearest depth, in baselines.
@@ -29,7 +29,7 @@ _LEAST_DISPARITY = 2.0
 
 def read_pair(left: Path, right: Path) -> Shot:
     """Read the two images of a pair; PFM and TIFF files may hold floats of 0 to 255."""
-    return Shot(f"{left}, {right}", _read_pixels(left), _read_pixels(right))
+    return BitDepth().shot(Shot(f"{left}, {right}", _read_pixels(left), _read_pixels(right)))
 
 
 def _read_pixels(path: Path) -> Image:

@@ -22,7 +22,7 @@ from armsight.loop.handeye.poses import LEVER_M
 from armsight.loop.handeye.recording import Seen
 from armsight.vision.camera import Camera
 from armsight.vision.camera_file import read_camera
-from armsight.vision.image import grey, read_image
+from armsight.vision.image import BitDepth, grey, read_image
 from armsight.vision.markers.circles import unseen_row
 from armsight.vision.markers.marker import Target
 from armsight.vision.markers.targets import open_target
@@ -55,19 +55,20 @@ def see_with_camera(
     found, detections = open_target(target), list[Detections]()
     camera = None if camera_file == "fit" else read_camera(Path(camera_file))
     size: tuple[int, int] | None = None if camera is None else camera.image_size_px
+    depth = BitDepth.of_files(files)
     for file in files:
         progress(f"reading {file.name}")
-        image = read_image(file)
+        (image,) = depth.filled(read_image(file))
         here = (image.shape[1], image.shape[0])
         if size is not None and here != size:
             whose = "the first image" if camera is None else camera_file
             raise InputError(f"{file}: {here[0]}x{here[1]} px; {whose} has {size[0]}x{size[1]}")
         size = here
         detections.append(found.detect(grey(image)))
-    notes: tuple[str, ...] = ()
+    notes = depth.notes
     if camera is None and size is not None:
         camera = fit_camera(found, detections, size)
-        notes = (
+        notes += (
             f"the camera was calibrated from these images: fx {camera.intrinsics[0]:.1f} px; one of its own, from "
             "tilted views of a large board, would be independent of the arm",
         )

@@ -19,6 +19,7 @@ from armsight.app.interrupts import uninterrupted
 from armsight.data import SIDES, Shot
 from armsight.errors import ArmsightError, InputError
 from armsight.files import RowFile, check_folder, made_folder, replacing
+from armsight.vision.image import DeepShot
 from armsight.vision.source import Source
 from armsight.vision.sources.folder import COLUMNS, INDEX
 
@@ -123,7 +124,10 @@ class ShotFolder:
             if shot.problem is None:
                 for side in SIDES:
                     files.append(self.folder / f"{side}{self.shots:06d}.png")
-                    _, data = cv2.imencode(".png", np.asarray(shot.image(side)))
+                    image = np.asarray(shot.image(side))
+                    if isinstance(shot, DeepShot) and image.dtype == np.uint16:
+                        image = image >> (16 - shot.bits)  # as it came
+                    _, data = cv2.imencode(".png", image)
                     with replacing(files[-1], "wb", durable=False) as file:
                         file.write(data)
                     encoded.append(data.tobytes())

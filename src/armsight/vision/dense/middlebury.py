@@ -28,7 +28,7 @@ from armsight.errors import InputError
 from armsight.files import check_readable, read_bytes, read_text, replacing
 from armsight.vision.dense.evaluate import TrueDisparity, seen_by_right
 from armsight.vision.dense.method import Search
-from armsight.vision.image import IMAGE_MB, read_image
+from armsight.vision.image import IMAGE_MB, BitDepth, read_image
 
 
 def read_pfm(path: str | Path) -> NDArray[np.float32]:
@@ -181,7 +181,7 @@ def load_scene(folder: str | Path) -> MiddleburyScene:
     if files is None:
         known = ", ".join(f"{a} {b} {t}" for a, b, t in _LAYOUTS)
         raise InputError(f"{folder}: no scene of a known layout: {known}, or NAME_left NAME_right NAME_left_gt")
-    left, right = (read_image(path) for path in files[:2])
+    left, right = BitDepth().filled(*(read_image(path) for path in files[:2]))
     name = folder.resolve().name
     truth = _read_truth(files[2], name)
     if not left.shape[:2] == right.shape[:2] == truth.shape:

@@ -19,7 +19,7 @@ import numpy as np
 from armsight.data import SIDES, Array, Image, Record, Shot
 from armsight.errors import InputError
 from armsight.files import opened, read_json
-from armsight.vision.image import decoded
+from armsight.vision.image import BitDepth, decoded, images_of
 from armsight.vision.source import Source
 from armsight.vision.sources.video import Film
 
@@ -179,7 +179,7 @@ class LeRobotDataset:
 
 
 class LeRobotSource(Source):
-    """Two cameras of a dataset; a frame that cannot be decoded is a shot with a problem. ``notes``: what was left out."""
+    """Two cameras of a dataset; a frame that cannot be decoded is a shot with a problem."""
 
     timed = True
 
@@ -207,9 +207,15 @@ class LeRobotSource(Source):
         if len(missing) == len(numbers):
             raise InputError(next(iter(missing.values())))
         self._missing = missing
-        self.notes = tuple(f"episode {number}: {why}: left out" for number, why in missing.items())
+        self._notes = tuple(f"episode {number}: {why}: left out" for number, why in missing.items())
         self._ended = False
         self._shots = self._read()
+        self._depth = BitDepth(lambda: images_of(self._read()))
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What was left out, or is odd, a line each."""
+        return self._notes + self._depth.notes
 
     @property
     def count(self) -> int | None:
@@ -218,7 +224,8 @@ class LeRobotSource(Source):
 
     def read(self) -> Shot | None:
         """Return the next shot, or None at the end."""
-        return None if self._ended else next(self._shots, None)
+        shot = None if self._ended else next(self._shots, None)
+        return None if shot is None else self._depth.shot(shot)
 
     def close(self) -> None:
         """Close the videos."""

@@ -21,7 +21,7 @@ import numpy as np
 from armsight.data import Image, Shot
 from armsight.errors import InputError
 from armsight.files import natural_key
-from armsight.vision.image import read_image
+from armsight.vision.image import DEPTH_IMAGES, BitDepth, images_of, read_image
 from armsight.vision.source import Source
 
 #: Endings of video files, in lower case.
@@ -68,10 +68,12 @@ def halves(file: Path) -> tuple[Image, Image]:
 
 
 class StoredSource(Source):
-    """A source over ``pairs`` of image files, read one by one."""
+    """A source over ``pairs`` of image files, read one by one; a part of a source has its bits, ``depth``."""
 
-    def __init__(self, pairs: Sequence[StoredPair]) -> None:
+    def __init__(self, pairs: Sequence[StoredPair], depth: BitDepth | None = None) -> None:
         self.pairs = tuple(pairs)
+        every = max(1, -(-2 * len(self.pairs) // DEPTH_IMAGES))
+        self._depth = depth or BitDepth(lambda: images_of(pair.load() for pair in self.pairs[::every]))
         self.timed = any(pair.t_s is not None for pair in self.pairs)
         self._rest = iter(self.pairs)
 
@@ -79,6 +81,11 @@ class StoredSource(Source):
     def count(self) -> int:
         """How many there are."""
         return len(self.pairs)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What its images were taken for."""
+        return self._depth.notes
 
     @property
     def files(self) -> tuple[Path, ...]:
@@ -92,19 +99,19 @@ class StoredSource(Source):
     def __getitem__(self, row: int | slice) -> Shot | StoredSource:
         """Load a shot by its row in the recording, or return a source of some of them; what is read next here stays."""
         if isinstance(row, slice):
-            return StoredSource(self.pairs[row])
+            return StoredSource(self.pairs[row], self._depth)
         if not -len(self) <= row < len(self):
             raise IndexError(f"shot {row} of {len(self)}: rows begin at 0")
-        return self.pairs[row].load()
+        return self._depth.shot(self.pairs[row].load())
 
     def __iter__(self) -> Iterator[Shot]:
         """Load all shots, each time from the first; ``read`` goes on where it was."""
-        return (pair.load() for pair in self.pairs)
+        return (self._depth.shot(pair.load()) for pair in self.pairs)
 
     def read(self) -> Shot | None:
         """Return the next shot, or None at the end."""
         pair = next(self._rest, None)
-        return None if pair is None else pair.load()
+        return None if pair is None else self._depth.shot(pair.load())
 
     def close(self) -> None:
         """Let ``read`` return no more shots; no file is open."""

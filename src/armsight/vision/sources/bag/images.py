@@ -21,7 +21,7 @@ import numpy as np
 from armsight import MOST_PIXELS
 from armsight.data import SIDES, Image, Shot
 from armsight.errors import InputError
-from armsight.vision.image import decoded
+from armsight.vision.image import BitDepth, decoded, images_of
 from armsight.vision.source import Source
 from armsight.vision.sources.bag.pairing import Pairing, Stamps, pair, stamps_of
 from armsight.vision.sources.bag.reader import S_NS, Bag, BagMessage, Decoded
@@ -87,16 +87,22 @@ class _Planned:
 class BagSource(Source):
     """The stereo images of a recording in the order of time; an image without a partner is a shot with a problem.
 
-    ``notes``: what was left out, or is odd, a line each; ``topics``: of the left and of the right images.
+    ``topics``: of the left and of the right images.
     """
 
     timed = True
 
     def __init__(self, bag: Bag, topics: tuple[str, str], pairing: Pairing, stamps: tuple[Stamps, Stamps]) -> None:
-        self.topics, self.notes = topics, (*bag.notes, *pairing.notes)
+        self.topics, self._notes = topics, (*bag.notes, *pairing.notes)
+        self._depth = BitDepth(lambda: images_of(self._read()))
         self._bag = bag
         self._planned = _plan(pairing, stamps)
-        self._shots = self._read()
+        self._shots: Iterator[Shot] = map(self._depth.shot, self._read())
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What was left out, or is odd, a line each."""
+        return self._notes + self._depth.notes
 
     @property
     def count(self) -> int | None:
