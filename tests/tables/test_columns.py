@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from armsight.errors import InputError
+from armsight.robot.arm_file import open_arm
 from armsight.tables.cells import read_columns
 from armsight.tables.columns import Columns
 from armsight.tables.lengths import number
+from armsight.tables.poses import read_pose_table
 
 
 def test_columns_are_read_under_other_names(tmp_path):
@@ -109,3 +111,30 @@ def test_a_long_table_that_changes_while_it_is_read(tmp_path, monkeypatch):
     path.write_text("t_s,x_m\n0,1\n")
     with pytest.raises(InputError, match=r"imu\.csv: became shorter while it was read"):
         table.numbers(["x_m"])
+
+
+def test_joints_are_read_as_recorders_name_them(tmp_path):
+    arm = open_arm("ur5e")
+    q = np.random.default_rng(0).uniform(-1, 1, (3, 6)).round(6)
+    names, order = [f"{name}_joint" for name in arm.joint_names], [2, 1, 0, 3, 4, 5]
+    theirs, values = [names[k] for k in order], [",".join(map(str, row[order])) for row in q]
+    zeros = ",0.0" * 12
+    files = {
+        "plotjuggler": (
+            ",".join(["__time", *(f"/joint_states/{name}/position" for name in theirs)]),
+            "{k}.05,{values}",
+        ),
+        "topics": (",".join(["__time", *(f"/arm/{name}" for name in theirs)]), "{k}.05,{values}"),
+        "echo": ("", f"{{k}},50000000,,{','.join(theirs)},{{values}}{zeros}"),
+        "echo of positions alone": ("", f"{{k}},50000000,base,{','.join(theirs)},{{values}}"),
+    }
+    for name, (head, line) in files.items():
+        path = tmp_path / f"{name}.csv"
+        path.write_text(
+            "\n".join([*([head] if head else []), *(line.format(k=k, values=v) for k, v in enumerate(values))])
+        )
+        table = read_pose_table(path, arm=arm, only_joints=True)
+        np.testing.assert_allclose(table.q, q, err_msg=name)
+        np.testing.assert_allclose(table.t_s, np.arange(3) + 0.05, err_msg=name)
+    path.write_text(" ".join(["timestamp", *(f"actual_q_{k}" for k in range(6))]) + "\n7.5 " + " ".join(map(str, q[0])))
+    np.testing.assert_allclose(read_pose_table(path, arm=arm, only_joints=True).t_s, [7.5])

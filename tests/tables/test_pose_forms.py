@@ -199,6 +199,14 @@ FORMS = {
     ),
     "ros2 topic echo --csv of a PoseStamped": (
         "e.csv",
+        rows("1690000000,{k}5000000,base_link,{},{},{},{},{},{},{}", P, XYZW),
+    ),
+    "ros2 topic echo --csv of a TransformStamped": (
+        "e.csv",
+        rows("1690000000,5000000,base_link,tool0,{},{},{},{},{},{},{}", P, XYZW),
+    ),
+    "ros2 topic echo --csv of a PoseStamped, named in order": (
+        "e.csv",
         rows("1690000000,5000000,base_link,{},{},{},{},{},{},{}", P, XYZW),
         {"columns": "_,_,_,x_m,y_m,z_m,qx,qy,qz,qw"},
     ),

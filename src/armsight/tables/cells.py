@@ -261,8 +261,32 @@ def _without_names(path: Path, rows: Rows) -> Cells:
     if len(rows[0][1]) == 4:
         rows = _matrices(path, _even(path, rows, 4))
     count = len(rows[0][1])
+    if head := _echoed(rows):
+        times = [f"{row[0]}.{row[1]:0>9}" for _, row in _even(path, rows, count)]
+        return Cells(head, [(line, [t, *row[1:]]) for t, (line, row) in zip(times, rows, strict=True)])
     cells = Cells(_FORMS.get(count) or [f"_{k}" for k in range(count)], _even(path, rows, count))
     return _row_major(path, cells) if count == 16 else cells
+
+
+def _echoed(rows: Rows) -> list[str]:
+    """Return the names of the fields of messages that ``ros2 topic echo --csv`` writes; [] where they are none.
+
+    Seconds, nanoseconds, frame; then of a PoseStamped position and quaternion, of a TransformStamped the other frame first,
+    of a JointState names, positions, velocities, efforts (a message's fields in their order, without names).
+    """
+    first = rows[0][1]
+    texts = [k for k, cell in enumerate(first) if number(cell) is None]
+    names, rest = [first[k] for k in texts[1:]], len(first) - 2 - len(texts)
+    if texts != list(range(2, 2 + len(texts))) or not texts or not all(cell.isdecimal() for cell in first[:2]):
+        return []
+    if len(texts) <= 2 and rest == 7:
+        names = ["x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"]
+    elif rest not in (len(names), 2 * len(names), 3 * len(names)) or any(
+        row[3 : 3 + len(names)] != names for _, row in rows
+    ):
+        return []
+    fields = ["t_s", *(f"_{k}" for k in range(1, 2 + len(texts))), *names]
+    return [*fields, *(f"_{k}" for k in range(len(fields), len(first)))]
 
 
 def _is_last(cells: list[str]) -> bool | None:

@@ -102,14 +102,16 @@ def _of_ros(bare: Sequence[str], joint_names: Sequence[str], unit: str) -> list[
     """Return our names for those of ROS, of an arm's joints and of spreadsheets; others as they are."""
     ros = [_ROS.fullmatch(name) for name in bare]
     parts = {found[2] for found in ros if found and not found[1]}  # without w they are no quaternion
-    links = _RECORDED | {name.lower(): f"q{k}_rad" for k, name in enumerate(joint_names, 1)}
+    links = {name.lower(): f"q{k}_rad" for k, name in enumerate(joint_names, 1)}
+    recorded = _RECORDED | ({"timestamp": "t_s"} if any(name.startswith("actual_") for name in bare) else {})
     out = []
     for name, found in zip(bare, ros, strict=True):
         axis, mark, rest = name.partition("_")
         if found and (found[1] or parts == set("xyzw")):
             out.append(f"{found[2]}_{unit}" if found[1] else f"q{found[2]}")
         else:
-            out.append(links.get(re.sub(r"_joint$", "", name), _THEIRS.get(axis, axis) + mark + rest))
+            joint = links.get(re.sub(r"^.*/(?=[^/]+$)|_joint$", "", name.removesuffix("/position")))
+            out.append(joint or recorded.get(name, _THEIRS.get(axis, axis) + mark + rest))
     return out
 
 

@@ -294,8 +294,8 @@ def matched_rows(robot: PoseTable, seen: Sequence[str]) -> tuple[Rows, Rows]:
         return rows, matched
     if len(robot.Ts) != len(seen):
         raise InputError(
-            f"{robot.path}: {len(robot.Ts)} robot poses, but {len(seen)} images or target poses: which belong "
-            "together? give it a column image (or name), or t_s on both sides and --streams"
+            f"{robot.path}: {len(robot.Ts)} rows, but {len(seen)} images or target poses: which belong "
+            "together? give it a column image (or name), or t_s on both sides (handeye: with --streams)"
         )
     return np.arange(len(robot.Ts)), np.arange(len(seen))
 
