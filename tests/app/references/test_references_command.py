@@ -131,6 +131,8 @@ def test_a_sweep_that_rotates_the_tool_little_is_said(sweep, capsys, tmp_path, m
         ("[imu]\nkind = 'compass'", None, r"\[imu\]: kind is 'compass'; known are inertial, magnetometer"),
         ("[imu]\nkind = 'inertial'\nrate = 3", None, r"\[imu\]: unknown key 'rate'; known are kind, source"),
         ("[imu]\nkind = 'inertial'\nclass = 'best'", None, "no class of inertial units 'best'; there are icm-42688"),
+        ("[m]\nkind = 'magnetometer'\nclass = 'phone'", None, r"\[m\]: class is of an inertial unit"),
+        ("[imu]\nkind = 'inertial'\nsource = 'imu.csv'\nrate_hz = 5e4", None, "as if t_s were in ms; give s"),
         ("[imu]\nkind = 'inertial'\nrate_hz = 0", None, "rate_hz is 0; expected more"),
         ("[imu]\nkind = 'inertial'\nsource = 3", None, "source is 3; expected a text"),
         ("[imu]\nkind = 'inertial'", None, r"\[imu\]: no source; name its recording"),

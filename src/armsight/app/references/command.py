@@ -168,6 +168,7 @@ def _checked(entries: list[Entry]) -> Report:
     """Return what the recordings are like."""
     from armsight.app.show.messages import Note
     from armsight.app.show.report import Fact, Report
+    from armsight.loop.references.inertial import Inertial
 
     notes, facts, found = list[Note](), list[Fact](), list[dict[str, Any]]()
     for entry in entries:
@@ -177,10 +178,12 @@ def _checked(entries: list[Entry]) -> Report:
         facts += [Fact(line) for line in lines]
     name = "references check"
     sections = {"references": ("References", facts)}
-    answer: tuple[Grade, str] = (
-        "good",
-        "Good: what was recorded is as its class is; references calibrate is next.",
-    )
+    like = "what was recorded is as its class is"
+    if not all(isinstance(entry.reference, Inertial) for entry in entries):
+        like = "nothing is wrong with what was recorded"
+    done = all(entry.calibrated for entry in entries)
+    further = "run, demo and replay --references take the file" if done else "references calibrate is next"
+    answer: tuple[Grade, str] = ("good", f"Good: {like}; {further}.")
     if notes:
         answer = "fair", f"Usable with care: {notes[0].text}."
     return Report(name, "References", "", "", sections, notes, {"references": found}, assessed=answer)
@@ -225,6 +228,9 @@ def _check(entry: Entry) -> tuple[dict[str, Any], list[str], list[str]]:
         f"{name}: {len(t_s)} readings, {stream.rate_hz:.4g} Hz, jitter {1e3 * stream.jitter_s:.2g} ms, "
         f"{stream.gaps} gaps, the longest {1e3 * stream.longest_gap_s:.0f} ms"
     ]
+    for unit, scale in (("ms", 1e3), ("us", 1e6), ("ns", 1e9)):
+        if entry.rate_hz is not None and abs(stream.rate_hz * scale / entry.rate_hz - 1) <= RATE:
+            raise InputError(f"{source}: the rate is {stream.rate_hz:.4g} Hz, as if t_s were in {unit}; give s")
     weak = _weak_stream(entry, stream, values["saturated"])
     if not isinstance(entry.reference, Inertial):
         check_unit(str(source), z)

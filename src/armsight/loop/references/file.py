@@ -102,6 +102,8 @@ def _entry(path: Path, name: str, table: dict[str, Any]) -> Entry:
     for key in ("source", "live", "class"):
         if not isinstance(table.get(key, ""), str):
             raise InputError(f"{where}: {key} is {table[key]!r}; expected a text")
+    if kind == KINDS[Magnetometer] and "class" in table:
+        raise InputError(f"{where}: class is of an inertial unit; a magnetometer has none: leave it out")
     like = table.get("class", "mpu-6050")
     sensor: Sensor = Inertial.of(name, like) if kind == KINDS[Inertial] else Magnetometer.of(name)
     late = table.get("delay_s", 0.0), table.get("sigma_delay_s", sensor.sigma_delay_s)
