@@ -24,6 +24,17 @@ def test_an_exact_arm_loses_nothing_and_a_short_way_has_no_answer():
     assert odometry(arm, q[:0], arm.forward(q[:0])) is None
 
 
+def test_noise_of_an_arm_that_rests_is_no_travel_and_poses_that_are_no_numbers_are_left_out():
+    arm, rng = worn(1).nominal, np.random.default_rng(6)
+    q, _ = swept(worn(1))
+    Ts = arm.forward(np.tile(q[:1], (4000, 1)))
+    Ts[:, :3, 3] += rng.normal(0.0, 3e-4, (4000, 3))
+    assert odometry(arm, np.tile(q[:1], (4000, 1)), Ts) is None
+    Ts = arm.forward(q)
+    Ts[[0, 500]], bad = np.nan, np.where(np.arange(len(q))[:, None] == 300, np.nan, q)
+    assert max(odometry(arm, bad, Ts).error_rms_m) < 1e-12
+
+
 def test_worn_arms_lose_with_travel_as_is_predicted():
     """These arms are wrong by less than the prior: by as much less after each travel, whose errors differ five-fold."""
     found = [odometry(arm.nominal, *swept(arm)) for arm in map(worn, range(40, 52))]

@@ -75,6 +75,24 @@ def go(q, looks, said=None, t_s=None, z=None, late=0, *, heard=None, delay=KNOWN
     return estimator
 
 
+def test_images_that_waited_as_the_unit_came_count_as_those_after_it_do():
+    q, _, looks, said, t_s, z = world(300, 1.2, 1.2)
+    rows, covs = (t_s > 0.98) & (t_s < 1.1), []
+    ahead = [look for look in looks if 1.0 < look.t_s < 1.05]  # of the joints
+    for first in (True, False):
+        estimator = go(q[:1000], [look for look in looks if look.t_s <= 1.0])
+        for look in ahead if first else ():
+            assert estimator.vision(look) is Outcome.WAITING
+        estimator.take(said, Samples(t_s[rows], z[rows], DENSITY))
+        for look in () if first else ahead:
+            assert estimator.vision(look) is Outcome.WAITING
+        for k in range(1000, 1080, 10):
+            estimator.joints(states(np.arange(k, k + 10) * TICK_S, q[k : k + 10]))
+        covs.append(estimator.estimate().cov)
+    assert len(ahead) > 1
+    np.testing.assert_allclose(*covs, rtol=1e-9, atol=1e-18)
+
+
 def test_preintegration_is_that_of_a_hundred_times_finer_steps():
     w, f = np.array([1.2, -0.7, 2.0]), np.array([3.0, -2.0, 9.0])
     t = np.arange(0.0, 0.04, 1e-3)

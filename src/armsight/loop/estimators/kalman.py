@@ -74,8 +74,8 @@ WINDOW_S = 0.04
 #: While windows are used a link is loose by one sigma of so many rad, for so long, s. Half: joints overrule what was
 #: felt, double: they bound it later.
 LOOSE_RAD, LOOSE_S = 1.5e-3, 0.3
-#: Images in a row that count as one while windows are used; half: attitudes are claimed twice as well, double: late
-#: speeds.
+#: The gain is that of images whose noise is so many times its variance while windows are used, as errors of images in a row
+#: are alike; half: the tool follows what they share, double: late speeds.
 ALIKE = 5.0
 
 
@@ -249,8 +249,6 @@ class KalmanEstimator:
 
     def vision(self, pose_measurement: PoseMeasurement) -> Outcome:
         """Take a pose measurement, in any order of time; return what became of it."""
-        if self._unit is not None:
-            pose_measurement = replace(pose_measurement, cov_noise=ALIKE * pose_measurement.cov_noise)
         return self._hear(pose_measurement)
 
     def take(self, reference: Reference, reading: Reading | Samples) -> Outcome:
@@ -490,6 +488,9 @@ class KalmanEstimator:
         steps = () if felt is before else felt.steps
         before, joints = self._anew(felt, times)
         step = self._model.moved(before, joints, times, learning=LEARNING)
+        given, beside = pose_measurement, before.beside
+        if self._unit is not None:
+            pose_measurement = replace(given, cov_noise=ALIKE * given.cov_noise)
         at, chi = self._model.predicted(before, step, joints, pose_measurement, jitter_s)
         outcome = self._gate(at, chi)
         if outcome is Outcome.OUTLIER:
@@ -501,14 +502,14 @@ class KalmanEstimator:
             at.P[np.diag_indices(self._at.size)] += self._opened
             at.HP[:] += at.H * self._opened
         K, z, H = self._model.updated(at, joints, pose_measurement, jitter_s, learns_delay=self._learns_delay)
-        x, P, beside = at.x, at.P, before.beside
+        x, P = at.x, at.P
         if beside is not None:
             noise = pose_measurement.cov_noise + jitter_s**2 * np.outer(H[:, self._at.delay], H[:, self._at.delay])
             S = noise + at.HP @ H.T
             beside, gain = _measured(beside, step.kept[0], H, at.HP, z, S)
             by = np.hstack([H * step.kept[0], np.zeros((6, len(gain)))])
             # The gain is that of images which count less; what remains is by their own noise (Joseph's form).
-            less = (1.0 - 1.0 / ALIKE) * pose_measurement.cov_noise @ np.hstack([K.T, gain.T])
+            less = (pose_measurement.cov_noise - given.cov_noise) @ np.hstack([K.T, gain.T])
             whole = np.vstack([K, gain]) @ less
             P = P - whole[: len(P), : len(P)]
             beside = beside._replace(C=beside.C - whole[: len(P), len(P) :], Y=beside.Y - whole[len(P) :, len(P) :])
@@ -523,9 +524,7 @@ class KalmanEstimator:
                 by_delay = P[:, self._at.delay] / P[self._at.delay, self._at.delay]
                 P += (self.clock.sigma_s**2 - P[self._at.delay, self._at.delay]) * np.outer(by_delay, by_delay)
         considered = passed(_carried(before.considered, step), K, at.H) if before.considered else NONE_CONSIDERED
-        return ErrorState(
-            t_s, x, P, joints, pose_measurement, considered=considered, beside=beside, steps=steps
-        ), outcome
+        return ErrorState(t_s, x, P, joints, given, considered=considered, beside=beside, steps=steps), outcome
 
     def _alone(self, before: ErrorState, t_s: float, by: tuple[Smoothed, Propagation] | None = None) -> ErrorState:
         """Return the state at a time by the joints alone; ``by``: the joints then, and what the motion does to it."""

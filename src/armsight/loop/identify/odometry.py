@@ -9,6 +9,7 @@ derivatives become different, and is bounded, as nothing but the joints is added
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -45,13 +46,18 @@ def odometry(arm: Arm, q: Array, Ts_base_tool: Array, prior: Prior | None = None
 
     Args:
         arm: the nominal arm.
-        q: (N, n) joint angles by their sensors, rad, in order of time.
+        q: (N, n) joint angles by their sensors, rad, in order of time; rows that are no numbers are left out.
         Ts_base_tool: (N, 4, 4) poses of the tool then, by what is taken for the truth.
         prior: how far the arm may be off.
     """
     prior = prior or Prior()
-    way = np.cumsum(np.linalg.norm(np.diff(Ts_base_tool[:, :3, 3], axis=0, prepend=Ts_base_tool[:1, :3, 3]), axis=1))
-    rows = np.searchsorted(way, np.arange(0.0, way[-1] if len(way) else 0.0, STEP_M))
+    rows, points = list[int](), Ts_base_tool[:, :3, 3].tolist()
+    for row in np.flatnonzero(np.isfinite(Ts_base_tool).all(axis=(1, 2)) & np.isfinite(q).all(axis=1)).tolist():
+        if not rows or math.dist(points[row], points[rows[-1]]) >= STEP_M:  # a step that noise does not make
+            rows.append(row)
+    p = Ts_base_tool[rows, :3, 3]
+    way = np.cumsum(np.linalg.norm(np.diff(p, axis=0, prepend=p[:1]), axis=1))
+    rows = np.array(rows, int)[np.searchsorted(way, np.arange(0.0, way[-1] if len(way) else 0.0, STEP_M))]
     q, T, F = np.ascontiguousarray(q[rows]), Ts_base_tool[rows], arm.forward(q[rows])
     model = ErrorModel(arm, prior, 0.0)
     # Links are on the side of the backlash where friction holds them as their joints move; gravity keeps its side.
