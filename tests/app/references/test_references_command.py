@@ -197,7 +197,7 @@ def test_a_calibration_that_was_written_is_read_whatever_its_name_and_delay(swee
         read_references(out)
 
 
-def test_a_magnetometer_is_checked_and_calibrated_and_other_units_are_named(capsys, tmp_path):
+def test_a_magnetometer_is_checked_and_calibrated_and_other_units_are_named(capsys, tmp_path, monkeypatch):
     """Beside a motor, as the workcell has one; the poses are those of a sweep."""
     t, rng = np.arange(0.0, 30.0, 0.02), np.random.default_rng(8)
     Ts = np.array([pose(at) for at in t])
@@ -218,7 +218,11 @@ def test_a_magnetometer_is_checked_and_calibrated_and_other_units_are_named(caps
     (found,) = said.lines[0]["references"]
     assert found["left_out_rms"]["field_t"] < 5e-6
     assert found["left_out_over_sigma"] == pytest.approx(1.0, abs=0.3)
+    assert found["noise_factor"]["field"] > 0.9
     assert run("references", "check", tmp_path / "out.toml") == 0
+    monkeypatch.setattr(command, "SMALL_DEG", 200.0)
+    said = said_of(capsys, "references", "calibrate", tmp_path / "out.toml", *given[:2])
+    assert "the iron may be off by more than its sigma" in said.out + said.err  # it has no lever
     said = said_of(capsys, "references", "calibrate", tmp_path / "micro.toml", *given[:2])
     assert (said.code, len(said.err.splitlines())) == (2, 2)  # and what is fitted
     assert "as if in uT" in said.err

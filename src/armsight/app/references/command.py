@@ -37,7 +37,8 @@ ALLAN = {
     "gyro": ("rad", "rad_per_sqrt_s", "rad_s", "rad_s_per_sqrt_s", "rad_s2"),
     "accelerometer": ("m_s", "m_s_per_sqrt_s", "m_s2", "m_s2_per_sqrt_s", "m_s3"),
 }
-UNITS = {"gyro": "rad/s", "accelerometer": "m/s2", "field": "T"}
+#: Channels: their unit, and the least noise of a mean in it, below any chip's; half, double: nothing.
+CHANNELS = {"gyro": ("rad/s", 1e-6), "accelerometer": ("m/s2", 1e-6), "field": ("T", 1e-8)}
 
 
 @click.group("references")
@@ -302,6 +303,7 @@ def _calibrated(entries: list[Entry], poses: Path) -> tuple[Report, list[Entry]]
     from armsight.geometry.rotation import log_so3
     from armsight.loop.references.calibrate import PosePath
     from armsight.loop.references.calibrate import calibrate as fit
+    from armsight.loop.references.inertial import Inertial
     from armsight.tables.poses import read_pose_table
 
     table = read_pose_table(poses)
@@ -314,7 +316,8 @@ def _calibrated(entries: list[Entry], poses: Path) -> tuple[Report, list[Entry]]
     far = int(np.argmax(np.linalg.norm(log_so3(R[0].T @ R), axis=1)))  # from the first pose; and from there
     angle_deg = float(np.degrees(np.linalg.norm(log_so3(R[far].T @ R), axis=1).max()))
     if angle_deg < SMALL_DEG:
-        text = f"{poses}: the tool rotates by {angle_deg:.0f} deg: the lever may be off by more than its sigma"
+        what = "lever" if any(isinstance(entry.reference, Inertial) for entry in entries) else "iron"
+        text = f"{poses}: the tool rotates by {angle_deg:.0f} deg: the {what} may be off by more than its sigma"
         notes.append(Note("weak", f"{text}; rotate it by {SMALL_DEG:.0f} deg and more, about two axes"))
     for entry in entries:
         readings = _averaged(entry, path)
@@ -357,7 +360,8 @@ def _averaged(entry: Entry, path: Any) -> list[Any]:  # noqa: ANN401 - imported 
         )
     # Of neighbouring means what is not a line in time is noise; its median is that of rests, too, where there are any.
     bend = means[2:] - 2 * means[1:-1] + means[:-2]
-    noise = np.maximum(np.median(np.abs(bend), axis=0) / (0.6745 * np.sqrt(6.0)), 1e-6)
+    least = np.array([[CHANNELS[name][1]] for name in entry.reference.channels])
+    noise = np.maximum(np.median(np.abs(bend), axis=0) / (0.6745 * np.sqrt(6.0)), least)
     return [
         Reading(float(times[k]), channel, means[k, channel], np.diag(noise[channel] ** 2))
         for k in within[:: 1 if channels > 1 else max(round(FIELDS_S / float(np.median(np.diff(times)))), 1)]
@@ -386,7 +390,7 @@ def _said(result: ReferenceCalibration[Sensor]) -> tuple[dict[str, Any], list[An
         "sigma_delay_s": sensor.sigma_delay_s,
         "open": list(result.open),
         "noise_factor": result.noise,
-        "left_out_rms": {f"{name}_{UNITS[name].lower().replace('/', '_')}": rms for name, rms in errors.items()},
+        "left_out_rms": {f"{name}_{CHANNELS[name][0].lower().replace('/', '_')}": rms for name, rms in errors.items()},
         "left_out_over_sigma": float(np.sqrt(np.mean(result.squares[result.used]))),
         "outliers": int((~result.used).sum()),
     }
@@ -395,7 +399,7 @@ def _said(result: ReferenceCalibration[Sensor]) -> tuple[dict[str, Any], list[An
         for name, value in (*sensor.parameters.items(),)
     )
     delay = ("delay_s", f"{sensor.delay_s:.5g}", f"{sensor.sigma_delay_s:.2g}")
-    wrong = " and ".join(f"{rms:.3g} {UNITS[name]}" for name, rms in errors.items())
+    wrong = " and ".join(f"{rms:.3g} {CHANNELS[name][0]}" for name, rms in errors.items())
     sentence = (
         f"{sensor.name}: readings of times left out are wrong by {wrong} RMS, {values['left_out_over_sigma']:.2f} sigma; "
         f"{values['outliers']} of {len(result.used)} are outliers"
