@@ -74,8 +74,8 @@ WINDOW_S = 0.04
 #: While windows are used a link is loose by one sigma of so many rad, for so long, s. Half: joints overrule what was
 #: felt, double: they bound it later.
 LOOSE_RAD, LOOSE_S = 1.5e-3, 0.3
-#: The gain is that of images whose noise is so many times its variance while windows are used, as errors of images in a row
-#: are alike; half: the tool follows what they share, double: late speeds.
+#: The gain is that of images whose noise has so many times its variance while windows are used, as errors of images in a
+#: row are alike; half: the tool follows what they share, double: late speeds.
 ALIKE = 5.0
 
 

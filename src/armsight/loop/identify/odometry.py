@@ -51,13 +51,13 @@ def odometry(arm: Arm, q: Array, Ts_base_tool: Array, prior: Prior | None = None
         prior: how far the arm may be off.
     """
     prior = prior or Prior()
-    rows, points = list[int](), Ts_base_tool[:, :3, 3].tolist()
+    kept, points = list[int](), Ts_base_tool[:, :3, 3].tolist()
     for row in np.flatnonzero(np.isfinite(Ts_base_tool).all(axis=(1, 2)) & np.isfinite(q).all(axis=1)).tolist():
-        if not rows or math.dist(points[row], points[rows[-1]]) >= STEP_M:  # a step that noise does not make
-            rows.append(row)
-    p = Ts_base_tool[rows, :3, 3]
+        if not kept or math.dist(points[row], points[kept[-1]]) >= STEP_M:  # a step that noise does not make
+            kept.append(row)
+    p = Ts_base_tool[kept, :3, 3]
     way = np.cumsum(np.linalg.norm(np.diff(p, axis=0, prepend=p[:1]), axis=1))
-    rows = np.array(rows, int)[np.searchsorted(way, np.arange(0.0, way[-1] if len(way) else 0.0, STEP_M))]
+    rows = np.array(kept, int)[np.searchsorted(way, np.arange(0.0, way[-1] if len(way) else 0.0, STEP_M))]
     q, T, F = np.ascontiguousarray(q[rows]), Ts_base_tool[rows], arm.forward(q[rows])
     model = ErrorModel(arm, prior, 0.0)
     # Links are on the side of the backlash where friction holds them as their joints move; gravity keeps its side.
