@@ -202,8 +202,8 @@ def test_what_a_loop_holds_does_not_grow_with_its_shots(monkeypatch):
         closure: {"_MOST_KEPT": 14},
         fixed: {"MOST": 6, "_NEWEST": 4},
         residuals: {"KEPT": 4},
-        rig: {"_IMAGES": 30, "_POSES": 10},
-        shape: {"_VIEWS": 20, "_ASKED": 8, "_POSES": 10},
+        rig: {"_IMAGES": 30, "POSES": 10},
+        shape: {"_VIEWS": 20, "_ASKED": 8, "POSES": 10},
         monitor: {"_ALL_S": 2.0, "_RATIO": 2.0},
         base_motion: {"_KEPT": 20},
     }
