@@ -201,15 +201,19 @@ def _delimited(path: Path, text: str, written: list[tuple[int, str]], named: Col
     # pandas' names of none, with its index or without
     if not is_named and len(rows) > 1 and head in (numbered, ["", *numbered[:-1]]):
         return _without_names(path, [(line, row[head[0] == "" :]) for line, row in rows[1:]])
+    if not is_named and not _is_head(head, rows[1:]):
+        return _without_names(path, rows)
+    twice = next((name for name in head if name and head.count(name) > 1), None)
+    if twice is not None:
+        raise InputError(f"{path}: line {rows[0][0]} names a column twice: {twice}")
+    return Cells(head, _even(path, rows[1:], len(head)))
+
+
+def _is_head(head: list[str], rows: Rows) -> bool:
+    """Whether a first row is of names: most of it, or one stands above a number (a message's frame, above itself)."""
     words = [k for k, cell in enumerate(head) if number(cell) is None]
-    below = [row[k] for k in words if head[k][:1].isalpha() for _, row in rows[1:] if k < len(row)]
-    # names stand above numbers; what one message after another holds, a frame's name, above itself
-    if is_named or 2 * len(words) > len(head) or any(number(cell) is not None for cell in below):
-        twice = next((name for name in head if name and head.count(name) > 1), None)
-        if twice is not None:
-            raise InputError(f"{path}: line {rows[0][0]} names a column twice: {twice}")
-        return Cells(head, _even(path, rows[1:], len(head)))
-    return _without_names(path, rows)
+    below = [row[k] for k in words if head[k][:1].isalpha() for _, row in rows if k < len(row)]
+    return 2 * len(words) > len(head) or any(number(cell) is not None for cell in below)
 
 
 def _with_content(cells: list[list[str]]) -> list[tuple[int, list[str]]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -36,17 +36,10 @@ def command(plan: Sequence[str], optimise: bool, output: str | None, as_json: bo
     from armsight.app.budget.report import REPORT_FILES, budget_report, to_build
     from armsight.app.progress import steps
     from armsight.files import check_folder
-    from armsight.sim.budget.plan import RigPlan, planned
+    from armsight.sim.budget.plan import planned
     from armsight.sim.budget.result import RigBudget, best, chosen
 
-    settings = [each for each in plan if "=" in each and "/" not in each.partition("=")[0]]  # not runs/exp=3/plan.toml
-    path, *more = [each for each in plan if each not in settings] or [""]
-    if keys := {each.name for each in RigPlan.settings()} & {path, *more}:
-        raise InputError(f"{path} {' '.join(more)}: expected {min(keys)}=VALUE")
-    if more:
-        raise InputError(f"{more[0]}: {path} is the plan already: expected one PLAN.toml, and KEY=VALUE")
-    options_text = [f"{key}={value}" for key, value in options.items() if value is not None]
-    given = dict.fromkeys(options) | RigPlan.of_text([*settings, *options_text])
+    path, given = _given(plan, options)
     if output is not None:
         used = [path, *filter(None, map(given.get, ("rig", "arm", "body")))]
         check_folder(output, holding=REPORT_FILES, apart_from=used)
@@ -67,6 +60,20 @@ def command(plan: Sequence[str], optimise: bool, output: str | None, as_json: bo
         written = str(report.write(Path(output), {"budget.json": report.json_text(), **to_build(found)}))
         draw_body([found.plan.body or Path(output) / "body.toml"], Path(output) / "body.pdf", split=True)
     return report.echo(as_json=as_json, written=written) or int(not found.reached(found.moving))
+
+
+def _given(plan: Sequence[str], options: dict[str, str | None]) -> tuple[str, dict[str, Any]]:
+    """Return the path of the plan, "" without one, and what KEY=VALUE and options say."""
+    from armsight.sim.budget.plan import RigPlan
+
+    settings = [each for each in plan if "=" in each and "/" not in each.partition("=")[0]]  # not runs/exp=3/plan.toml
+    path, *more = [each for each in plan if each not in settings] or [""]
+    if keys := {each.name for each in RigPlan.settings()} & {path, *more}:
+        raise InputError(f"{path} {' '.join(more)}: expected {min(keys)}=VALUE")
+    if more:
+        raise InputError(f"{more[0]}: {path} is the plan already: expected one PLAN.toml, and KEY=VALUE")
+    options_text = [f"{key}={value}" for key, value in options.items() if value is not None]
+    return path, dict.fromkeys(options) | RigPlan.of_text([*settings, *options_text])
 
 
 def _asked(path: str, run: str | None, given: dict[str, str | None]) -> RigPlan:

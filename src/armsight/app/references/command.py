@@ -43,7 +43,7 @@ CHANNELS = {"gyro": ("rad/s", 1e-6), "accelerometer": ("m/s2", 1e-6), "field": (
 
 @click.group("references")
 def command() -> None:
-    """Check and calibrate inertial units and magnetometers beside vision, named in a file references.toml."""
+    """Check and calibrate inertial units and magnetometers, named in a file references.toml."""
 
 
 @command.command()
