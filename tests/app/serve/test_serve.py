@@ -198,7 +198,8 @@ def test_options_become_arguments(rendered, tmp_path):
     assert found.arguments[0] == str(rendered.rig)
     assert {"--source=usb:0,1", "--stream=json+tcp:1", "--stream=json+tcp:2"} <= set(found.arguments)
     assert (found.folder, found.log_files) == (tmp_path, 2)
-    found = read_config(write(tmp_path / "b.toml", text + '[board]\nport = "emulated:host"\n'))
+    text += 'stream = "json+tcp:1"\n[board]\nport = "emulated:host"\n'
+    found = read_config(write(tmp_path / "b.toml", text))
     assert "--board=emulated:host" in found.arguments
 
 
@@ -233,8 +234,17 @@ def test_a_first_start_without_a_shot_ends_it_and_what_is_no_datum_is_passed_ove
         ("source =", "sorce =", "[measure] has an unknown key 'sorce': did you mean source?"),
         ("[measure]", "[mesure]", "unknown table [mesure]; known are [measure], [board] and [serve]"),
         ("[measure]", "[board]\n[measure]", "[board] has no port, such as feetech:/dev/ttyACM0"),
-        ("[measure]", '[board]\nport = "usb:1"\n[measure]', "no board 'usb:1'; there are emulated:unicorn"),
-        ("[measure]", '[board]\nport = "serial:/none"\n[measure]', "/none: no such port"),
+        (
+            "[measure]",
+            '[board]\nport = "usb:1"\n[measure]\nstream = "json+tcp:1"',
+            "no board 'usb:1'; there are emulated:",
+        ),
+        ("[measure]", '[board]\nport = "serial:/none"\n[measure]\nstream = "json+tcp:1"', "/none: no such port"),
+        (
+            "[measure]",
+            '[board]\nport = "emulated:host"\n[measure]',
+            "serve.toml: [board] is published beside live cameras",
+        ),
         (
             "[measure]",
             '[measure]\nboard = "serial:/none"',
@@ -246,7 +256,7 @@ def test_a_first_start_without_a_shot_ends_it_and_what_is_no_datum_is_passed_ove
         ("[measure]", "[measure]\njson = true", "json: not for a service"),
         ("[measure]", "[measure]\nskew = [1, 2]", "skew is [1, 2]: expected one text, number or true"),
         ("target =", "#", "[measure]: Missing option '--target'"),
-        ("rig.json", "none.json", "none.json"),
+        ("rig.json", "none.json", "none.json: no such file"),
         ("chessboard:9x6:25mm", "chessbord:9x6:25mm", "chessbord"),
         ("[measure]", "[serve]\nstale_s = 0\n[measure]", "[serve] stale_s is 0: expected a number above 0"),
         ("[measure]", "[serve]\nstale = 3\n[measure]", "[serve] has an unknown key 'stale': did you mean stale_s?"),

@@ -80,8 +80,11 @@ def read_config(path: Path) -> ServeConfig:
         command.make_context("measure", list(arguments)).close()
     except click.UsageError as error:
         raise InputError(f"{path}: [measure]: {error.format_message()}") from None
-    with contextlib.chdir(folder):
-        _check(given, board)
+    try:
+        with contextlib.chdir(folder):
+            _check(given, board)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
     each_start = tuple(each for each in arguments if not each.startswith("--output="))
     return ServeConfig(each_start, folder, **service, output=str(given.get("output", "")))
 
@@ -145,8 +148,10 @@ def _check(given: dict[str, Any], board: dict[str, Any]) -> None:
     """Open rig and target, and look at the port: a mistake in them ends the service before it begins."""
     from armsight.robot.board_registry import check_board
     from armsight.vision.markers.targets import open_target
-    from armsight.vision.sources import open_rig
+    from armsight.vision.sources import LIVE, open_rig
 
+    if board and not (given.get("stream") and str(given.get("source", "")).startswith(LIVE)):
+        raise InputError("[board] is published beside live cameras: give [measure] stream, and source usb: or url:")
     open_rig(str(given["rig"]))
     open_target(str(given["target"]))
     for each in board.values():
