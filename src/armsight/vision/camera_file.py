@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from armsight.data import SIDES, Array
-from armsight.errors import InputError
+from armsight.errors import InputError, naming
 from armsight.geometry.check import checked
 from armsight.vision.camera import Camera
 
@@ -279,7 +279,6 @@ def read_cameras(path: str | Path) -> tuple[Camera, Camera]:
     InputError names the file and the entry.
     """
     from armsight.tables.document import read_document  # not above: YAML takes as long to import as a pair of images
-    from armsight.vision.rigfiles.rigfile import naming
 
     document = read_document(path)
     if not all(isinstance(document.get(side), dict) for side in SIDES):
@@ -298,7 +297,6 @@ def read_cameras(path: str | Path) -> tuple[Camera, Camera]:
 def read_camera(path: str | Path) -> Camera:
     """Read one camera: the file of any program whose names are known; InputError of two cameras, or none."""
     from armsight.tables.document import read_document  # not above: YAML takes as long to import as a pair of images
-    from armsight.vision.rigfiles.rigfile import naming
 
     document = read_document(path)
     inner = [value for value in document.values() if is_camera(value)]

@@ -30,6 +30,9 @@ def five(d):
     return np.append(d, 0.0)
 
 
+FIVES = five(D_LEFT), five(D_RIGHT)
+
+
 def storage(suffix, **values):
     """What cv2.FileStorage writes."""
     file = cv2.FileStorage(suffix, cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
@@ -70,15 +73,8 @@ def stereo_parameters(matrix, **pose_of_2):
 def named(K1, D1, K2, D2, R_="R", T_="T", scale=1e3, row=False, **more):
     """The six matrices under somebody's names, translation in mm."""
     d = [five(D_LEFT).reshape(1, -1), five(D_RIGHT).reshape(1, -1)]
-    return {
-        K1: K_LEFT,
-        D1: d[0],
-        K2: K_RIGHT,
-        D2: d[1],
-        R_: R,
-        T_: (T * scale) if row else (T * scale).reshape(3, 1),
-        **more,
-    }
+    t = T * scale if row else (T * scale).reshape(3, 1)
+    return {K1: K_LEFT, D1: d[0], K2: K_RIGHT, D2: d[1], R_: R, T_: t, **more}
 
 
 def lists(document):
@@ -126,29 +122,30 @@ def euroc(K, d, T_body_camera):
     }
 
 
-def rectified():
+def rectified(d=FIVES, model="plumb_bob"):
     """R1 R2 P1 P2 of OpenCV."""
-    found = cv2.stereoRectify(K_LEFT, five(D_LEFT), K_RIGHT, five(D_RIGHT), SIZE, R, T.reshape(3, 1), alpha=0)
+    args = (K_LEFT, np.ravel(d[0]), K_RIGHT, np.ravel(d[1]), SIZE, R, T.reshape(3, 1))
+    fisheye = model == "equidistant"
+    found = cv2.fisheye.stereoRectify(*args, flags=1024) if fisheye else cv2.stereoRectify(*args, alpha=0)
     return [np.asarray(m, float) for m in found[:4]]
 
 
-def camera_info(side, style):
-    """One camera's camera_info: of camera_calibration's files, rostopic echo, ros2 topic echo."""
-    R1, R2, P1, P2 = rectified()
-    K, d, R_, P = (K_LEFT, five(D_LEFT), R1, P1) if side == "left" else (K_RIGHT, five(D_RIGHT), R2, P2)
-    flat = [[float(x) for x in np.ravel(m)] for m in (d, K, R_, P)]
+def camera_info(side, style, d=FIVES, model="plumb_bob", digits=17, changes=None):
+    """One camera's camera_info: of camera_calibration's files, rostopic echo, ros2 topic echo.
+
+    Of a file, numbers are printed to some digits and entries changed; ... removes one.
+    """
+    k, (R1, R2, P1, P2) = int(side == "right"), rectified(d, model)
+    matrices = d[k], (K_LEFT, K_RIGHT)[k], (R1, R2)[k], (P1, P2)[k]
+    flat = [[float(f"{x:.{digits}g}") for x in np.ravel(m)] for m in matrices]
     if style == "file":
         names = ("distortion_coefficients", "camera_matrix", "rectification_matrix", "projection_matrix")
-        shapes = ((1, 5), (3, 3), (3, 3), (3, 4))
-        document = {
-            "image_width": SIZE[0],
-            "image_height": SIZE[1],
-            "camera_name": side,
-            "distortion_model": "plumb_bob",
-        }
-        for name, shape, data in zip(names, shapes, flat, strict=True):
-            document[name] = {"rows": shape[0], "cols": shape[1], "data": data}
-        return yaml.safe_dump(document, sort_keys=False)
+        document = {"image_width": SIZE[0], "image_height": SIZE[1], "camera_name": side, "distortion_model": model}
+        for name, data in zip(names, flat, strict=True):
+            rows = 1 if name == names[0] else 3
+            document[name] = {"rows": rows, "cols": len(data) // rows, "data": data}
+        document |= changes or {}
+        return yaml.safe_dump({key: v for key, v in document.items() if v is not ...}, sort_keys=False)
     letters = "DKRP" if style == "ros1" else "dkrp"
     lines = ["header:", "  stamp:", "    secs: 5", "  frame_id: cam", f"height: {SIZE[1]}", f"width: {SIZE[0]}"]
     lines.append("distortion_model: " + ('"plumb_bob"' if style == "ros1" else "plumb_bob"))
@@ -194,13 +191,11 @@ def basalt(kind):
 def orbslam3():
     lines = ["%YAML:1.0", "", 'File.version: "1.0"', 'Camera.type: "PinHole"']
     for n, K, d in (("1", K_LEFT, D_LEFT), ("2", K_RIGHT, D_RIGHT)):
+        numbers = (K[0, 0], K[1, 1], K[0, 2], K[1, 2], *d)
         lines += [
-            f"Camera{n}.fx: {K[0, 0]}",
-            f"Camera{n}.fy: {K[1, 1]}",
-            f"Camera{n}.cx: {K[0, 2]}",
-            f"Camera{n}.cy: {K[1, 2]}",
+            f"Camera{n}.{key}: {x}"
+            for key, x in zip(["fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"], numbers, strict=True)
         ]
-        lines += [f"Camera{n}.{key}: {value}" for key, value in zip(("k1", "k2", "p1", "p2"), d, strict=True)]
     data = ", ".join(f"{x!r}" for x in inverse(T_RIGHT_LEFT).ravel().tolist())
     lines += [f"Camera.width: {SIZE[0]}", f"Camera.height: {SIZE[1]}", "Camera.fps: 20", "Stereo.ThDepth: 60.0"]
     lines += ["Stereo.T_c1_c2: !!opencv-matrix", "  rows: 4", "  cols: 4", "  dt: f", f"  data: [{data}]"]
@@ -211,13 +206,8 @@ def orbslam2():
     R1, R2, P1, P2 = rectified()
     values = {"Camera.fx": 435.2, "Camera.bf": 47.9}
     for side, K, d, R_, P in (("LEFT", K_LEFT, D_LEFT, R1, P1), ("RIGHT", K_RIGHT, D_RIGHT, R2, P2)):
-        values |= {
-            f"{side}.height": SIZE[1],
-            f"{side}.width": SIZE[0],
-            f"{side}.D": five(d).reshape(1, 5),
-            f"{side}.K": K,
-        }
-        values |= {f"{side}.R": R_, f"{side}.P": P}
+        parts = {"height": SIZE[1], "width": SIZE[0], "D": five(d).reshape(1, 5), "K": K, "R": R_, "P": P}
+        values |= {f"{side}.{key}": value for key, value in parts.items()}
     lines = ["%YAML:1.0"]
     for key, value in values.items():
         if isinstance(value, np.ndarray):
@@ -322,259 +312,88 @@ _third = kalibr_camera(K_RIGHT, D_RIGHT, T_cn_cnm1=nested(np.eye(4) + np.eye(4, 
 
 #: Name -> (program and where it is described), format, files, options.
 PROGRAMS = {
-    "stereo_calib": (
-        "opencv 4, samples/cpp/stereo_calib.cpp",
-        "opencv",
-        {"both.yml": storage(YML, **named("M1", "D1", "M2", "D2", Q=np.eye(4)))},
-        MM_SIZE,
-    ),
-    "stereo_calib 5": (
-        "opencv 5, %YAML 1.2 header",
-        "opencv",
-        {"both.yml": storage(YML, **named("M1", "D1", "M2", "D2")).replace("%YAML:1.0", "%YAML 1.2")},
-        MM_SIZE,
-    ),
-    "k1": (
-        "sourishg/stereo-calibration, calib_stereo.cpp",
-        "opencv",
-        {"cam_stereo.yml": storage(YML, **_k1, E=np.diag([1.0, 2, 3]), F=np.eye(3) * 0.1)},
-        MM_SIZE,
-    ),
-    "cameraMatrix1": (
-        "opencv_contrib and tutorials, cameraMatrix1",
-        "opencv",
-        {
-            "camera.yml": storage(
-                YML,
-                **named("cameraMatrix1", "distCoeffs1", "cameraMatrix2", "distCoeffs2"),
-                imageSize=np.array([SIZE], np.int32),
-            )
-        },
-        MM,
-    ),
-    "stereoMapL": (
-        "niconielsen32/ComputerVision, stereo tutorial",
-        "opencv",
-        {"stereo.xml": storage(".xml", **named("cameraMatrixL", "distL", "cameraMatrixR", "distR", "rot", "trans"))},
-        MM_SIZE,
-    ),
-    "xml": (
-        "opencv 4, FileStorage in XML",
-        "opencv",
-        {"both.xml": storage(".xml", **named("M1", "D1", "M2", "D2"))},
-        MM_SIZE,
-    ),
-    "json storage": (
-        "opencv 4, FileStorage in JSON",
-        "opencv",
-        {"both.json": storage(".json", **named("M1", "D1", "M2", "D2"))},
-        MM_SIZE,
-    ),
-    "gz": (
-        "opencv 4, FileStorage named .yml.gz",
-        "opencv",
-        {"rig.yml.gz": gzip.compress(storage(YML, **_k1).encode())},
-        MM_SIZE,
-    ),
-    "mtxL": (
-        "spmallick/learnopencv, stereo-camera",
-        "opencv",
-        {"stereo.npz": npz(**named("mtxL", "distL", "mtxR", "distR", "Rot", "Trns"))},
-        MM_SIZE,
-    ),
-    "left_K": (
-        "numpy.savez of tutorials",
-        "opencv",
-        {"c.npz": npz(**named("left_K", "left_D", "right_K", "right_D"), image_size=np.array(SIZE))},
-        MM,
-    ),
-    "K_l": (
-        "numpy.savez of tutorials",
-        "opencv",
-        {"c.npz": npz(**named("K_l", "dist_l", "K_r", "dist_r", row=True), img_shape=np.array(SIZE[::-1]))},
-        MM,
-    ),
+    "stereo_calib": ("opencv 4, samples/cpp/stereo_calib.cpp", "opencv",
+        {"both.yml": storage(YML, **named("M1", "D1", "M2", "D2", Q=np.eye(4)))}, MM_SIZE),
+    "stereo_calib 5": ("opencv 5, %YAML 1.2 header", "opencv",
+        {"both.yml": storage(YML, **named("M1", "D1", "M2", "D2")).replace("%YAML:1.0", "%YAML 1.2")}, MM_SIZE),
+    "k1": ("sourishg/stereo-calibration, calib_stereo.cpp", "opencv",
+        {"cam_stereo.yml": storage(YML, **_k1, E=np.diag([1.0, 2, 3]), F=np.eye(3) * 0.1)}, MM_SIZE),
+    "cameraMatrix1": ("opencv_contrib and tutorials, cameraMatrix1", "opencv",
+        {"camera.yml": storage(YML, **named("cameraMatrix1", "distCoeffs1", "cameraMatrix2", "distCoeffs2"), imageSize=np.array([SIZE], np.int32))}, MM),
+    "stereoMapL": ("niconielsen32/ComputerVision, stereo tutorial", "opencv",
+        {"stereo.xml": storage(".xml", **named("cameraMatrixL", "distL", "cameraMatrixR", "distR", "rot", "trans"))}, MM_SIZE),
+    "xml": ("opencv 4, FileStorage in XML", "opencv",
+        {"both.xml": storage(".xml", **named("M1", "D1", "M2", "D2"))}, MM_SIZE),
+    "json storage": ("opencv 4, FileStorage in JSON", "opencv",
+        {"both.json": storage(".json", **named("M1", "D1", "M2", "D2"))}, MM_SIZE),
+    "gz": ("opencv 4, FileStorage named .yml.gz", "opencv",
+        {"rig.yml.gz": gzip.compress(storage(YML, **_k1).encode())}, MM_SIZE),
+    "mtxL": ("spmallick/learnopencv, stereo-camera", "opencv",
+        {"stereo.npz": npz(**named("mtxL", "distL", "mtxR", "distR", "Rot", "Trns"))}, MM_SIZE),
+    "left_K": ("numpy.savez of tutorials", "opencv",
+        {"c.npz": npz(**named("left_K", "left_D", "right_K", "right_D"), image_size=np.array(SIZE))}, MM),
+    "K_l": ("numpy.savez of tutorials", "opencv",
+        {"c.npz": npz(**named("K_l", "dist_l", "K_r", "dist_r", row=True), img_shape=np.array(SIZE[::-1]))}, MM),
     "cam0 cam1": ("numpy.savez of tutorials", "opencv", {"c.npz": npz(**named("K0", "d0", "K1", "d1"))}, MM_SIZE),
-    "npz gz-like": (
-        "numpy.savez_compressed",
-        "opencv",
-        {"c.npz": npz(**named("cameraMatrix_left", "distCoeffs_left", "cameraMatrix_right", "distCoeffs_right"))},
-        MM_SIZE,
-    ),
+    "npz gz-like": ("numpy.savez_compressed", "opencv",
+        {"c.npz": npz(**named("cameraMatrix_left", "distCoeffs_left", "cameraMatrix_right", "distCoeffs_right"))}, MM_SIZE),
     "npy": ("numpy.save of each array", "opencv", {f"{key}.npy": npy(value) for key, value in _k1.items()}, MM_SIZE),
-    "optimal too": (
-        "tutorials that keep getOptimalNewCameraMatrix",
-        "opencv",
-        {"c.npz": npz(**_k1, newK1=K_LEFT * 0.9, newK2=K_RIGHT * 0.9, roi_L=np.array([0, 0, 5, 5]))},
-        MM_SIZE,
-    ),
-    "json lists": (
-        "json.dump of lists",
-        "opencv",
-        {"c.json": json.dumps(lists(named("camera_matrix_left", "dist_left", "camera_matrix_right", "dist_right")))},
-        MM_SIZE,
-    ),
+    "optimal too": ("tutorials that keep getOptimalNewCameraMatrix", "opencv",
+        {"c.npz": npz(**_k1, newK1=K_LEFT * 0.9, newK2=K_RIGHT * 0.9, roi_L=np.array([0, 0, 5, 5]))}, MM_SIZE),
+    "json lists": ("json.dump of lists", "opencv",
+        {"c.json": json.dumps(lists(named("camera_matrix_left", "dist_left", "camera_matrix_right", "dist_right")))}, MM_SIZE),
     "json nested": ("json.dump of nested names", "opencv", {"c.json": json.dumps(_json_two)}, MM),
-    "yaml lists": (
-        "yaml.safe_dump of lists",
-        "opencv",
-        {"c.yaml": yaml.safe_dump(lists(named("M1", "D1", "M2", "D2")), default_flow_style=None)},
-        MM_SIZE,
-    ),
-    "toml": (
-        "toml.dump of lists",
-        "opencv",
-        {"c.toml": "\n".join(f"{k} = {v}" for k, v in lists(named("K_left", "D_left", "K_right", "D_right")).items())},
-        MM_SIZE,
-    ),
-    "bouguet": (
-        "Bouguet's toolbox for MATLAB, Calib_Results_stereo.mat by jsonencode(load(..))",
-        "opencv",
-        {"Calib_Results_stereo.json": json.dumps({k: np.squeeze(v).tolist() for k, v in BOUGUET.items()})},
-        MM,
-    ),
-    "stereoParams": (
-        "MATLAB R2019b, Computer Vision Toolbox, jsonencode(toStruct(stereoParams))",
-        "stereoparams",
-        {"stereoParams.json": json.dumps(stereo_parameters("IntrinsicMatrix", RotationOfCamera2=R.T.tolist()))},
-        {},
-    ),
-    "stereoParams, K": (
-        "MATLAB R2023a, jsonencode(load('stereo.mat')), PoseCamera2",
-        "stereoparams",
-        {"stereo.json": json.dumps({"stereoParams": stereo_parameters("K", PoseCamera2=POSE_CAMERA_2)})},
-        {},
-    ),
-    "14": (
-        "opencv 4, CALIB_RATIONAL_MODEL: 14 coefficients",
-        "opencv",
-        {
-            "c.yml": storage(
-                YML,
-                **(_k1 | {"D1": np.pad(D_LEFT, (0, 10)).reshape(1, 14), "D2": np.pad(D_RIGHT, (0, 10)).reshape(1, 14)}),
-            )
-        },
-        MM_SIZE,
-    ),
-    "ros files": (
-        "camera_calibration 1.17, left.yaml right.yaml",
-        "ros",
-        {f"{s}.yaml": camera_info(s, "file") for s in ("left", "right")},
-        {},
-    ),
-    "rostopic": (
-        "ROS 1 Noetic, rostopic echo -n 1",
-        "ros",
-        {f"{s}.txt": camera_info(s, "ros1") for s in ("left", "right")},
-        {},
-    ),
-    "ros2 topic": (
-        "ROS 2 Humble, ros2 topic echo --once",
-        "ros",
-        {f"{s}.yaml": camera_info(s, "ros2") for s in ("left", "right")},
-        {},
-    ),
-    "camchain": (
-        "Kalibr wiki, yaml formats: camchain",
-        "kalibr",
-        {"camchain.yaml": yaml.safe_dump(chain(T_cn_cnm1=_link))},
-        {},
-    ),
-    "camchain-imucam": (
-        "Kalibr wiki: camchain-imucam",
-        "kalibr",
-        {"c.yaml": yaml.safe_dump(chain(T_cn_cnm1=_link, T_cam_imu=[T_LEFT_BODY, T_RIGHT_BODY]))},
-        {},
-    ),
-    "T_cam_imu": (
-        "Kalibr, poses to the IMU alone",
-        "kalibr",
-        {"c.yaml": yaml.safe_dump(chain(T_cam_imu=[T_LEFT_BODY, T_RIGHT_BODY]))},
-        {},
-    ),
-    "openvins": (
-        "open_vins 2.7, config/*/kalibr_imucam_chain.yaml",
-        "kalibr",
-        {"c.yaml": "%YAML:1.0\n\n" + yaml.safe_dump(chain(T_imu_cam=[inverse(T_LEFT_BODY), inverse(T_RIGHT_BODY)]))},
-        {},
-    ),
-    "three cameras": (
-        "Kalibr, a chain of three",
-        "kalibr",
-        {"c.yaml": yaml.safe_dump(chain(T_cn_cnm1=_link) | {"cam2": _third})},
-        {"pair": ("cam0", "cam1")},
-    ),
-    "euroc": (
-        "EuRoC MAV, mav0/cam*/sensor.yaml",
-        "kalibr",
-        {
-            "cam0.yaml": yaml.safe_dump(euroc(K_LEFT, D_LEFT, inverse(T_LEFT_BODY))),
-            "cam1.yaml": "%YAML:1.0\n" + yaml.safe_dump(euroc(K_RIGHT, D_RIGHT, inverse(T_RIGHT_BODY))),
-        },
-        {},
-    ),
-    "basalt": (
-        "basalt, doc/Calibration.md: pinhole-radtan8",
-        "basalt",
-        {"calibration.json": basalt("pinhole-radtan8")},
-        {},
-    ),
+    "yaml lists": ("yaml.safe_dump of lists", "opencv",
+        {"c.yaml": yaml.safe_dump(lists(named("M1", "D1", "M2", "D2")), default_flow_style=None)}, MM_SIZE),
+    "toml": ("toml.dump of lists", "opencv",
+        {"c.toml": "\n".join(f"{k} = {v}" for k, v in lists(named("K_left", "D_left", "K_right", "D_right")).items())}, MM_SIZE),
+    "bouguet": ("Bouguet's toolbox for MATLAB, Calib_Results_stereo.mat by jsonencode(load(..))", "opencv",
+        {"Calib_Results_stereo.json": json.dumps({k: np.squeeze(v).tolist() for k, v in BOUGUET.items()})}, MM),
+    "stereoParams": ("MATLAB R2019b, Computer Vision Toolbox, jsonencode(toStruct(stereoParams))", "stereoparams",
+        {"stereoParams.json": json.dumps(stereo_parameters("IntrinsicMatrix", RotationOfCamera2=R.T.tolist()))}, {}),
+    "stereoParams, K": ("MATLAB R2023a, jsonencode(load('stereo.mat')), PoseCamera2", "stereoparams",
+        {"stereo.json": json.dumps({"stereoParams": stereo_parameters("K", PoseCamera2=POSE_CAMERA_2)})}, {}),
+    "14": ("opencv 4, CALIB_RATIONAL_MODEL: 14 coefficients", "opencv",
+        {"c.yml": storage(YML, **(_k1 | {"D1": np.pad(D_LEFT, (0, 10)).reshape(1, 14), "D2": np.pad(D_RIGHT, (0, 10)).reshape(1, 14)}))}, MM_SIZE),
+    "ros files": ("camera_calibration 1.17, left.yaml right.yaml", "ros",
+        {f"{s}.yaml": camera_info(s, "file") for s in ("left", "right")}, {}),
+    "rostopic": ("ROS 1 Noetic, rostopic echo -n 1", "ros",
+        {f"{s}.txt": camera_info(s, "ros1") for s in ("left", "right")}, {}),
+    "ros2 topic": ("ROS 2 Humble, ros2 topic echo --once", "ros",
+        {f"{s}.yaml": camera_info(s, "ros2") for s in ("left", "right")}, {}),
+    "camchain": ("Kalibr wiki, yaml formats: camchain", "kalibr",
+        {"camchain.yaml": yaml.safe_dump(chain(T_cn_cnm1=_link))}, {}),
+    "camchain-imucam": ("Kalibr wiki: camchain-imucam", "kalibr",
+        {"c.yaml": yaml.safe_dump(chain(T_cn_cnm1=_link, T_cam_imu=[T_LEFT_BODY, T_RIGHT_BODY]))}, {}),
+    "T_cam_imu": ("Kalibr, poses to the IMU alone", "kalibr",
+        {"c.yaml": yaml.safe_dump(chain(T_cam_imu=[T_LEFT_BODY, T_RIGHT_BODY]))}, {}),
+    "openvins": ("open_vins 2.7, config/*/kalibr_imucam_chain.yaml", "kalibr",
+        {"c.yaml": "%YAML:1.0\n\n" + yaml.safe_dump(chain(T_imu_cam=[inverse(T_LEFT_BODY), inverse(T_RIGHT_BODY)]))}, {}),
+    "three cameras": ("Kalibr, a chain of three", "kalibr",
+        {"c.yaml": yaml.safe_dump(chain(T_cn_cnm1=_link) | {"cam2": _third})}, {"pair": ("cam0", "cam1")}),
+    "euroc": ("EuRoC MAV, mav0/cam*/sensor.yaml", "kalibr",
+        {"cam0.yaml": yaml.safe_dump(euroc(K_LEFT, D_LEFT, inverse(T_LEFT_BODY))), "cam1.yaml": "%YAML:1.0\n" + yaml.safe_dump(euroc(K_RIGHT, D_RIGHT, inverse(T_RIGHT_BODY)))}, {}),
+    "basalt": ("basalt, doc/Calibration.md: pinhole-radtan8", "basalt",
+        {"calibration.json": basalt("pinhole-radtan8")}, {}),
     "orbslam3": ("ORB-SLAM3 1.0, Examples/Stereo/EuRoC.yaml", "orbslam", {"EuRoC.yaml": orbslam3()}, {}),
     "orbslam2": ("ORB-SLAM2, Examples/Stereo/EuRoC.yaml", "orbslam", {"EuRoC.yaml": orbslam2()}, {}),
-    "caliscope": (
-        "caliscope, tests/reference/2d_data/camera_array.toml",
-        "caliscope",
-        {"camera_array.toml": caliscope()},
-        {},
-    ),
-    "caliscope matrix": (
-        "caliscope 0.1, rotation as a matrix",
-        "caliscope",
-        {"camera_array.toml": caliscope("matrix")},
-        {},
-    ),
-    "aniposelib": (
-        "aniposelib 0.4, CameraGroup.dump; a board in mm",
-        "caliscope",
-        {
-            "calibration.toml": caliscope(scale=1e3, tables=("cam_0", "cam_1"), more='name = "A"\nfisheye = false\n')
-            + "[metadata]\nadjusted = false\nerror = 0.26\n"
-        },
-        MM,
-    ),
-    "multical": (
-        "multical 0.2, io/export_calib.py with a master",
-        "multical",
-        {"calibration.json": multical(True)},
-        {},
-    ),
+    "caliscope": ("caliscope, tests/reference/2d_data/camera_array.toml", "caliscope",
+        {"camera_array.toml": caliscope()}, {}),
+    "caliscope matrix": ("caliscope 0.1, rotation as a matrix", "caliscope",
+        {"camera_array.toml": caliscope("matrix")}, {}),
+    "aniposelib": ("aniposelib 0.4, CameraGroup.dump; a board in mm", "caliscope",
+        {"calibration.toml": caliscope(scale=1e3, tables=("cam_0", "cam_1"), more='name = "A"\nfisheye = false\n') + "[metadata]\nadjusted = false\nerror = 0.26\n"}, MM),
+    "multical": ("multical 0.2, io/export_calib.py with a master", "multical", {"calibration.json": multical(True)}, {}),
     "multical no master": ("multical 0.2, io/export_calib.py", "multical", {"calibration.json": multical(False)}, {}),
-    "mrcal 5": (
-        "mrcal 2.4, cameramodel, OPENCV5",
-        "mrcal",
-        {f"{s}.cameramodel": mrcal(s) for s in ("left", "right")},
-        {},
-    ),
-    "mrcal 8": (
-        "mrcal, rt_cam_ref, OPENCV8",
-        "mrcal",
-        {f"{s}.cameramodel": mrcal(s, "rt_cam_ref", "LENSMODEL_OPENCV8") for s in ("left", "right")},
-        {},
-    ),
-    "mrcal 4": (
-        "mrcal, OPENCV4",
-        "mrcal",
-        {f"{s}.cameramodel": mrcal(s, lens="LENSMODEL_OPENCV4") for s in ("left", "right")},
-        {},
-    ),
+    "mrcal 5": ("mrcal 2.4, cameramodel, OPENCV5", "mrcal", {f"{s}.cameramodel": mrcal(s) for s in ("left", "right")}, {}),
+    "mrcal 8": ("mrcal, rt_cam_ref, OPENCV8", "mrcal",
+        {f"{s}.cameramodel": mrcal(s, "rt_cam_ref", "LENSMODEL_OPENCV8") for s in ("left", "right")}, {}),
+    "mrcal 4": ("mrcal, OPENCV4", "mrcal",
+        {f"{s}.cameramodel": mrcal(s, lens="LENSMODEL_OPENCV4") for s in ("left", "right")}, {}),
     "zed": ("Stereolabs, SN*.conf of one resolution", "stereolabs", {"SN12345.conf": zed("HD")}, {}),
-    "zed all": (
-        "Stereolabs, SN*.conf of all resolutions",
-        "stereolabs",
-        {"SN12345.conf": zed("2K", "FHD", "HD", "VGA")},
-        {"image_size_px": SIZE},
-    ),
-}
+    "zed all": ("Stereolabs, SN*.conf of all resolutions", "stereolabs",
+        {"SN12345.conf": zed("2K", "FHD", "HD", "VGA")}, {"image_size_px": SIZE}),
+}  # fmt: skip
 
 
 def write(folder, files):

@@ -101,7 +101,7 @@ def export(path: str, more: tuple[str, ...], output: tuple[str, ...], name: str,
     paths = (*output, *more)
     check_outputs(paths, (path,))
     lost = export_rig(StereoRig.load(path), name, paths)
-    alpha = ALPHA if open_format(name).RECTIFIES else None
+    alpha = ALPHA if open_format(name).rectifies else None
     if alpha is not None:
         click.echo(
             f"note: the rectification in it has alpha {alpha:g}: all pixels of the rectified images are valid", err=True

@@ -1,4 +1,4 @@
-"""Rigs of other programs: a registry of formats, each one file behind :class:`~.rigfile.RigFormat`.
+"""Rigs of other programs: a registry of formats, each a :class:`~.rigfile.RigFormat`.
 
 Foreign files go in and a StereoRig comes out, or the other way; what is lost on the way is always said.
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 from armsight.errors import InputError
 
@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
 #: Format name -> the module here that reads it, imported when it is opened; those of ``programs.py`` are asked first.
 FORMATS = dict.fromkeys(
-    ("stereolabs", "mrcal", "basalt", "orbslam", "multical", "caliscope", "stereoparams"), "programs"
-) | {"kalibr": "kalibr", "ros": "ros", "opencv": "opencv"}
+    ("stereolabs", "mrcal", "basalt", "orbslam", "multical", "caliscope", "stereoparams", "kalibr"), "programs"
+) | {"ros": "ros", "opencv": "opencv"}
 #: Those that are written, too.
 EXPORTED = ("opencv", "ros", "kalibr")
 #: Standard deviation of a detection where a file does not give one: that of chessboard corners in fair webcam images. A
@@ -31,8 +31,8 @@ def open_format(name: str) -> RigFormat:
     """Return a format by its name; InputError where it is unknown."""
     if name not in FORMATS:
         raise InputError(f"unknown rig format {name!r}; known are {', '.join(FORMATS)}")
-    module = importlib.import_module(f"{__name__}.{FORMATS[name]}")
-    return cast("RigFormat", module.PROGRAMS[name] if FORMATS[name] == "programs" else module)
+    found: RigFormat = importlib.import_module(f"{__name__}.{FORMATS[name]}").FORMATS[name]
+    return found
 
 
 def import_rig(
@@ -75,7 +75,7 @@ def import_rig(
     if name is not None and found is not None and found != name:
         article = "is" if len(files) == 1 else "are"
         raise InputError(
-            f"{where} {article} {open_format(found).TITLE}, not {open_format(name).TITLE}: leave --format out, or "
+            f"{where} {article} {open_format(found).title}, not {open_format(name).title}: leave --format out, or "
             f"give --format {found}"
         )
     if found is None:
@@ -90,7 +90,7 @@ def import_rig(
 
         raise InputError(
             f"{where}: no calibration of two cameras is recognised; there are {described(documents[0])}. Expected are "
-            f"{', '.join(open_format(each).TITLE for each in FORMATS)}: --format NAME says what of it is missing"
+            f"{', '.join(open_format(each).title for each in FORMATS)}: --format NAME says what of it is missing"
         )
     return open_format(chosen).read(documents, files, ImportOptions(unit_m, image_size_px, sigma_px, pair))
 
@@ -106,7 +106,7 @@ def export_rig(rig: StereoRig, name: str, paths: Sequence[str | Path]) -> tuple[
     Raises:
         InputError: unknown format, one that is only read, a rig that does not fit it, or a file that cannot be written.
     """
-    module = open_format(name)
-    if name not in EXPORTED:
+    write = open_format(name).write
+    if write is None:
         raise InputError(f"{name} is read, not written; written are {', '.join(EXPORTED)}")
-    return module.write(rig, [Path(p) for p in paths])
+    return write(rig, [Path(p) for p in paths])

@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 
 from armsight.data import Array
-from armsight.errors import InputError
+from armsight.errors import InputError, naming
 from armsight.geometry.pose import inverse
 from armsight.geometry.rotation import exp_so3
 from armsight.tables.document import Foreign
@@ -30,18 +30,15 @@ from armsight.vision.rigfiles.rigfile import (
     LOOSEST_ROTATION,
     Document,
     ImportOptions,
+    RigFormat,
     count_paths,
     imported,
-    naming,
     not_held,
     rectification,
     rigid,
     write_together,
 )
 
-TITLE = "OpenCV's stereo calibration (camera matrices, distortion, R and T)"
-#: Its files hold a rectification.
-RECTIFIES = True
 #: Words of a name that say which camera of a pair it is of, left before right.
 _SIDES = [pair.split() for pair in ("left right", "l r", "1 2", "0 1", "first second", "a b", "master slave", "01 02")]
 #: Words of matrices that follow from a rectification: they are not the cameras' own.
@@ -291,3 +288,10 @@ def _dump(document: dict[str, Foreign]) -> str:
     for key, value in document.items():
         storage.write(key, np.ascontiguousarray(value) if isinstance(value, np.ndarray) else value)
     return str(storage.releaseAndGetString())
+
+
+FORMATS = {
+    "opencv": RigFormat(
+        "OpenCV's stereo calibration (camera matrices, distortion, R and T)", recognises, read, write, rectifies=True
+    )
+}

@@ -1,4 +1,10 @@
-"""Formats that are read and not written, of programs that keep each camera's pose in a third frame, or the pair's.
+"""Formats of programs that keep each camera's pose in a third frame, or the pair's; all but Kalibr's are read alone.
+
+kalibr: Kalibr's camchain YAML, OpenVINS's chains to the IMU, and the sensor.yaml pairs of EuRoC recordings.
+
+``T_cn_cnm1`` takes the coordinates of the camera before to camera n's, in metres; where a camera has none, its pose to the
+IMU holds: ``T_cam_imu`` takes the IMU's coordinates to the camera's, ``T_imu_cam`` and EuRoC's ``T_BS`` the other way.
+Models: pinhole with radtan (Brown-Conrady, four coefficients), equidistant (Kannala-Brandt) or none.
 
 mrcal: mrcal's .cameramodel files, one a camera, the left one first.
 
@@ -39,67 +45,56 @@ transposed, p2 = p1 R + t for rows; PoseCamera2, of later versions, is for colum
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
 from armsight.data import Array
-from armsight.errors import InputError
+from armsight.errors import InputError, naming
+from armsight.files import natural_key
 from armsight.geometry.check import checked
 from armsight.geometry.pose import inverse, pose
 from armsight.geometry.rotation import exp_so3, from_quaternion_wxyz
-from armsight.tables.document import Foreign
+from armsight.tables.document import Foreign, dump_yaml
 from armsight.tables.lengths import UNITS_M
+from armsight.vision.camera import Camera
 from armsight.vision.camera_file import camera_of, found, is_camera
 from armsight.vision.rig import StereoRig
 from armsight.vision.rigfiles.rigfile import (
     Document,
+    Entries,
     ImportOptions,
+    RigFormat,
     count_paths,
     imported,
-    naming,
     need,
     need_named,
-    posed_rig,
+    not_held,
+    posed_format,
     rigid,
+    write_together,
 )
 from armsight.vision.rigfiles.ros import rig_of
-
-
-class ReadFormat(NamedTuple):
-    """A format that is only read, as :class:`~.rigfile.RigFormat` has it."""
-
-    TITLE: str
-    recognises: Callable[[Sequence[Document]], bool]
-    read: Callable[[Sequence[Document], Sequence[Path], ImportOptions], StereoRig]
-
 
 #: Lens models whose parameters are OpenCV's.
 _LENSES = {f"LENSMODEL_OPENCV{n}": n for n in (4, 5, 8, 12)} | {"LENSMODEL_PINHOLE": 0}
 
 
-def _mrcal_recognises(documents: Sequence[Document]) -> bool:
-    """Say whether a file names one of mrcal's lens models."""
-    return any("lensmodel" in document for document in documents)
-
-
-def _mrcal_read(documents: Sequence[Document], paths: Sequence[Path], options: ImportOptions) -> StereoRig:
-    """Read the left and the right camera."""
-    count_paths(paths, (2,), "two files, left.cameramodel and right.cameramodel (a file has one camera)")
-    models, entries = {}, {}
+def _mrcal_entries(documents: Sequence[Document], paths: Sequence[Path]) -> Entries:
+    """Return the left and the right camera by their files' names."""
+    entries = dict[str, Document]()
     for path, document in zip(paths, documents, strict=True):
         with naming(path):
-            name = path.name if path.name not in models else str(path)
-            models[name], entries[name] = document, mrcal_entry(document)
+            entries[path.name if path.name not in entries else str(path)] = mrcal_entry(document)
+    return entries
 
-    def posed(name: str) -> tuple[Array, list[str]]:
-        value = models[name].get("rt_cam_ref", models[name].get("extrinsics"))
-        rt = checked([] if value is None else value, (6,), f"{name}: extrinsics")
-        return pose(exp_so3(rt[:3]), rt[3:]), []
 
-    return posed_rig(entries, posed, options, paths)
+def _mrcal_pose(entries: Entries, name: str) -> tuple[Array, list[str]]:
+    """Return a camera's pose."""
+    value = entries[name]["pose"]
+    rt = checked([] if value is None else value, (6,), f"{name}: extrinsics")
+    return pose(exp_so3(rt[:3]), rt[3:]), []
 
 
 def mrcal_entry(document: Document) -> Mapping[str, Foreign]:
@@ -116,6 +111,7 @@ def mrcal_entry(document: Document) -> Mapping[str, Foreign]:
         "distortion": np.array(numbers[4:]),
         "distortion_model": "opencv",
         "imagersize": need(document, "imagersize"),
+        "pose": document.get("rt_cam_ref", document.get("extrinsics")),
     }
 
 
@@ -124,32 +120,29 @@ def _basalt_recognises(documents: Sequence[Document]) -> bool:
     return any(isinstance(value := document.get("value0"), Mapping) and "T_imu_cam" in value for document in documents)
 
 
-def _basalt_read(documents: Sequence[Document], paths: Sequence[Path], options: ImportOptions) -> StereoRig:
-    """Read two cameras, called cam0, cam1, .. in their order."""
-    count_paths(paths, (1,), "one file, calibration.json")
-    with naming(paths[0]):
-        inner = need_named(documents[0], "value0")
-        poses, cameras, sizes = (need(inner, key) for key in ("T_imu_cam", "intrinsics", "resolution"))
-        if not all(isinstance(part, list) for part in (poses, cameras, sizes)) or not all(
-            isinstance(camera, Mapping) for camera in cameras
-        ):
-            raise InputError("T_imu_cam, intrinsics and resolution must be lists with an entry for each camera")
-        if not len(poses) == len(cameras) == len(sizes):
-            raise InputError(f"has {len(poses)} poses, {len(cameras)} intrinsics and {len(sizes)} resolutions")
-    entries = {
-        f"cam{i}": {**camera, "distortion_model": camera.get("camera_type"), "resolution": size}
-        for i, (camera, size) in enumerate(zip(cameras, sizes, strict=True))
-    }
-    for entry in entries.values():
-        if entry["distortion_model"] == "pinhole":
-            entry["distortion"] = []
+def _basalt_entries(documents: Sequence[Document], paths: Sequence[Path]) -> Entries:
+    """Return the cameras, called cam0, cam1, .. in their order."""
+    inner = need_named(documents[0], "value0")
+    poses, cameras, sizes = (need(inner, key) for key in ("T_imu_cam", "intrinsics", "resolution"))
+    if not all(isinstance(part, list) for part in (poses, cameras, sizes)) or not all(
+        isinstance(camera, Mapping) for camera in cameras
+    ):
+        raise InputError("T_imu_cam, intrinsics and resolution must be lists with an entry for each camera")
+    if not len(poses) == len(cameras) == len(sizes):
+        raise InputError(f"has {len(poses)} poses, {len(cameras)} intrinsics and {len(sizes)} resolutions")
+    entries = {}
+    for i, (camera, size, T) in enumerate(zip(cameras, sizes, poses, strict=True)):
+        kind = camera.get("camera_type")
+        plain = {"distortion": []} if kind == "pinhole" else {}
+        entries[f"cam{i}"] = {**camera, **plain, "distortion_model": kind, "resolution": size, "pose": T}
+    return entries
 
-    def posed(name: str) -> tuple[Array, list[str]]:
-        given = poses[list(entries).index(name)]
-        p, q = (checked([need(given, key) for key in keys], (len(keys),), f"T_imu_cam of {name}") for keys in _KEYS)
-        return inverse(pose(from_quaternion_wxyz(q / np.linalg.norm(q)), p)), []
 
-    return posed_rig(entries, posed, options, paths)
+def _basalt_pose(entries: Entries, name: str) -> tuple[Array, list[str]]:
+    """Return the inverse of a camera's pose before the IMU."""
+    given = entries[name]["pose"]
+    p, q = (checked([need(given, key) for key in keys], (len(keys),), f"T_imu_cam of {name}") for keys in _KEYS)
+    return inverse(pose(from_quaternion_wxyz(q / np.linalg.norm(q)), p)), []
 
 
 _KEYS = (("px", "py", "pz"), ("qw", "qx", "qy", "qz"))
@@ -174,21 +167,15 @@ def _caliscope_recognises(documents: Sequence[Document]) -> bool:
     )
 
 
-def _caliscope_read(documents: Sequence[Document], paths: Sequence[Path], options: ImportOptions) -> StereoRig:
-    """Read two cameras of an array."""
-    count_paths(paths, (1,), "one file, camera_array.toml")
-    entries = _caliscope_entries(documents[0])
-
-    def posed(name: str) -> tuple[Array, list[str]]:
-        R, t = (found(entries[name], names) for names in (_ROTATIONS, _TRANSLATIONS))
-        if R is None or t is None:
-            raise InputError(f"{name} has no rotation and translation: its pose was not calibrated")
-        R = np.asarray(R, object)
-        if R.size == 3:
-            R = exp_so3(checked(R.ravel(), (3,), f"rotation of {name}"))
-        return rigid(R, np.ravel(np.asarray(t, object)), f"rotation of {name}")
-
-    return posed_rig(entries, posed, options, paths)
+def _caliscope_pose(entries: Entries, name: str) -> tuple[Array, list[str]]:
+    """Return a camera's pose, its rotation given as a vector or a matrix."""
+    R, t = (found(entries[name], names) for names in (_ROTATIONS, _TRANSLATIONS))
+    if R is None or t is None:
+        raise InputError(f"{name} has no rotation and translation: its pose was not calibrated")
+    R = np.asarray(R, object)
+    if R.size == 3:
+        R = exp_so3(checked(R.ravel(), (3,), f"rotation of {name}"))
+    return rigid(R, np.ravel(np.asarray(t, object)), f"rotation of {name}")
 
 
 def _multical_recognises(documents: Sequence[Document]) -> bool:
@@ -198,25 +185,23 @@ def _multical_recognises(documents: Sequence[Document]) -> bool:
     )
 
 
-def _multical_entry(entry: Foreign) -> Foreign:
-    """Return a camera's entry, with the lens that its coefficients have the shape of."""
-    fisheye = isinstance(entry, Mapping) and np.shape(np.asarray(entry.get("dist"), object)) == (4, 1)
-    return {**entry, "model": "fisheye"} if fisheye else entry
+def _multical_entries(documents: Sequence[Document], paths: Sequence[Path]) -> Entries:
+    """Return the cameras, each with the lens that its coefficients have the shape of, and all poses."""
+    poses = {str(k).partition("_to_")[0]: value for k, value in need_named(documents[0], "camera_poses").items()}
+    entries = dict(need_named(documents[0], "cameras"))
+    for name, entry in entries.items():
+        if isinstance(entry, Mapping):
+            fisheye = np.shape(np.asarray(entry.get("dist"), object)) == (4, 1)
+            entries[name] = {**entry, **({"model": "fisheye"} if fisheye else {}), "camera_poses": poses}
+    return entries
 
 
-def _multical_read(documents: Sequence[Document], paths: Sequence[Path], options: ImportOptions) -> StereoRig:
-    """Read two cameras."""
-    count_paths(paths, (1,), "one file, calibration.json")
-    with naming(paths[0]):
-        poses = {str(k).partition("_to_")[0]: value for k, value in need_named(documents[0], "camera_poses").items()}
-        entries = {str(k): _multical_entry(entry) for k, entry in need_named(documents[0], "cameras").items()}
-
-    def posed(name: str) -> tuple[Array, list[str]]:
-        if name not in poses:
-            raise InputError(f"camera_poses has no {name}; there are {', '.join(poses)}")
-        return rigid(need(poses[name], "R"), need(poses[name], "T"), f"R of {name}")
-
-    return posed_rig(entries, posed, options, paths)
+def _multical_pose(entries: Entries, name: str) -> tuple[Array, list[str]]:
+    """Return a camera's pose."""
+    poses = entries[name]["camera_poses"]
+    if name not in poses:
+        raise InputError(f"camera_poses has no {name}; there are {', '.join(poses)}")
+    return rigid(need(poses[name], "R"), need(poses[name], "T"), f"R of {name}")
 
 
 #: Name of a resolution in the file -> its image size, px.
@@ -328,11 +313,6 @@ def _matlab_inner(document: Document) -> Mapping[str, Foreign] | None:
     return None
 
 
-def _matlab_recognises(documents: Sequence[Document]) -> bool:
-    """Say whether a file is a whole stereoParameters object."""
-    return any(_matlab_inner(document) is not None for document in documents)
-
-
 def _matlab_read(documents: Sequence[Document], paths: Sequence[Path], options: ImportOptions) -> StereoRig:
     """Read both cameras."""
     count_paths(paths, (1,), "one file, of jsonencode(stereoParams)")
@@ -373,13 +353,116 @@ def _matlab_read(documents: Sequence[Document], paths: Sequence[Path], options: 
     return imported(cameras, inverse(T), options, paths, notes + said, _WORLD_UNITS.get(unit, 1.0))
 
 
+#: Poses to a third frame: name -> whether it takes the camera's coordinates to that frame's.
+_THIRD = {"T_cam_imu": False, "T_imu_cam": True, "T_BS": True, "T_C_B": False}
+
+
+def _kalibr_entries(documents: Sequence[Document], paths: Sequence[Path] = ()) -> Entries:
+    """Return the cameras of a chain, or of a pair of EuRoC's files, by name."""
+    if all("T_BS" in document and "intrinsics" in document for document in documents):
+        return {f"cam{i}": document for i, document in enumerate(documents)}
+    if len(documents) > 1:
+        return {}
+    return {
+        str(name): entry
+        for name, entry in sorted(documents[0].items(), key=lambda one: natural_key(one[0]))  # cam2 stands behind cam10
+        if str(name)[-1:].isdigit() and str(name).startswith("cam") and isinstance(entry, Mapping)
+    }
+
+
+def _kalibr_recognises(documents: Sequence[Document]) -> bool:
+    """Say whether a file has cameras cam0, cam1, .. as Kalibr writes them, or files have EuRoC's."""
+    keys = {"camera_model", "cam_overlaps", "T_cn_cnm1", "distortion_coeffs", *_THIRD}
+    return any(keys & set(entry) for entry in _kalibr_entries(documents).values())
+
+
+def _kalibr_pose(entries: Entries, name: str) -> tuple[Array, list[str]]:
+    """Return a camera's pose before the first one, along the chain, or before the IMU."""
+    third = next((key for key in _THIRD if all(key in entry for entry in entries.values())), None)
+    if third is not None and not all("T_cn_cnm1" in entry for entry in list(entries.values())[1:]):
+        T, notes = _kalibr_rigid(entries[name][third], f"{name}.{third}")
+        return inverse(T) if _THIRD[third] else T, notes
+    T, notes = np.eye(4), []
+    for link, entry in list(entries.items())[1 : list(entries).index(name) + 1]:
+        if "T_cn_cnm1" not in entry:
+            raise InputError(
+                f"{link} has no 'T_cn_cnm1', nor have all cameras {' or '.join(_THIRD)}; there are {', '.join(entry)}: "
+                "calibrate both cameras in one chain"
+            )
+        step, said = _kalibr_rigid(entry["T_cn_cnm1"], f"{link}.T_cn_cnm1")
+        T, notes = step @ T, notes + said
+    return T, notes
+
+
+def _kalibr_rigid(value: Foreign, name: str) -> tuple[Array, list[str]]:
+    """Return (4, 4) a transform as printed, and notes."""
+    T = checked(value, (4, 4), name)
+    return rigid(T[:3, :3], T[:3, 3], f"rotation of {name}")
+
+
+def _kalibr_write(rig: StereoRig, paths: Sequence[Path]) -> tuple[str, ...]:
+    """Write a camchain of two cameras."""
+    count_paths(paths, (1,), "one file, camchain.yaml")
+    T_right_left = inverse(rig.T_left_right)
+    document = {
+        f"cam{i}": _kalibr_entry(name, camera)
+        for i, (name, camera) in enumerate(zip(("left", "right"), rig.cameras, strict=True))
+    }
+    document["cam1"] = {"T_cn_cnm1": T_right_left.tolist(), **document["cam1"]}
+    write_together(paths, [dump_yaml(document)])
+    return not_held(rig)
+
+
+def _kalibr_entry(name: str, camera: Camera) -> dict[str, Foreign]:
+    """Return a camera as a camchain holds it."""
+    model = {"none": "none", "fisheye": "equidistant"}.get(camera.model, "radtan")
+    d = camera.distortion
+    if model == "radtan":
+        if d[4:].any():
+            raise InputError(
+                f"Kalibr's radtan holds k1 k2 p1 p2 only; the {name} camera is {camera.model} with more that is not "
+                "zero: calibrate with brown4 or fisheye to export to Kalibr"
+            )
+        d = d[:4]
+    return {
+        "camera_model": "pinhole",
+        "intrinsics": camera.intrinsics.tolist(),
+        "distortion_model": model,
+        "distortion_coeffs": d.tolist(),
+        "resolution": list(camera.image_size_px),
+    }
+
+
 #: The formats of this file by their names.
-PROGRAMS = {
-    "mrcal": ReadFormat("mrcal .cameramodel files", _mrcal_recognises, _mrcal_read),
-    "basalt": ReadFormat("a Basalt calibration.json", _basalt_recognises, _basalt_read),
-    "caliscope": ReadFormat("a camera array of caliscope or aniposelib", _caliscope_recognises, _caliscope_read),
-    "multical": ReadFormat("a multical calibration.json", _multical_recognises, _multical_read),
-    "stereolabs": ReadFormat("a Stereolabs SN*.conf", _stereolabs_recognises, _stereolabs_read),
-    "orbslam": ReadFormat("ORB-SLAM's stereo settings", _orbslam_recognises, _orbslam_read),
-    "stereoparams": ReadFormat("MATLAB's stereoParameters as JSON", _matlab_recognises, _matlab_read),
+FORMATS = {
+    "mrcal": posed_format(
+        "mrcal .cameramodel files",
+        ((2,), "two files, left.cameramodel and right.cameramodel (a file has one camera)"),
+        *(lambda documents: any("lensmodel" in document for document in documents), _mrcal_entries, _mrcal_pose),
+    ),
+    "basalt": posed_format(
+        "a Basalt calibration.json",
+        ((1,), "one file, calibration.json"),
+        *(_basalt_recognises, _basalt_entries, _basalt_pose),
+    ),
+    "caliscope": posed_format(
+        "a camera array of caliscope or aniposelib",
+        ((1,), "one file, camera_array.toml"),
+        *(_caliscope_recognises, lambda documents, paths: _caliscope_entries(documents[0]), _caliscope_pose),
+    ),
+    "multical": posed_format(
+        "a multical calibration.json",
+        ((1,), "one file, calibration.json"),
+        *(_multical_recognises, _multical_entries, _multical_pose),
+    ),
+    "kalibr": posed_format(
+        "a Kalibr camchain",
+        ((1, 2), "one file, camchain.yaml, or two sensor.yaml, the left camera's first"),
+        *(_kalibr_recognises, _kalibr_entries, _kalibr_pose, _kalibr_write),
+    ),
+    "stereolabs": RigFormat("a Stereolabs SN*.conf", _stereolabs_recognises, _stereolabs_read),
+    "orbslam": RigFormat("ORB-SLAM's stereo settings", _orbslam_recognises, _orbslam_read),
+    "stereoparams": RigFormat(
+        "MATLAB's stereoParameters as JSON", lambda documents: any(map(_matlab_inner, documents)), _matlab_read
+    ),
 }

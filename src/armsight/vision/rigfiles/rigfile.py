@@ -1,6 +1,6 @@
 """The contract of a foreign rig file: another program's calibration goes in, a StereoRig comes out, and back.
 
-To add a format: write one module with the functions of :class:`RigFormat`, and add one line to ``FORMATS`` in
+To add a format: write a :class:`RigFormat` into the ``FORMATS`` of a module here, and add one line to ``FORMATS`` in
 ``__init__.py``. The laws in tests/vision/rigfiles/test_rigfiles.py are parametrised over that registry. What the
 formats share, such as checking matrices and OpenCV's rectification, stands here too.
 """
@@ -8,16 +8,16 @@ formats share, such as checking matrices and OpenCV's rectification, stands here
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, TypeAlias
+from typing import TypeAlias
 
 import cv2
 import numpy as np
 
 from armsight.data import Array
-from armsight.errors import InputError
+from armsight.errors import InputError, naming
 from armsight.files import replacing
 from armsight.geometry.check import checked
 from armsight.geometry.pose import inverse, mean_pose, pose
@@ -30,6 +30,9 @@ from armsight.vision.rigfiles import ASSUMED_SIGMA_PX
 
 #: A file's names and values.
 Document: TypeAlias = Mapping[str, Foreign]
+#: Each camera's names and values, by its name.
+Entries: TypeAlias = Mapping[str, Document]
+PoseOf: TypeAlias = Callable[[Entries, str], tuple[Array, list[str]]]
 #: A baseline longer than this is remarked, m.
 LONG_M = 2.0  # half: rooms' rigs are remarked; double: 30 cm read as inches are not
 #: OpenCV's alpha (of fisheyes: balance) of every rectification that is written: 0, as ROS's calibrator has it, scales the
@@ -39,6 +42,8 @@ ALPHA = 0.0
 LOOSEST_ROTATION = 2e-3
 #: Lengths beyond this are damaged numbers in any unit; half, double: the same.
 _FARTHEST = 1e9
+#: Keys of a camera that armsight cannot represent.
+_LEFT_BEHIND = ("timeshift_cam_imu", "rostopic")
 
 
 @dataclass(frozen=True)
@@ -58,36 +63,53 @@ class ImportOptions:
     pair: tuple[str, str] | None = None
 
 
-class RigFormat(Protocol):
-    """One foreign format; a module with these constants and functions fulfils it, ``write`` where it is exported to.
+@dataclass(frozen=True)
+class RigFormat:
+    """One foreign format.
 
     Attributes:
-        TITLE: what its files are, for messages: "a Kalibr camchain".
-        RECTIFIES: whether its files hold a rectification, which is computed with ALPHA; of exported ones alone.
+        title: what its files are, for messages: "a Kalibr camchain".
+        recognises: says by their content whether files are of this format.
+        read: returns the rig of files; its provenance says what was assumed and left behind. InputError: a file is damaged,
+            misses a key, or holds what armsight cannot; the message names the file.
+        write: writes a rig and returns what the format cannot hold, a line each; None where it is only read. InputError:
+            the rig does not fit the format, or a file cannot be written; no file is left half-written.
+        rectifies: whether the files that are written hold a rectification, which is computed with ALPHA.
     """
 
-    TITLE: str
-    RECTIFIES: bool
+    title: str
+    recognises: Callable[[Sequence[Document]], bool]
+    read: Callable[[Sequence[Document], Sequence[Path], ImportOptions], StereoRig]
+    write: Callable[[StereoRig, Sequence[Path]], tuple[str, ...]] | None = None
+    rectifies: bool = False
 
-    def recognises(self, documents: Sequence[Document]) -> bool:
-        """Say by their content whether files are of this format."""
-        ...
 
-    def read(self, documents: Sequence[Document], paths: Sequence[Path], options: ImportOptions) -> StereoRig:
-        """Read a rig; its provenance says what was assumed and what was left behind.
+def posed_format(
+    title: str,
+    files: tuple[tuple[int, ...], str],
+    recognises: Callable[[Sequence[Document]], bool],
+    entries: Callable[[Sequence[Document], Sequence[Path]], Entries],
+    pose_of: PoseOf,
+    write: Callable[[StereoRig, Sequence[Path]], tuple[str, ...]] | None = None,
+) -> RigFormat:
+    """Return a format of files that hold each camera and its pose in a third frame, the world's or an IMU's.
 
-        Raises:
-            InputError: a file is damaged, misses a key, or holds what armsight cannot; the message names the file.
-        """
-        ...
+    Args:
+        title: as in :class:`RigFormat`, as are ``recognises`` and ``write``.
+        files: how many there may be, and what they are called.
+        recognises: by content.
+        entries: returns each camera's entry by its name, in the order of the files.
+        pose_of: returns (4, 4) T_camera_reference of a camera of the entries, in the file's unit, and notes.
+        write: see there.
+    """
 
-    def write(self, rig: StereoRig, paths: Sequence[Path]) -> tuple[str, ...]:
-        """Write a rig and return what the format cannot hold, a line each.
+    def read(documents: Sequence[Document], paths: Sequence[Path], options: ImportOptions) -> StereoRig:
+        count_paths(paths, *files)
+        with naming(paths[0]) if len(paths) == 1 else contextlib.nullcontext():
+            found = entries(documents, paths)
+        return _posed_rig(found, pose_of, options, paths)
 
-        Raises:
-            InputError: the rig does not fit the format, or a file cannot be written; no file is left half-written.
-        """
-        ...
+    return RigFormat(title, recognises, read, write)
 
 
 def count_paths(paths: Sequence[Path], allowed: Sequence[int], names: str) -> None:
@@ -96,22 +118,10 @@ def count_paths(paths: Sequence[Path], allowed: Sequence[int], names: str) -> No
         raise InputError(f"expected {names}, got {len(paths)} file(s): {', '.join(map(str, paths)) or 'none'}")
 
 
-def posed_rig(
-    entries: Mapping[str, Mapping[str, Foreign]],
-    pose_of: Callable[[str], tuple[Array, list[str]]],
-    options: ImportOptions,
-    paths: Sequence[Path],
-) -> StereoRig:
-    """Return the rig of two of several cameras whose poses in a third frame are known.
+def _posed_rig(entries: Entries, pose_of: PoseOf, options: ImportOptions, paths: Sequence[Path]) -> StereoRig:
+    """Return the rig of two of several cameras whose poses in a third frame are known; ``options.pair`` chooses the two.
 
-    Args:
-        entries: each camera's entry by its name, in the order of the file.
-        pose_of: returns (4, 4) T_camera_reference of a camera, in the file's unit, and notes.
-        options: what the user added; ``pair`` chooses the two.
-        paths: the files.
-
-    Raises:
-        InputError: fewer than two, an unknown name in ``pair``, or a camera that cannot be read.
+    InputError: fewer than two, an unknown name in ``pair``, or a camera that cannot be read.
     """
     names = list(entries)
     if len(names) < 2:
@@ -132,13 +142,15 @@ def posed_rig(
         with naming(paths[min(names.index(name), len(paths) - 1)]), naming(name):
             camera, said = camera_of(entries[name], options.image_size_px)
         with naming(paths[-1]):
-            T, noted = pose_of(name)
+            T, noted = pose_of(entries, name)
         cameras.append(camera)
         Ts.append(T)
         notes += [f"{name}: {note}" for note in said] + noted
     if others := [name for name in names if name not in chosen]:
         left, right = chosen
         notes.append(f"left behind: {', '.join(others)}; {left} is left, {right} right: --pair LEFT,RIGHT chooses")
+    if keys := [key for key in _LEFT_BEHIND if any(key in entry for entry in entries.values())]:
+        notes.append(f"left behind: {', '.join(keys)}")
     return imported(cameras, Ts[0] @ inverse(Ts[1]), options, paths, notes)
 
 
@@ -164,15 +176,6 @@ def need_named(document: Foreign, key: str) -> Mapping[str, Foreign]:
     if not isinstance(value, Mapping):
         raise InputError(f"{key} holds {str(value)[:40]!r}, expected names and values")
     return value
-
-
-@contextlib.contextmanager
-def naming(where: str | Path) -> Iterator[None]:
-    """Put the name of a file, or of a part of it, before any error about its content."""
-    try:
-        yield
-    except InputError as error:
-        raise InputError(f"{where}: {error}") from None
 
 
 def rigid(R: Foreign, t: Foreign, name: str) -> tuple[Array, list[str]]:

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from armsight.data import Array
-from armsight.errors import InputError
+from armsight.errors import InputError, naming
 from armsight.geometry.check import checked
 from armsight.geometry.pose import inverse
 from armsight.tables.document import Foreign, dump_yaml
@@ -24,18 +24,15 @@ from armsight.vision.rig import StereoRig
 from armsight.vision.rigfiles.rigfile import (
     Document,
     ImportOptions,
+    RigFormat,
     count_paths,
     imported,
-    naming,
     not_held,
     rectification,
     rigid,
     write_together,
 )
 
-TITLE = "a pair of ROS camera_info files"
-#: Its files hold a rectification.
-RECTIFIES = True
 #: Names of the matrices in the files of camera_calibration, and in printed messages (D K R P, in ROS 2 d k r p).
 _NAMES = {
     "camera_matrix": ("cameramatrix", "k"),
@@ -184,3 +181,6 @@ def _matrix_of(document: Document, key: str, shape: tuple[int, int]) -> Array:
 def _matrix(m: Array) -> dict[str, Foreign]:
     """Return a matrix as camera_info files hold it."""
     return {"rows": m.shape[0], "cols": m.shape[1], "data": m.ravel().tolist()}
+
+
+FORMATS = {"ros": RigFormat("a pair of ROS camera_info files", recognises, read, write, rectifies=True)}
