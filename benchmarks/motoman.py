@@ -100,7 +100,7 @@ def bodies_in(shot, body, rig):
     """Every ball in a shot, located, the left one in the image first."""
     found = candidates(body.points, rig.cameras, shot)
     located = []
-    for _, seen in instances(body.points, rig.cameras, rig.T_left_right, shot, found):
+    for _, seen in instances(body.points, rig, shot, found):
         result = locate(rig, body, triangulate(rig, body, gate(rig, body, seen)))
         if not isinstance(result, Missed):
             located.append(result)

@@ -11,7 +11,7 @@ from armsight.geometry.rotation import exp_so3, log_so3
 from armsight.vision.calibrate.bodies import LEAST_SHOTS, calibrate_bodies
 from armsight.vision.camera import Camera
 from armsight.vision.detections import SeenShot
-from armsight.vision.pose.assign import candidates, instances
+from armsight.vision.pose.assign import instances
 from armsight.vision.rig import StereoRig
 from views import both_pixels
 
@@ -137,9 +137,7 @@ def test_two_bodies_of_one_kind_are_distinguished():
     nominal, _ = ball()
     shots, truths = two_in_view(true, nominal.points, 8)
     for shot, (Ts, counts) in zip(shots, truths, strict=True):
-        found = instances(
-            nominal.points, known(true), true.T_left_right, shot, candidates(nominal.points, known(true), shot)
-        )
+        found = instances(nominal.points, true, shot)
         assert len(found) == 2
         for T, seen in found:
             gaps = [np.linalg.norm(T[:3, 3] - other[:3, 3]) for other in Ts]

@@ -92,7 +92,7 @@ def test_motion_is_learned_and_stated(moved):
     # The far pairs make most of the mean square, which is to be met whatever a pair's weight; a way is seen to
     # 0.05 px * 0.7 m / 450 px / sqrt(54) = 0.01 mm sideways and some five times that along the line of sight.
     assert c.motion.rms_m / factor == pytest.approx(np.sqrt((motions[:, :3] ** 2).mean()), rel=0.15)
-    assert c.motion.rms_rad / factor == pytest.approx(np.sqrt((motions[:, 3:] ** 2).mean()), rel=0.35)
+    assert c.motion.rms[1] / factor == pytest.approx(np.sqrt((motions[:, 3:] ** 2).mean()), rel=0.35)
     assert set(np.argsort(c.motion.weights)[:2]) == {4, 13}
     # 24 pairs of 54 corners of both cameras: sqrt(1 / (2 * 5184)) is 1%, and motions take a few per cent of that.
     assert c.solution.sigma_px == pytest.approx(SIGMA_PX, rel=0.05)
@@ -149,7 +149,7 @@ def test_a_body_at_rest_is_measured_within_the_sigma_of_a_rig_of_moving_boards(m
 def test_a_motion_seen_from_a_camera_moves_points_as_it_does():
     true, board, Ts = rig_and_board()
     points, T = board.body.points, Ts[3]
-    middle, motion = points.mean(axis=0), ExposureMotion(1.0, 1.0, np.ones(1), 2e-6, 3e-5)
+    middle, motion = points.mean(axis=0), ExposureMotion(np.ones(2), np.ones(1), np.array([2e-6, 3e-5]))
     T_right_board = np.linalg.inv(true.T_left_right) @ T
     seen = both_pixels(true, transform(T, points))
     p, _, by_rig = optimal_points(true, seen, np.tile(np.eye(2), (len(points), 2, 1, 1)))
@@ -194,8 +194,7 @@ def test_learning_ends_at_the_scale_of_what_is_plainly_seen():
         motion, freed = motion.updated(solution)
     assert freed == 6 * count
     # A scale of 12000 draws of a heavy tail: about 1 / sqrt(2 * 12000) each, four of these and a half for the tail.
-    assert motion.scale_m == pytest.approx(WAY_M, rel=0.04)
-    assert motion.scale_rad == pytest.approx(ROTATION_RAD, rel=0.04)
+    assert motion.scales == pytest.approx([WAY_M, ROTATION_RAD], rel=0.04)
     assert motion.rms_m == pytest.approx(np.sqrt((seen[:, :3] ** 2).mean()), rel=1e-12)
 
 

@@ -61,9 +61,9 @@ def test_most_shots_decide_the_relative_pose():
         ]
     for j in (0, 3):  # two have a mirror solution in front
         left[j].insert(0, Ts[j + 1])
-    best = relative_poses(left, right, 0.6)[0]
+    best = relative_poses(left, right)[0]
     assert best == pytest.approx(true.T_left_right, abs=1e-9)
-    assert relative_poses([[], []], [[], []], 1.0) == []
+    assert relative_poses([[], []], [[], []]) == []
 
 
 # Screening.

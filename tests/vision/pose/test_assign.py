@@ -3,7 +3,7 @@ import pytest
 
 from armsight.geometry.pose import inverse, log_se3, transform
 from armsight.vision.detections import SeenShot
-from armsight.vision.pose.assign import candidates, instances, plain
+from armsight.vision.pose.assign import instances, plain
 from strategies import ordinary_rig
 from views import both_pixels, somewhere
 
@@ -28,7 +28,7 @@ def shot_of(rig, points, Ts, rng):
 
 
 def found_in(rig, points, shot):
-    return instances(points, rig.cameras, rig.T_left_right, shot, candidates(points, rig.cameras, shot))
+    return instances(points, rig, shot)
 
 
 def test_names_that_stand_once_are_plain():

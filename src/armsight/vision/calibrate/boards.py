@@ -32,6 +32,7 @@ from armsight.vision.calibrate import FOLDS, MODELS
 from armsight.vision.calibrate.heldout import (
     ROUGHLY,
     STEPS,
+    Trial,
     adjusted,
     concluded,
     cross_validate,
@@ -41,7 +42,7 @@ from armsight.vision.calibrate.heldout import (
     summary,
 )
 from armsight.vision.calibrate.motion import ExposureMotion
-from armsight.vision.calibrate.result import Calibration, HeldOutErrors, PairErrors, RejectedPair
+from armsight.vision.calibrate.result import Calibration, HeldOutErrors, RejectedPair
 from armsight.vision.calibrate.screen import (
     LEAST_CORNERS,
     MOTION_EASE,
@@ -177,20 +178,6 @@ Second = Callable[..., Any]
 
 def _silent(message: str) -> None:
     """Take a line of progress and show it nowhere."""
-
-
-@dataclass(frozen=True, eq=False)
-class Trial(Record):
-    """One way to model cameras and board, adjusted to all pairs, with its held-out ``errors`` and their summary.
-
-    ``model`` has its tolerance and its motion as learned; ``motion`` is None where the board stood still.
-    """
-
-    model: BundleModel
-    motion: ExposureMotion | None
-    solution: BundleSolution
-    errors: PairErrors
-    heldout: HeldOutErrors
 
 
 @dataclass(frozen=True, eq=False)
@@ -392,17 +379,13 @@ def calibrate_boards(
     names = tuple(usable[j].name for j in screened.kept if j < pair_count)
     calibration = concluded(
         board.body,
-        trial.model,
-        trial.solution,
+        trial,
         screened.observations,
-        errors=trial.errors,
-        heldout=trial.heldout,
         models=tried,
         pairs=names,
         pairs_found=len(pairs),
         rejected=tuple(rejected),
         notes=(*notes, *screened.notes, *unseen_row(board, _shown(pairs))),
-        motion=None if trial.motion is None else trial.motion.scaled(trial.heldout.normalised_rms),
         disc_radius_m=radius_m,
     )
     _apart(calibration.rig, trial.solution.state)

@@ -19,6 +19,7 @@ from armsight.errors import CalibrationError
 from armsight.geometry.pose import inverse, log_se3
 from armsight.vision.calibrate import FOLDS
 from armsight.vision.calibrate.heldout import (
+    Trial,
     adjusted,
     concluded,
     cross_validate,
@@ -30,7 +31,7 @@ from armsight.vision.calibrate.result import Calibration, RejectedPair
 from armsight.vision.calibrate.start import relative_poses
 from armsight.vision.camera import Camera
 from armsight.vision.detections import SeenShot
-from armsight.vision.pose.assign import candidates, instances, plain
+from armsight.vision.pose.assign import candidates, instances, joined
 from armsight.vision.pose.bundle import BundleModel, BundleState, Observations, minimise
 from armsight.vision.pose.pnp import Candidate
 from armsight.vision.pose.projection import every_point
@@ -75,21 +76,17 @@ def calibrate_bodies(
     progress("looking for the body in every image")
     found = [candidates(body.points, cameras, shot) for shot in shots]
     progress("estimating the relative pose of the cameras")
-    T_left_right, points = _start(body.points, cameras, shots, found), body.points
-    for tolerance in (0.0, 0.0, *((_START_TOLERANCE_M,) if refine_body else ())):
-        names, seen, poses, rejected = _assigned(points, cameras, T_left_right, shots, found)
+    rig, points = _start(body.points, cameras, shots, found), body.points
+    for tolerance in (0.0, 0.0, _START_TOLERANCE_M, _START_TOLERANCE_M) if refine_body else (0.0, 0.0, 0.0):
+        names, seen, poses, rejected = _assigned(points, rig, shots, found)
         if len(seen) < LEAST_SHOTS:
             why = "; ".join(f"shot {r.pair}: {r.reason}" for r in rejected[:2])
             raise CalibrationError(f"{len(seen)} of {len(shots)} shots are usable, {LEAST_SHOTS} are needed: {why}")
         observations, model = Observations.from_shots(seen), _model(body.points, tolerance)
-        state = BundleState(cameras, T_left_right, np.stack(poses), np.zeros(len(model.modes)))
-        state = adjusted(model, state, observations, _START_SIGMA_PX)[2].state
-        T_left_right, points = state.T_left_right, model.body(state.shape)
-    names, seen, poses, rejected = _assigned(points, cameras, T_left_right, shots, found)
-    observations = Observations.from_shots(seen)
-    model = _model(body.points, _START_TOLERANCE_M if refine_body else 0.0)
-    state = BundleState(cameras, T_left_right, np.stack(poses), np.zeros(len(model.modes)))
-    model, _, solution = adjusted(model, state, observations, _START_SIGMA_PX)
+        state = BundleState(cameras, rig.T_left_right, np.stack(poses), np.zeros(len(model.modes)))
+        model, _, solution = adjusted(model, state, observations, _START_SIGMA_PX)
+        rig = replace(rig, T_left_right=solution.state.T_left_right)
+        points = model.body(solution.state.shape)
     progress("evaluating the rig on held-out shots")
 
     def fit(rows: NDArray[np.intp]) -> tuple[StereoRig, Array, None]:
@@ -106,11 +103,8 @@ def calibrate_bodies(
         notes = (f"the body differs from its drawing by {1e3 * tolerance_m:.2g} mm per coordinate, as the shots show",)
     return concluded(
         body,
-        model,
-        solution,
+        Trial(model, None, solution, errors, heldout),
         observations,
-        errors=errors,
-        heldout=heldout,
         models={cameras[0].model: heldout},
         pairs=tuple(names),
         pairs_found=len(shots),
@@ -119,69 +113,62 @@ def calibrate_bodies(
     )
 
 
-def _start(points: Array, cameras: tuple[Camera, Camera], shots: Sequence[SeenShot], found: list[Found]) -> Array:
-    """Return the relative pose under which most detections belong to bodies that both cameras see."""
+def _start(points: Array, cameras: tuple[Camera, Camera], shots: Sequence[SeenShot], found: list[Found]) -> StereoRig:
+    """Return the rig under whose relative pose most detections belong to bodies that both cameras see."""
     both = [j for j, (left, right) in enumerate(found) if left and right]
     both = sorted(both, key=lambda j: -sum(len(side[0].rows) for side in found[j]))[:_START_SHOTS]
-    depths = [c.T_camera_body[2, 3] for j in both for side in found[j] for c in side]
-    if not depths:
+    if not both:
         raise CalibrationError("no shot shows three or more of the body's points in both cameras")
     views = [[[c.T_camera_body for c in found[j][side]] for j in both] for side in (0, 1)]
-    best, most = None, -1
-    for T in relative_poses(views[0], views[1], float(np.median(depths))):
-        T = _refined(points, cameras, T, [shots[j] for j in both], [found[j] for j in both])
+    best, most, count = None, -1, sum(camera.parameters.size for camera in cameras) + 6
+    for T in relative_poses(views[0], views[1]):
+        rig = StereoRig(*cameras, T, np.zeros((count, count)), 0.0)
+        rig = _refined(points, rig, [shots[j] for j in both], [found[j] for j in both])
         # A body that one camera alone sees does not constrain the other: any relative pose explains it.
         explained = sum(
-            sum(int(seen.seen.sum(axis=0).min()) for _, seen in instances(points, cameras, T, shots[j], found[j]))
+            sum(int(seen.seen.sum(axis=0).min()) for _, seen in instances(points, rig, shots[j], found[j]))
             for j in both
         )
         if explained > most:
-            best, most = T, explained
+            best, most = rig, explained
     assert best is not None
     return best
 
 
-def _refined(
-    points: Array, cameras: tuple[Camera, Camera], T_left_right: Array, shots: list[SeenShot], found: list[Found]
-) -> Array:
+def _refined(points: Array, rig: StereoRig, shots: list[SeenShot], found: list[Found]) -> StereoRig:
     """Adjust a hypothesis of the relative pose to the pairs of candidates that agree with it."""
     seen, poses = [], []
     for shot, (left, right) in zip(shots, found, strict=True):
         pairs = [(a, b) for a in left for b in right]
         gaps = [
-            np.linalg.norm(log_se3(inverse(T_left_right) @ a.T_camera_body @ inverse(b.T_camera_body)))
+            np.linalg.norm(log_se3(inverse(rig.T_left_right) @ a.T_camera_body @ inverse(b.T_camera_body)))
             for a, b in pairs
         ]
         a, b = pairs[int(np.argmin(gaps))]
-        from_rows = SeenShot(
-            shot.name, (shot.ids[0][a.rows], shot.ids[1][b.rows]), (shot.uv[0][a.rows], shot.uv[1][b.rows])
-        )
-        joined = plain(from_rows)
-        assert joined is not None, "a candidate names every point once"
-        seen.append(joined)
+        seen.append(joined(shot, (a.rows, b.rows)))
         poses.append(a.T_camera_body)
-    state = BundleState(cameras, T_left_right, np.stack(poses), np.zeros(0))
+    state = BundleState(rig.cameras, rig.T_left_right, np.stack(poses), np.zeros(0))
     try:
-        return minimise(_model(points, 0.0), state, Observations.from_shots(seen), _START_SIGMA_PX).state.T_left_right
+        found_state = minimise(_model(points, 0.0), state, Observations.from_shots(seen), _START_SIGMA_PX).state
     except (CalibrationError, np.linalg.LinAlgError):
-        return T_left_right
+        return rig
+    return replace(rig, T_left_right=found_state.T_left_right)
 
 
 def _assigned(
-    points: Array, cameras: tuple[Camera, Camera], T_left_right: Array, shots: Sequence[SeenShot], found: list[Found]
+    points: Array, rig: StereoRig, shots: Sequence[SeenShot], found: list[Found]
 ) -> tuple[list[str], list[Correspondences], list[Array], list[RejectedPair]]:
     """Give every shot its detections of the body and its pose, or the reason why it has none."""
     names, seen, poses, rejected = [], [], [], []
     for shot, candidates_of_shot in zip(shots, found, strict=True):
-        bodies = instances(points, cameras, T_left_right, shot, candidates_of_shot)
+        bodies = instances(points, rig, shot, candidates_of_shot)
         if not bodies:
             count = sum(len(ids) for ids in shot.ids)
             rejected.append(RejectedPair(shot.name, f"no pose of the body agrees with its {count} detections"))
             continue
-        T, correspondences = bodies[0]
         names.append(shot.name)
-        poses.append(T)
-        seen.append(correspondences)
+        poses.append(bodies[0][0])
+        seen.append(bodies[0][1])
     return names, seen, poses, rejected
 
 

@@ -20,6 +20,7 @@ from armsight.geometry.rotation import exp_so3
 from armsight.vision.calibrate.boards import printed_board, rigid_board
 from armsight.vision.calibrate.budget import covariance_root
 from armsight.vision.calibrate.result import Calibration, corner_variance_px2
+from armsight.vision.calibrate.start import pinhole
 from armsight.vision.camera import Camera
 from armsight.vision.markers.marker import CalibrationBoard
 from armsight.vision.pose.bundle import BundleModel, BundleState, Observations, predict
@@ -243,12 +244,10 @@ class Guide:
 
 def guessed_rig(sizes: tuple[tuple[int, int], tuple[int, int]], T_left_right: Array) -> StereoRig:
     """Return a rig before the first calibration: ordinary lenses without distortion, at a relative pose (4, 4)."""
-    cameras = [guessed_camera(size) for size in sizes]
-    count = sum(camera.parameters.size for camera in cameras) + 6
-    return StereoRig(cameras[0], cameras[1], T_left_right, np.zeros((count, count)), 0.0)
+    left, right = (guessed_camera(size) for size in sizes)
+    return StereoRig(left, right, T_left_right, np.zeros((14, 14)), 0.0)
 
 
 def guessed_camera(size: tuple[int, int]) -> Camera:
     """Return a camera before anything is known of it."""
-    f = GUESSED_FOCAL * size[0]
-    return Camera(size, "none", np.array([f, f, (size[0] - 1) / 2, (size[1] - 1) / 2]), np.zeros(0))
+    return pinhole(size, GUESSED_FOCAL * size[0], "none")

@@ -9,12 +9,12 @@ that it shows itself (empirical Bayes); with the held-out errors it becomes a Ca
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from armsight.data import Array, Body, Correspondences, PoseEstimate
+from armsight.data import Array, Body, Correspondences, PoseEstimate, Record
 from armsight.errors import CalibrationError, InputError
 from armsight.geometry.pose import inverse, transform
 from armsight.geometry.rigid import fit_rigid, fit_scale
@@ -65,12 +65,37 @@ def pair_errors(
     print from its drawing is not an error of the cameras. ``motion``: expected between the two exposures. One row for
     each shot that has three or more matched points.
     """
-    rows = []
-    found = drawing if estimated is None else estimated
+    rows, found = [], drawing if estimated is None else estimated
     for shot in range(observations.shot_count):
-        row = _pair_error(rig, drawing, found, correspondences(observations, shot), motion, disc_radius_m)
-        if row is not None:
-            rows.append((float(shot), *row))
+        seen = correspondences(observations, shot)
+        seen = Correspondences(seen.ids[seen.paired], seen.uv[seen.paired], seen.cov_uv[seen.paired])
+        if disc_radius_m > 0:
+            seen = middles(rig, found, seen, disc_radius_m)
+        cov = seen.cov_uv + max(rig.sigma_px, LEAST_SIGMA_PX) ** 2 * np.eye(2)
+        p, cov_p, by_rig = optimal_points(rig, seen.uv, cov)
+        good = np.flatnonzero(np.isfinite(p).all(axis=1))
+        if len(good) >= 3:
+            good = good[_without_outliers(found[seen.ids[good]], p[good])]
+        if len(good) < 3:
+            continue
+        board, body = drawing[seen.ids[good]], found[seen.ids[good]]
+        p, cov_p, by_rig = p[good], cov_p[good], by_rig[good]
+        T = fit_rigid(board, p)
+        gap = p - transform(T, board)
+        epipolar = epipolar_distances(rig, seen.uv[good, 0], seen.uv[good, 1])
+        T_found, cov_rig = fit_rigid(body, p), np.array(rig.cov)
+        if motion is not None:
+            # A motion between the exposures has the effect of another position of the right camera for this one pair.
+            cov_rig[-6:, -6:] += motion.seen_from(inverse(rig.T_left_right) @ T_found, found.mean(axis=0))
+        row = (
+            float(shot),
+            float(np.sqrt((epipolar**2).mean())),
+            float(np.sqrt((gap**2).sum(axis=1).mean())),
+            fit_scale(board, p),
+            float(len(good)),
+            *_normalised(transform(T_found, body), p, cov_p, by_rig, cov_rig),
+        )
+        rows.append(row)
     return PairErrors(*np.array(rows, dtype=np.float64).reshape(-1, 1 + len(_FIELDS)).T)
 
 
@@ -94,43 +119,6 @@ def middles(rig: StereoRig, body: Array, seen: Correspondences, disc_radius_m: f
         bias = [disc_bias(camera, T, points, disc_radius_m) for camera, T in zip(rig.cameras, Ts, strict=True)]
         centres = replace(seen, uv=seen.uv - np.stack(bias, axis=1))
     return centres
-
-
-def _pair_error(
-    rig: StereoRig,
-    drawing: Array,
-    estimated: Array,
-    seen: Correspondences,
-    motion: ExposureMotion | None,
-    disc_radius_m: float,
-) -> tuple[float, ...] | None:
-    """Return one shot's metrics in the order of _FIELDS; None where it has too few points."""
-    seen = Correspondences(seen.ids[seen.paired], seen.uv[seen.paired], seen.cov_uv[seen.paired])
-    if disc_radius_m > 0:
-        seen = middles(rig, estimated, seen, disc_radius_m)
-    cov = seen.cov_uv + max(rig.sigma_px, LEAST_SIGMA_PX) ** 2 * np.eye(2)
-    p, cov_p, by_rig = optimal_points(rig, seen.uv, cov)
-    good = np.flatnonzero(np.isfinite(p).all(axis=1))
-    if len(good) >= 3:
-        good = good[_without_outliers(estimated[seen.ids[good]], p[good])]
-    if len(good) < 3:
-        return None
-    board, found = drawing[seen.ids[good]], estimated[seen.ids[good]]
-    p, cov_p, by_rig = p[good], cov_p[good], by_rig[good]
-    T = fit_rigid(board, p)
-    gap = p - transform(T, board)
-    epipolar = epipolar_distances(rig, seen.uv[good, 0], seen.uv[good, 1])
-    T_found, cov_rig = fit_rigid(found, p), np.array(rig.cov)
-    if motion is not None:
-        # A motion between the exposures has the effect of another position of the right camera for this one pair.
-        cov_rig[-6:, -6:] += motion.seen_from(inverse(rig.T_left_right) @ T_found, estimated.mean(axis=0))
-    return (
-        float(np.sqrt((epipolar**2).mean())),
-        float(np.sqrt((gap**2).sum(axis=1).mean())),
-        fit_scale(board, p),
-        float(len(good)),
-        *_normalised(transform(T_found, found), p, cov_p, by_rig, cov_rig),
-    )
 
 
 def _without_outliers(body: Array, p: Array) -> NDArray[np.bool_]:
@@ -229,13 +217,8 @@ def summary(errors: PairErrors, folds: int, motion: ExposureMotion | None = None
     rms = {name: float(np.sqrt(w @ getattr(errors, name) ** 2)) for name in _FIELDS}
     return HeldOutErrors(
         folds,
-        rms["epipolar_px"],
-        rms["rigid_m"],
-        float(errors.scale.mean() - 1),
-        rms["normalised"],
-        rms["over_noise"],
-        0.0 if motion is None else motion.rms_m,
-        0.0 if motion is None else motion.rms_rad,
+        *(rms["epipolar_px"], rms["rigid_m"], float(errors.scale.mean() - 1), rms["normalised"], rms["over_noise"]),
+        *((0.0, 0.0) if motion is None else motion.rms.tolist()),
     )
 
 
@@ -337,43 +320,54 @@ def adjusted(
     return model, motion, minimise(model, state, observations, sigma_px, damping=NEAR)
 
 
+@dataclass(frozen=True, eq=False)
+class Trial(Record):
+    """One way to model cameras and board, adjusted to all pairs, with its held-out ``errors`` and their summary.
+
+    ``model`` has its tolerance and its motion as learned; ``motion`` is None where the board stood still.
+    """
+
+    model: BundleModel
+    motion: ExposureMotion | None
+    solution: BundleSolution
+    errors: PairErrors
+    heldout: HeldOutErrors
+
+
 def concluded(
     body: Body,
-    model: BundleModel,
-    solution: BundleSolution,
+    trial: Trial,
     observations: Observations,
     *,
-    errors: PairErrors,
-    heldout: HeldOutErrors,
     models: dict[str, HeldOutErrors],
     pairs: tuple[str, ...],
     pairs_found: int,
     rejected: tuple[RejectedPair, ...],
     notes: tuple[str, ...],
-    motion: ExposureMotion | None = None,
     disc_radius_m: float | None = None,
 ) -> Calibration:
-    """Put a calibration together from the drawing of a body, its model, and the adjustment; the rest as in Calibration."""
+    """Put a calibration together from the drawing of a body and the adjustment; the rest as in Calibration."""
+    model, solution, heldout = trial.model, trial.solution, trial.heldout
     rig, state = scaled(rig_of(solution), heldout), solution.state
     found = model.body(state.shape)[: len(body.points)]
     found = transform(fit_rigid(found, body.points), found)
+    deviation_m = float(np.sqrt(((found - body.points) ** 2).sum(axis=1).mean()))
+    epipolar_px = residual_epipolar_rms(rig, of_middles(model, state, observations))
+    notes = (*notes, *unfinished(solution))
+    motion = None if trial.motion is None else trial.motion.scaled(heldout.normalised_rms)
     calibration = Calibration(
-        rig,
-        replace(body, points=found),
-        float(np.sqrt(((found - body.points) ** 2).sum(axis=1).mean())),
-        pairs,
-        pairs_found,
-        observations,
-        solution,
-        residual_epipolar_rms(rig, of_middles(model, state, observations)),
-        heldout,
-        errors,
-        models,
-        rejected,
-        (*notes, *unfinished(solution)),
-        (),
-        motion,
-        disc_radius_m,
+        *(
+            rig,
+            replace(body, points=found),
+            deviation_m,
+            pairs,
+            pairs_found,
+            observations,
+            solution,
+            epipolar_px,
+            heldout,
+        ),
+        *(trial.errors, models, rejected, notes, (), motion, disc_radius_m),
     )
     return replace(calibration, weaknesses=(*weaknesses(calibration), *_misfits(calibration)))
 

@@ -9,7 +9,7 @@ moved far pulls less on the relative pose of the cameras, and none on what is in
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,44 +31,43 @@ class ExposureMotion(Record):
     """How boards move between the exposures: the motion's scale, and how each of S pairs departs from it.
 
     Attributes:
-        scale_m: scale of the translation of the board's middle along each axis, m.
-        scale_rad: scale of the rotation about each axis, rad.
+        scales: (2,) scale of the translation of the board's middle along each axis, m, and of the rotation about each, rad.
         weights: (S,) by how much each pair's variance is smaller than the scale's square: 1 usual, near 0 moved far.
-        rms_m: root mean square of the translation along an axis over all pairs, m: the prediction for a new pair.
-        rms_rad: the same of the rotation about an axis, rad.
+        rms: (2,) root mean square of both over all pairs, m and rad: the prediction for a new pair.
     """
 
-    scale_m: float
-    scale_rad: float
+    scales: Array
     weights: Array
-    rms_m: float
-    rms_rad: float
+    rms: Array
 
     @staticmethod
     def guessed(points: Array, count: int) -> ExposureMotion:
         """Return the motion to begin with for a board of points (M, 3), m, in ``count`` pairs."""
-        diagonal = float(np.linalg.norm(np.ptp(points, axis=0)))
-        translation, rotation = START_SHARE * diagonal, 2 * START_SHARE
-        return ExposureMotion(translation, rotation, np.ones(count), translation, rotation)
+        scales = START_SHARE * np.array([np.linalg.norm(np.ptp(points, axis=0)), 2.0])
+        return ExposureMotion(scales, np.ones(count), scales)
+
+    @property
+    def rms_m(self) -> float:
+        """Root mean square of the translation along an axis, m."""
+        return float(self.rms[0])
 
     @property
     def sigmas(self) -> Array:
         """(S, 6) standard deviation of every pair's motion, as a model of bundle adjustment takes it."""
-        return np.asarray(np.repeat([self.scale_m, self.scale_rad], 3) / np.sqrt(self.weights)[:, None])
+        return np.asarray(np.repeat(self.scales, 3) / np.sqrt(self.weights)[:, None])
 
     @property
     def variance(self) -> Array:
         """(6,) variance of a new pair's motion."""
-        return np.repeat([self.rms_m**2, self.rms_rad**2], 3)
+        return np.repeat(self.rms**2, 3)
 
     def shots(self, rows: NDArray[np.intp]) -> ExposureMotion:
         """Return the motion of some of the pairs only."""
-        return ExposureMotion(self.scale_m, self.scale_rad, self.weights[rows], self.rms_m, self.rms_rad)
+        return replace(self, weights=self.weights[rows])
 
     def scaled(self, factor: float) -> ExposureMotion:
         """Return the motion with every standard deviation multiplied."""
-        translation, rotation = factor * self.scale_m, factor * self.scale_rad
-        return ExposureMotion(translation, rotation, self.weights, factor * self.rms_m, factor * self.rms_rad)
+        return replace(self, scales=factor * self.scales, rms=factor * self.rms)
 
     def seen_from(self, T_camera_board: Array, middle: Array) -> Array:
         """Return the (6, 6) covariance of a new pair's motion as a tangent [translation; rotation] in a camera's frame.
@@ -84,14 +83,10 @@ class ExposureMotion(Record):
     def updated(self, solution: BundleSolution) -> tuple[ExposureMotion, float]:
         """Learn from an adjustment under this motion: the better motion, and how many freedoms the pairs' motions took."""
         estimate, unsure = solution.state.motions**2, np.diagonal(solution.cov_motions, axis1=1, axis2=2)
-        scales = np.array([self.scale_m, self.scale_rad])
-        q = ((estimate + unsure) / np.repeat(scales, 3) ** 2).sum(axis=1)
+        q = ((estimate + unsure) / np.repeat(self.scales, 3) ** 2).sum(axis=1)
         weights = (TAIL + 6) / (TAIL + q)
         freed = 3 * len(q) - (unsure / self.sigmas**2).reshape(-1, 2, 3).sum(axis=(0, 2))
         moved = (weights[:, None, None] * estimate.reshape(-1, 2, 3)).sum(axis=(0, 2))
-        scale = np.sqrt(moved / np.maximum(freed, 1e-3))
+        scales = np.maximum(np.sqrt(moved / np.maximum(freed, 1e-3)), _LEAST)
         rms = np.sqrt((estimate + unsure).reshape(-1, 2, 3).mean(axis=(0, 2)))
-        motion = ExposureMotion(
-            max(float(scale[0]), _LEAST), max(float(scale[1]), _LEAST), weights, float(rms[0]), float(rms[1])
-        )
-        return motion, float(freed.sum())
+        return ExposureMotion(scales, weights, rms), float(freed.sum())

@@ -97,7 +97,7 @@ def screen(
     state, sigma = replace(start, Ts_left_body=start.Ts_left_body[kept]), sigma_px
     for k in range(_ROUNDS):
         rows = good & np.isin(observations.shot, kept)
-        now = _renumbered(observations, rows, kept)
+        now = observations.select(good).shots(kept)
         damping = NEAR if k else DAMPING
         solution = minimise(
             _of_shots(model, kept), state, now, sigma, damping=damping, least_decrease=_ROUGHLY, covariance=False
@@ -119,16 +119,15 @@ def screen(
         kept, sigma = left, new_sigma
         if done:
             break
-    final = _renumbered(observations, good & np.isin(observations.shot, kept), kept)
+    final = observations.select(good).shots(kept)
     notes = []
     for j in kept:
         mine = observations.shot == j
         if lost := int((mine & ~good).sum()):
             which = " of both images" if len(set(observations.camera[mine])) > 1 else ""
             notes.append(f"{names[j]}: {lost} of {mine.sum()} points{which} {_DROPPED}")
-    unscreened = _renumbered(observations, np.isin(observations.shot, kept), kept)
     solution = minimise(_of_shots(model, kept), state, final, sigma, damping=NEAR)
-    return Screened(final, unscreened, kept, solution, tuple(rejected), tuple(notes))
+    return Screened(final, observations.shots(kept), kept, solution, tuple(rejected), tuple(notes))
 
 
 def merged_notes(notes: Sequence[str]) -> list[str]:
@@ -159,14 +158,6 @@ def _far_moved(model: BundleModel, kept: NDArray[np.int64], solution: BundleSolu
                 "usual: wrong corners, or a board that moved between the two images"
             )
     return bad
-
-
-def _renumbered(observations: Observations, rows: NDArray[np.bool_], kept: NDArray[np.int64]) -> Observations:
-    """Return chosen rows of the kept shots, shots renumbered 0.. in the order of ``kept``."""
-    chosen = observations.select(rows)
-    return Observations(
-        np.searchsorted(kept, chosen.shot), chosen.camera, chosen.point, chosen.uv, chosen.cov_uv, len(kept)
-    )
 
 
 def _whitened(solution: BundleSolution, observations: Observations) -> Array:

@@ -70,18 +70,19 @@ def _apart(a: Array, b: Array, scale_m: float = 1.0) -> Array:
     return np.asarray(np.hypot(ways / scale_m, np.arccos(np.clip(cosine, -1, 1))))
 
 
-def relative_poses(left: list[list[Array]], right: list[list[Array]], scale_m: float) -> list[Array]:
+def relative_poses(left: list[list[Array]], right: list[list[Array]]) -> list[Array]:
     """Return the relative poses of two cameras that most shots agree on.
 
     Args:
         left: per shot, candidate poses T_left_body.
         right: per shot, candidate poses T_right_body.
-        scale_m: typical distance of the body, m: makes rotations and translations comparable.
 
     Returns:
         A few different T_left_right (4, 4), the one with the widest agreement first; none where no shot has candidates
         in both cameras.
     """
+    # The usual distance of the body makes rotations and translations comparable.
+    scale_m = float(np.median([T[2, 3] for views in (*left, *right) for T in views] or [1.0]))
     each = [[Tl @ inverse(Tr) for Tl in ls for Tr in rs] for ls, rs in zip(left, right, strict=True)]
     each = [of_shot for of_shot in each if of_shot]
     if not each:
@@ -114,21 +115,21 @@ def _agreeing_poses(left: list[list[Array]], right: list[list[Array]], T_left_ri
     return chosen
 
 
+def _candidates(points: Array, camera: Camera, observations: Observations, side: int) -> list[list[Array]]:
+    """Return per shot the poses T_camera_body that one camera's detections allow."""
+    return [
+        [T for T, _ in body_poses(points[observations.point[rows]], camera, observations.uv[rows])]
+        for rows in _views(observations, side)
+    ]
+
+
 def _assemble(points: Array, cameras: tuple[Camera, Camera], observations: Observations) -> BundleState | None:
     """Build a state from two cameras: poses of all shots and the relative pose; None where a shot has no pose."""
-    candidates: list[list[list[Array]]] = []
-    for side, camera in enumerate(cameras):
-        candidates.append(
-            [
-                [T for T, _ in body_poses(points[observations.point[rows]], camera, observations.uv[rows])]
-                for rows in _views(observations, side)
-            ]
-        )
-    depths = [T[2, 3] for views in candidates for view in views for T in view]
-    hypotheses = relative_poses(candidates[0], candidates[1], float(np.median(depths))) if depths else []
+    left, right = (_candidates(points, camera, observations, side) for side, camera in enumerate(cameras))
+    hypotheses = relative_poses(left, right)
     if not hypotheses:
         return None
-    poses = _agreeing_poses(candidates[0], candidates[1], hypotheses[0])
+    poses = _agreeing_poses(left, right, hypotheses[0])
     return None if poses is None else BundleState(cameras, hypotheses[0], np.stack(poses), np.zeros(0))
 
 
@@ -154,22 +155,15 @@ def agreed_symmetries(
     Returns:
         Shot -> the permutation that sorts its right detections into the left's order.
     """
-    candidates: list[list[list[list[Array]]]] = []  # by camera, order and shot
-    for side, orders in enumerate(((), symmetries)):
-        camera = pinhole(sizes[side], _focal_candidates(points, sizes[side], observations, side, model)[0], model)
-        candidates.append(
-            [
-                [
-                    [T for T, _ in body_poses(points[order[observations.point[rows]]], camera, observations.uv[rows])]
-                    for rows in _views(observations, side)
-                ]
-                for order in (np.arange(len(points)), *orders)
-            ]
-        )
-    left, right = candidates[0][0], candidates[1]
-    depths = [T[2, 3] for views in left for T in views]
-    every = [[T for views in shot for T in views] for shot in zip(*right, strict=True)]
-    hypotheses = relative_poses(left, every, float(np.median(depths))) if depths else []
+    cameras = [
+        pinhole(sizes[side], _focal_candidates(points, sizes[side], observations, side, model)[0], model)
+        for side in (0, 1)
+    ]
+    left = _candidates(points, cameras[0], observations, 0)
+    right = [  # by order
+        _candidates(points[order], cameras[1], observations, 1) for order in (np.arange(len(points)), *symmetries)
+    ]
+    hypotheses = relative_poses(left, [[T for views in shot for T in views] for shot in zip(*right, strict=True)])
     found: dict[int, Ids] = {}
     for shot, ls in enumerate(left if hypotheses else []):
         gaps = [

@@ -183,7 +183,7 @@ def _moved(calibration: Calibration, motion: ExposureMotion) -> str | None:
         return None
     return (
         f"the board moved between the two exposures of a pair, by {1e3 * motion.rms_m:.2g} mm and "
-        f"{1e3 * motion.rms_rad:.2g} mrad RMS along and about each axis ({way_px:.2g} px{most}): the cameras are not "
+        f"{1e3 * motion.rms[1]:.2g} mrad RMS along and about each axis ({way_px:.2g} px{most}): the cameras are not "
         f"synchronised. The rig's noise of {calibration.rig.sigma_px:.2g} px allows for a body that moves like that, the "
         f"corners alone have {calibration.solution.sigma_px:.2g} px: hold still what is measured, or trigger both cameras "
         f"together.{_hint(calibration)}"

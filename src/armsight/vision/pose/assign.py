@@ -6,6 +6,8 @@ that explains most detections takes them; what is left may be another body.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,6 +18,7 @@ from armsight.vision.detections import SeenShot
 from armsight.vision.match import join
 from armsight.vision.pose.pnp import Candidate, agreeing, consensus_poses
 from armsight.vision.pose.posefit import PixelObservations, fit_pose
+from armsight.vision.rig import StereoRig
 
 #: Fewest detections, both cameras together, that make a body: where names settle it, and where they do not.
 LEAST_DETECTIONS, LEAST_AMBIGUOUS = 4, 6
@@ -26,13 +29,16 @@ def plain(shot: SeenShot) -> Correspondences | None:
     """Return a shot's correspondences by name, or None where a name occurs twice in one image."""
     if any(len(np.unique(ids)) < len(ids) for ids in shot.ids):
         return None
-    return join(*(_detections(ids, uv) for ids, uv in zip(shot.ids, shot.uv, strict=True)))
+    return joined(shot, [np.arange(len(ids)) for ids in shot.ids])
 
 
-def _detections(ids: Ids, uv: Array) -> Detections:
-    """Sort named pixel positions into detections whose covariance is unknown."""
-    order = np.argsort(ids)
-    return Detections(ids[order], uv[order], np.zeros((len(ids), 2, 2)))
+def joined(shot: SeenShot, rows: Sequence[Ids]) -> Correspondences:
+    """Return some of a shot's detections, rows of each camera that name a point once; their covariance is unknown."""
+    sides = []
+    for ids, uv, some in zip(shot.ids, shot.uv, rows, strict=True):
+        order = some[np.argsort(ids[some])]
+        sides.append(Detections(ids[order], uv[order], np.zeros((len(order), 2, 2))))
+    return join(*sides)
 
 
 def candidates(
@@ -44,59 +50,45 @@ def candidates(
 
 
 def instances(
-    points: Array,
-    cameras: tuple[Camera, Camera],
-    T_left_right: Array,
-    shot: SeenShot,
-    found: tuple[list[Candidate], list[Candidate]],
+    points: Array, rig: StereoRig, shot: SeenShot, found: tuple[list[Candidate], list[Candidate]] | None = None
 ) -> list[tuple[Array, Correspondences]]:
     """Find the bodies in one shot.
 
     Args:
         points: (M, 3) points of the body, m.
-        cameras: left and right.
-        T_left_right: (4, 4) their relative pose.
+        rig: the cameras and their relative pose.
         shot: the detections of both cameras.
-        found: the poses that each camera alone allows, from :func:`candidates`.
+        found: what :func:`candidates` returns, where it is known.
 
     Returns:
         T_left_body (4, 4) and the correspondences of every body, the one with most detections first; no detection is
         used twice.
     """
-    starts = [c.T_camera_body for c in found[0]] + [T_left_right @ c.T_camera_body for c in found[1]]
-    poses = [_polished(points, cameras, T_left_right, shot, T) for T in starts]
-    free = tuple(np.ones(len(ids), bool) for ids in shot.ids)
+    left, right = candidates(points, rig.cameras, shot) if found is None else found
+    starts = [c.T_camera_body for c in left] + [rig.T_left_right @ c.T_camera_body for c in right]
+    poses = [T for start in starts if (T := _polished(points, rig, shot, start)) is not None]
+    free = [np.ones(len(ids), bool) for ids in shot.ids]
     least = LEAST_AMBIGUOUS if plain(shot) is None else LEAST_DETECTIONS
     bodies: list[tuple[Array, Correspondences]] = []
-    while True:
-        best, best_rows, best_key = None, None, (0, 0.0)
-        for T in poses:
-            if T is None:
-                continue
-            rows, cost = _agreeing(points, cameras, T_left_right, shot, T, free)
-            key = (sum(len(r) for r in rows), -cost)
-            if key > best_key:
-                best, best_rows, best_key = T, rows, key
-        if best is None or best_rows is None or best_key[0] < least:
-            return bodies
-        seen = join(*(_detections(shot.ids[i][r], shot.uv[i][r]) for i, r in enumerate(best_rows)))
-        bodies.append((best, seen))
-        for side, taken in enumerate(best_rows):
+    while poses:
+        agreed = [_agreeing(points, rig, shot, T, free) for T in poses]
+        best = max(range(len(poses)), key=lambda k: (sum(map(len, agreed[k][0])), -agreed[k][1]))
+        rows = agreed[best][0]
+        if sum(map(len, rows)) < least:
+            break
+        bodies.append((poses[best], joined(shot, rows)))
+        for side, taken in enumerate(rows):
             free[side][taken] = False
+    return bodies
 
 
 def _agreeing(
-    points: Array,
-    cameras: tuple[Camera, Camera],
-    T_left_right: Array,
-    shot: SeenShot,
-    T_left_body: Array,
-    free: tuple[NDArray[np.bool_], ...],
+    points: Array, rig: StereoRig, shot: SeenShot, T_left_body: Array, free: Sequence[NDArray[np.bool_]]
 ) -> tuple[list[Ids], float]:
     """Return per camera the free detections that agree with a pose, and their summed squared distance, px^2."""
     rows, cost = [], 0.0
-    for side, camera in enumerate(cameras):
-        T = T_left_body if side == 0 else inverse(T_left_right) @ T_left_body
+    for side, camera in enumerate(rig.cameras):
+        T = T_left_body if side == 0 else inverse(rig.T_left_right) @ T_left_body
         row, rms = agreeing(points, camera, T, shot.ids[side], shot.uv[side], free[side])
         if not np.isfinite(rms):
             return [np.zeros(0, np.int64), np.zeros(0, np.int64)], np.inf
@@ -105,17 +97,14 @@ def _agreeing(
     return rows, cost
 
 
-def _polished(
-    points: Array, cameras: tuple[Camera, Camera], T_left_right: Array, shot: SeenShot, T: Array
-) -> Array | None:
+def _polished(points: Array, rig: StereoRig, shot: SeenShot, T: Array) -> Array | None:
     """Adjust a pose to what agrees with it in both cameras, twice, for the first time only roughly."""
-    everything = tuple(np.ones(len(ids), bool) for ids in shot.ids)
     for _ in range(2):
-        rows, _ = _agreeing(points, cameras, T_left_right, shot, T, everything)
-        if sum(len(r) for r in rows) < 3:
+        rows, _ = _agreeing(points, rig, shot, T, [np.ones(len(ids), bool) for ids in shot.ids])
+        if sum(map(len, rows)) < 3:
             return None
-        seen = join(*(_detections(shot.ids[i][r], shot.uv[i][r]) for i, r in enumerate(rows)))
-        fit = fit_pose(cameras, T_left_right, points, PixelObservations.of(seen, _POLISH_SIGMA_PX), T, robust=True)
+        seen = PixelObservations.of(joined(shot, rows), _POLISH_SIGMA_PX)
+        fit = fit_pose(rig.cameras, rig.T_left_right, points, seen, T, robust=True)
         if fit is None:
             return None
         T = fit.T_left_body
