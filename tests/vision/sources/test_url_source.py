@@ -152,15 +152,24 @@ def error_of(spec):
     return str(caught.value)
 
 
-def stalling(server, films):
+def sending(server, frames=(), raw=b"", wait=False, **said):
+    """Send a header, frames and bytes; then wait until stopped, or end."""
+
     def serve(handler):
-        server.multipart(handler)
-        for frame in films["right"][:3]:
+        server.multipart(handler, **said)
+        for frame in frames:
             server.part(handler, frame)
             time.sleep(PERIOD)
-        server.stop.wait()
+        handler.wfile.write(raw)
+        if wait:
+            server.stop.wait()
 
     return serve
+
+
+def lasting(length):
+    """The head of a part of so many bytes."""
+    return f"--{BOUNDARY}\r\nContent-Length: {length}\r\n\r\n".encode()
 
 
 def garbage(server, films):
@@ -169,42 +178,6 @@ def garbage(server, films):
         rng = np.random.default_rng(1)
         while not server.stop.wait(0.01):
             handler.wfile.write(rng.bytes(2000))
-
-    return serve
-
-
-def ending(server, films):
-    def serve(handler):
-        server.multipart(handler)
-        for frame in films["right"][:3]:
-            server.part(handler, frame)
-            time.sleep(PERIOD)
-
-    return serve
-
-
-def cutting(server, films):
-    def serve(handler):
-        server.multipart(handler)
-        handler.wfile.write(f"--{BOUNDARY}\r\nContent-Length: 90000\r\n\r\n".encode() + films["right"][0])
-
-    return serve
-
-
-def huge(server, films):
-    def serve(handler):
-        server.multipart(handler)
-        handler.wfile.write(f"--{BOUNDARY}\r\nContent-Length: 99999999999\r\n\r\n".encode())
-
-    return serve
-
-
-def snapshot(server, films):
-    def serve(handler):
-        handler.send_response(200)
-        handler.send_header("Content-Type", "image/jpeg")
-        handler.end_headers()
-        handler.wfile.write(films["right"][0])
 
     return serve
 
@@ -218,31 +191,28 @@ def moved(server, films):
     return serve
 
 
-def absent(server, films):
-    return lambda handler: handler.send_error(404)
-
-
-def mute(server, films):
-    return lambda handler: server.stop.wait()
-
-
-def gibberish(server, films):
-    return lambda handler: handler.wfile.write(b"SSH-2.0-OpenSSH_9.2p1\r\n")
-
-
 @pytest.mark.parametrize(
     ("behaviour", "said"),
     [
-        (stalling, "no answer for 0.6 s"),
+        (lambda server, films: sending(server, films["right"][:3], wait=True), "no answer for 0.6 s"),
         (garbage, "no frame for 1.5 s"),
-        (ending, "the stream ended"),
-        (cutting, "the stream ended"),
-        (huge, "says a frame has 99999999999 bytes: not an MJPEG stream"),
-        (snapshot, "sends image/jpeg, expected an MJPEG stream (multipart/x-mixed-replace)"),
+        (lambda server, films: sending(server, films["right"][:3]), "the stream ended"),
+        (lambda server, films: sending(server, raw=lasting(90_000) + films["right"][0]), "the stream ended"),
+        (
+            lambda server, films: sending(server, raw=lasting(99_999_999_999)),
+            "says a frame has 99999999999 bytes: not an MJPEG stream",
+        ),
+        (
+            lambda server, films: sending(server, raw=films["right"][0], said="image/jpeg"),
+            "sends image/jpeg, expected an MJPEG stream (multipart/x-mixed-replace)",
+        ),
         (moved, "HTTP 302 Found, it points to http://elsewhere/stream"),
-        (absent, "HTTP 404 Not Found"),
-        (mute, "no answer for 0.6 s"),
-        (gibberish, "SSH-2.0-OpenSSH_9.2p1"),
+        (lambda server, films: lambda handler: handler.send_error(404), "HTTP 404 Not Found"),
+        (lambda server, films: lambda handler: server.stop.wait(), "no answer for 0.6 s"),
+        (
+            lambda server, films: lambda handler: handler.wfile.write(b"SSH-2.0-OpenSSH_9.2p1\r\n"),
+            "SSH-2.0-OpenSSH_9.2p1",
+        ),
     ],
 )
 def test_a_bad_stream_is_reported_by_its_address(server, films, behaviour, said, monkeypatch):

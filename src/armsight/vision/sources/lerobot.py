@@ -9,7 +9,7 @@ or the user does: ``lerobot:DIR,left=KEY,right=KEY``; ``episode=N`` reads one ep
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -101,7 +101,7 @@ class LeRobotDataset:
     def table(self, columns: list[str]) -> _Columns:
         """Return columns of the frames' table, in the order of the frames."""
         found: _Columns = {name: [] for name in columns}
-        for file, table in self._tables():
+        for file, table in _parquet_files(self.folder, "data"):
             cells = sum(
                 group.column(k).num_values
                 for group in (table.metadata.row_group(n) for n in range(table.num_row_groups))
@@ -120,17 +120,13 @@ class LeRobotDataset:
 
     def images(self, key: str) -> Iterator[Image | str]:
         """Yield a camera's image of every frame of the table, or why it cannot be decoded."""
-        for file, table in self._tables():
+        for file, table in _parquet_files(self.folder, "data"):
             for batch in table.iter_batches(batch_size=1, columns=[key]):
                 stored = batch.column(0)[0].as_py() or {}
                 try:
                     yield decoded(stored.get("bytes") or b"", f"{file}: {key}")
                 except InputError as error:
                     yield str(error)
-
-    def _tables(self) -> Iterator[tuple[Path, _Parquet]]:
-        """Yield the files of the frames' table, each open while it is used."""
-        yield from _parquet_files(self.folder, "data")
 
     def joints(self) -> LeRobotJoints:
         """Return the joints of all frames."""
@@ -156,9 +152,9 @@ class LeRobotDataset:
             names |= {f"{part}_index": int(row[f"{prefix}/{part}_index"]) for part in ("chunk", "file")}
             begin_s = float(row.get(f"{prefix}/from_timestamp", 0.0))
         template = str(self.info.get("video_path"))
-        if re.search(r"\{(?!\w+(:0?\d{1,2}d?)?\})", template):
-            raise InputError(f"{self.folder}: meta/info.json: video_path {template[:80]!r} is none of lerobot's")
         try:
+            if re.search(r"\{(?!\w+(:0?\d{1,2}d?)?\})", template):
+                raise ValueError
             path = self.folder / template.format(**names)
         except (KeyError, ValueError):
             raise InputError(
@@ -185,8 +181,7 @@ class LeRobotSource(Source):
 
     def __init__(self, dataset: LeRobotDataset, keys: tuple[str, str], episode: int | None) -> None:
         table = dataset.table(["timestamp", "episode_index", "frame_index"])
-        columns = (np.array(table[key]).reshape(-1) for key in ("timestamp", "episode_index", "frame_index"))
-        stamps, episodes, frames = columns
+        stamps, episodes, frames = (np.array(column).reshape(-1) for column in table.values())
         self._dataset, self._keys = dataset, keys
         self._rows = [  # row of the table, time, episode, frame
             (row, float(t), int(e), int(f))
@@ -208,7 +203,6 @@ class LeRobotSource(Source):
             raise InputError(next(iter(missing.values())))
         self._missing = missing
         self._notes = tuple(f"episode {number}: {why}: left out" for number, why in missing.items())
-        self._ended = False
         self._shots = self._read()
         self._depth = BitDepth(lambda: images_of(self._read()))
 
@@ -224,21 +218,18 @@ class LeRobotSource(Source):
 
     def read(self) -> Shot | None:
         """Return the next shot, or None at the end."""
-        shot = None if self._ended else next(self._shots, None)
+        shot = next(self._shots, None)
         return None if shot is None else self._depth.shot(shot)
 
     def close(self) -> None:
         """Close the videos."""
-        self._ended = True
-        next(self._shots, None)
+        self._shots.close()
 
-    def _read(self) -> Iterator[Shot]:
+    def _read(self) -> Generator[Shot]:
         number, views = None, tuple[_View, ...]()
         begin_s, last_s = 0.0, 0.0
         try:
             for row, t_s, episode, frame in self._rows:
-                if self._ended:
-                    return
                 if number != episode:
                     # Episodes begin at 0 each; a shot's times must rise.
                     begin_s = 0.0 if number is None else last_s + 1.0

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -23,8 +22,8 @@ from armsight.data import SIDES, Image, Shot
 from armsight.errors import InputError
 from armsight.vision.image import BitDepth, decoded, images_of
 from armsight.vision.source import Source
-from armsight.vision.sources.bag.pairing import Pairing, Stamps, pair, stamps_of
-from armsight.vision.sources.bag.reader import S_NS, Bag, BagMessage, Decoded
+from armsight.vision.sources.bag.pairing import Pairing, Stamps, pair, planned_shots, stamps_of
+from armsight.vision.sources.bag.reader import Bag, BagMessage, Decoded
 
 #: Types of messages that hold one image.
 IMAGES = ("sensor_msgs/Image", "sensor_msgs/CompressedImage", "foxglove.RawImage", "foxglove.CompressedImage")
@@ -75,15 +74,6 @@ _HELD_MB = 128
 _SAMPLED = 61  # of so many bytes one distinguishes messages of a stamp; half: 20 us an image more, double: less
 
 
-@dataclass(frozen=True)
-class _Planned:
-    """A shot to be: the message numbers of its two images, none where one has no partner."""
-
-    messages: tuple[int, ...]
-    t_s: float
-    problem: str | None
-
-
 class BagSource(Source):
     """The stereo images of a recording in the order of time; an image without a partner is a shot with a problem.
 
@@ -96,7 +86,7 @@ class BagSource(Source):
         self.topics, self._notes = topics, (*bag.notes, *pairing.notes)
         self._depth = BitDepth(lambda: images_of(self._read()))
         self._bag = bag
-        self._planned = _plan(pairing, stamps)
+        self._planned = planned_shots(pairing, stamps)
         self._shots: Iterator[Shot] = map(self._depth.shot, self._read())
 
     @property
@@ -118,11 +108,12 @@ class BagSource(Source):
         self._shots = iter(())
 
     def _read(self) -> Iterator[Shot]:
-        due = {key: k for k, planned in enumerate(self._planned) for key in enumerate(planned.messages)}
-        held: dict[tuple[int, int], BagMessage] = {}
+        whole = [tuple(enumerate(planned.messages)) if planned.problem is None else () for planned in self._planned]
+        due = {key: k for k, needed in enumerate(whole) for key in needed}
+        held: dict[tuple[int, int | None], BagMessage] = {}
         messages, passes, size = self._bag.messages(self.topics), 0, 0
-        for number, planned in enumerate(self._planned):
-            name, needed = f"{number:06d}", tuple(enumerate(planned.messages))
+        for number, (planned, needed) in enumerate(zip(self._planned, whole, strict=True)):
+            name = f"{number:06d}"
             while any(key not in held for key in needed) and passes <= number + 1:
                 message = next(messages, None)
                 if message is None:  # the recording's order is far from that of time: once more from its beginning
@@ -144,14 +135,6 @@ class BagSource(Source):
                 size -= sum(len(held[key].data) for key in needed)
                 # Kept here no longer than the reader keeps it: new memory for each image takes longer than to read it.
                 yield _shot(name, planned.t_s, [held.pop(key) for key in needed])
-
-
-def _plan(pairing: Pairing, stamps: tuple[Stamps, Stamps]) -> list[_Planned]:
-    """Return the shots in the order of time."""
-    rows = [(pairing.due_ns[0, k], _Planned((k, n), stamps[0].t_ns[k] / S_NS, None)) for k, n in pairing.pairs]
-    for (side, n), problem in pairing.alone.items():
-        rows.append((pairing.due_ns[side, n], _Planned((), stamps[side].t_ns[n] / S_NS, problem)))
-    return [planned for _, planned in sorted(rows, key=lambda row: row[0])]
 
 
 def _shot(name: str, t_s: float, pair_: Sequence[BagMessage]) -> Shot:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from armsight.data import Array
 from armsight.errors import InputError
+from armsight.vision.sources.bag.reader import S_NS
 
 _Times = NDArray[np.int64]
 #: A clock that moves by so much more or less than the recorder's has jumped, s, and as many periods; half: messages that
@@ -226,6 +227,24 @@ def _shared(left: Stamps, right: Stamps) -> Sequence[tuple[int, int]]:
         (at, by if abs(by - ours) < _JUMP_S / 2 / _NS else ours)
         for (_, by), (at, ours) in zip(left.jumps_ns, right.jumps_ns, strict=True)
     ]
+
+
+@dataclass(frozen=True)
+class Planned:
+    """A shot to be: the message numbers of its left and right image, None where one has no partner; its time, s."""
+
+    messages: tuple[int | None, int | None]
+    t_s: float
+    problem: str | None
+
+
+def planned_shots(pairing: Pairing, stamps: tuple[Stamps, Stamps]) -> list[Planned]:
+    """Return the shots in the order of time, messages without a partner included."""
+    rows = [(pairing.due_ns[0, k], Planned((k, n), stamps[0].t_ns[k] / S_NS, None)) for k, n in pairing.pairs]
+    for (side, n), problem in pairing.alone.items():
+        messages = (n, None) if side == 0 else (None, n)
+        rows.append((pairing.due_ns[side, n], Planned(messages, stamps[side].t_ns[n] / S_NS, problem)))
+    return [planned for _, planned in sorted(rows, key=lambda row: row[0])]
 
 
 def _nearest(of: _Times, among: _Times) -> NDArray[np.int64]:

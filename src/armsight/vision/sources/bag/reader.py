@@ -14,6 +14,7 @@ import sqlite3
 import struct
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -101,8 +102,21 @@ class Bag:
             return
         counts = dict.fromkeys(topics, 0)
         for topic, arrival_ns, encoding, data, decode in self._container.messages(set(topics)):
-            yield BagMessage(topic, self.topics[topic].kind, counts[topic], arrival_ns, encoding, data, decode)
+            kind = self.topics[topic].kind
+            yield BagMessage(
+                topic, kind, counts[topic], arrival_ns, encoding, data, partial(self._decoded, kind, decode)
+            )
             counts[topic] += 1
+
+    def _decoded(self, kind: str, decode: Callable[[], Decoded]) -> Decoded:
+        """Decode a message; whatever a library finds wrong with it becomes one line."""
+        try:
+            return decode()
+        except InputError:
+            raise
+        except Exception as error:  # noqa: BLE001 - a damaged message fails in many ways
+            text = " ".join(str(error).split())
+            raise InputError(f"{self.path}: a message of type {kind} cannot be decoded: {text}") from None
 
     def of_kind(self, *kinds: str) -> list[Topic]:
         """Return the topics of some types that hold messages, by name."""
@@ -200,7 +214,6 @@ class _RosFiles:
             if not file.is_dir():
                 _check_magic(self._path, file)
             with AnyReader([file], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
-                self._store = reader.typestore
                 yield reader
         except (InputError, GeneratorExit):
             raise
@@ -216,19 +229,9 @@ class _RosFiles:
             with self._opened(file) as reader:
                 connections = [each for each in reader.connections if each.topic in topics]
                 for connection, arrival_ns, data in reader.messages(connections) if connections else ():
-                    content = bytes(data)
-                    yield connection.topic, arrival_ns, encoding, content, self._decoder(content, connection.msgtype)
-
-    def _decoder(self, data: bytes, kind: str) -> Callable[[], Decoded]:
-        store = self._store
-
-        def decode() -> Decoded:
-            try:
-                return (store.deserialize_cdr if self._is_cdr else store.deserialize_ros1)(data, kind)
-            except Exception as error:  # noqa: BLE001 - as above
-                raise InputError(_undecodable(self._path, _plain(kind), error)) from None
-
-        return decode
+                    content, store = bytes(data), reader.typestore
+                    decode = store.deserialize_cdr if self._is_cdr else store.deserialize_ros1
+                    yield connection.topic, arrival_ns, encoding, content, partial(decode, content, connection.msgtype)
 
 
 def _check_magic(path: str | Path, file: Path) -> None:
@@ -241,10 +244,6 @@ def _check_magic(path: str | Path, file: Path) -> None:
             f"{path}: damaged, cut short, or not a ROS bag (File magic is invalid: it begins with {found!r}, expected is "
             f"{magic!r})"
         )
-
-
-def _undecodable(path: str | Path, kind: str, error: Exception) -> str:
-    return f"{path}: a message of type {kind} cannot be decoded: {' '.join(str(error).split())}"
 
 
 def _ros_problem(path: str | Path, error: Exception) -> str:
@@ -273,26 +272,26 @@ class _McapFiles:
     def topics(self) -> list[Topic]:
         counts: dict[tuple[str, str], int] = {}
         for file in self._files:
-            for schema, channel, _, _ in self._records(file, set(), note=True):
+            for schema, channel, _ in self._records(file, set(), note=True):
                 key = (channel.topic, _plain(schema.name if schema else channel.message_encoding))
                 counts[key] = counts.get(key, 0) + 1
         return [Topic(name, kind, count) for (name, kind), count in counts.items()]
 
     def messages(self, topics: Collection[str]) -> Iterator[_Raw]:
         for file in self._files:
-            for schema, channel, message, decoders in self._records(file, topics):
-                decode = self._decoder(schema, channel, message, decoders)
+            decoders: dict[int, Callable[[bytes], Decoded]] = {}
+            for schema, channel, message in self._records(file, topics):
+                decode = partial(_mcap_decoded, schema, channel, message.data, decoders)
                 yield channel.topic, message.log_time, channel.message_encoding, message.data, decode
 
     def _records(
         self, file: Path, topics: Collection[str], *, note: bool = False
-    ) -> Iterator[tuple[_McapRecord, _McapRecord, _McapRecord, dict[int, Callable[[bytes], Decoded]]]]:
+    ) -> Iterator[tuple[_McapRecord, _McapRecord, _McapRecord]]:
         """Yield schema, channel and message of a file's messages, all where no topics are named."""
         from mcap import records
 
         schemas: dict[int, _McapRecord] = {0: None}
         channels: dict[int, _McapRecord] = {}
-        decoders: dict[int, Callable[[bytes], Decoded]] = {}
         try:
             for record in self._unpacked(file, note=note):
                 if isinstance(record, records.Schema):
@@ -304,7 +303,7 @@ class _McapFiles:
                 elif isinstance(record, records.Message):
                     channel = channels[record.channel_id]
                     if not topics or channel.topic in topics:
-                        yield schemas[channel.schema_id], channel, record, decoders
+                        yield schemas[channel.schema_id], channel, record
         except InputError:
             raise
         except OSError as error:
@@ -339,26 +338,6 @@ class _McapFiles:
             if note:
                 self._chunks[file] = chunks
 
-    def _decoder(
-        self,
-        schema: _McapRecord,
-        channel: _McapRecord,
-        message: _McapRecord,
-        decoders: dict[int, Callable[[bytes], Decoded]],
-    ) -> Callable[[], Decoded]:
-        def decode() -> Decoded:
-            try:
-                if channel.id not in decoders:
-                    decoders[channel.id] = _mcap_decoder(schema, channel)
-                return decoders[channel.id](message.data)
-            except InputError:
-                raise
-            except Exception as error:  # noqa: BLE001 - whatever a library finds wrong with one message
-                name = schema.name if schema else channel.message_encoding
-                raise InputError(_undecodable(self._path, _plain(name), error)) from None
-
-        return decode
-
 
 def _decompressed(chunk: _McapRecord) -> _McapRecord:
     """Return a chunk decompressed; one that is larger than it says, or than any is, raises a ValueError before it is."""
@@ -377,6 +356,15 @@ def _decompressed(chunk: _McapRecord) -> _McapRecord:
     if len(data) != size:
         raise ValueError(f"a chunk that says {size} bytes and has {len(data)}, or more")
     return replace(chunk, compression="", data=data)
+
+
+def _mcap_decoded(
+    schema: _McapRecord, channel: _McapRecord, data: bytes, decoders: dict[int, Callable[[bytes], Decoded]]
+) -> Decoded:
+    """Decode a message; what decodes those of its channel is kept in ``decoders``."""
+    if channel.id not in decoders:
+        decoders[channel.id] = _mcap_decoder(schema, channel)
+    return decoders[channel.id](data)
 
 
 def _mcap_decoder(schema: _McapRecord, channel: _McapRecord) -> Callable[[bytes], Decoded]:

@@ -23,8 +23,8 @@ from armsight.vision.markers.marker import Target
 from armsight.vision.markers.tag import TagTarget
 from armsight.vision.markers.targets import Composite
 from armsight.vision.sources.bag.images import parsed, stamps_of_topics, two_topics
-from armsight.vision.sources.bag.pairing import pair
-from armsight.vision.sources.bag.reader import S_NS, Bag, BagMessage, Decoded
+from armsight.vision.sources.bag.pairing import pair, planned_shots
+from armsight.vision.sources.bag.reader import Bag, BagMessage, Decoded
 
 #: Types of messages that hold a camera's detected tags, with corners.
 TAGS = (
@@ -60,18 +60,14 @@ def read_tags(spec: str, target: Target | Body) -> tuple[list[SeenShot], tuple[s
     for message in bag.messages(topics):
         found[topics.index(message.topic)].append(_corners(message, points, unknown))
     nothing = (np.zeros(0, np.int64), np.zeros((0, 2)))
-    rows: list[tuple[int, tuple[int | None, int | None], str | None]] = []
-    rows += [(stamps[0].t_ns[k], (k, n), None) for k, n in pairing.pairs]
-    for (side, n), alone in pairing.alone.items():
-        rows.append((stamps[side].t_ns[n], (n, None) if side == 0 else (None, n), alone))
-    rows.sort(key=lambda row: row[0])
     shots = []
-    for number, (t_ns, numbers, problem) in enumerate(rows):
-        seen = [nothing if n is None else of[n] for n, of in zip(numbers, found, strict=True)]
+    for number, planned in enumerate(planned_shots(pairing, stamps)):
+        problem = planned.problem
+        seen = [nothing if n is None else of[n] for n, of in zip(planned.messages, found, strict=True)]
         (left, uv_left), (right, uv_right) = seen
         if problem is None and not len(left) and not len(right):
             problem = "no tag of the body was detected"
-        shots.append(SeenShot(f"{number:06d}", (left, right), (uv_left, uv_right), t_ns / S_NS, problem))
+        shots.append(SeenShot(f"{number:06d}", (left, right), (uv_left, uv_right), planned.t_s, problem))
     if not any(len(ids) for shot in shots for ids in shot.ids):
         raise InputError(f"{path}: no tag of body {_name(target)} is in it; it has {_listed(unknown) or 'none'}")
     notes = [*bag.notes, *pairing.notes]
