@@ -16,7 +16,6 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Sequence
 from functools import lru_cache
-from typing import Any
 
 import cv2
 import numpy as np
@@ -35,12 +34,12 @@ FAMILIES = (*APRILTAGS, *sorted(n for n in dir(cv2.aruco) if n.startswith("DICT_
 _MOST, _CORRECTED = 1024, 0.6
 
 
-def family_name(text: str) -> str:
+def family_name(text: str, known: Sequence[str] = FAMILIES) -> str:
     """Return the family that a text names, in any case, with or without ``DICT_`` or ``tag``; InputError if unknown."""
-    for name in FAMILIES:
+    for name in known:
         if text.lower() in (name.lower(), name.lower().removeprefix("dict_"), name.lower().removeprefix("tag")):
             return name
-    raise InputError(f"unknown marker family {text!r}; known are {', '.join(FAMILIES)}")
+    raise InputError(f"unknown marker family {text!r}; known are {', '.join(known)}")
 
 
 @lru_cache(maxsize=64)
@@ -102,26 +101,22 @@ def _read_quickly(image: NDArray[np.uint8], family: str, border: int) -> tuple[l
     return read, regions > len(read)
 
 
-def detect_markers(
-    image: NDArray[np.uint8], family: str, border: int = 1
-) -> tuple[Sequence[NDArray[Any]], NDArray[Any]]:
-    """Find the markers of a family in a grey image (H, W): (1, 4, 2) corners of each in OpenCV's order, (n, 1) identities.
+def detect_markers(image: NDArray[np.uint8], family: str, border: int = 1) -> tuple[Array, NDArray[np.int32]]:
+    """Find the markers of a family in a grey image (H, W): corners (n, 4, 2) in OpenCV's order, identities (n,).
 
     ``border``: width of their dark border, cells.
     """
     image = _full_range(image)
     share = round(4.0 * SIDE_MIN_PX / max(image.shape), 4)
     found, read, unread = _detector(family, share, border).detectMarkers(image)
-    corners = list(found)
     identities = [] if read is None else np.ravel(read).tolist()
+    markers = [(identity, np.reshape(quad, (4, 2))) for identity, quad in zip(identities, found, strict=True)]
     for quad in unread if _dictionary(family).markerSize >= _CODE_CELLS else ():
         if (code := _nearest_code(image, np.reshape(quad, (4, 2)), family, border)) is not None:
-            identities.append(code[0])
-            corners.append(code[1][None])
-    if not identities:
-        return (), np.zeros((0, 1), np.int32)
-    kept = _without_repeats(np.reshape(corners, (-1, 4, 2)), np.array(identities))
-    return [corners[i] for i in kept], np.array(identities, np.int32)[kept, None]
+            markers.append(code)
+    markers = _without_repeats(markers)
+    corners = np.array([quad for _, quad in markers], np.float64).reshape(-1, 4, 2)
+    return corners, np.array([identity for identity, _ in markers], np.int32)
 
 
 #: An image whose levels, but for the extreme ones of this share, span less than this is scaled to all of them; but its
@@ -207,16 +202,17 @@ def _cells_seen(image: NDArray[np.uint8], corners: NDArray[np.float32], size: in
     return np.asarray(fine.reshape(count, samples, count, samples).mean(axis=(1, 3), dtype=np.float32))
 
 
-def _without_repeats(corners: Array, identities: NDArray[Any]) -> list[int]:
-    """Return the rows (n,) of corners (n, 4, 2) that are markers of their own: one outline is found once or more."""
+def _without_repeats(found: list[tuple[int, Array]]) -> list[tuple[int, Array]]:
+    """Return identities and corners (4, 2) that are markers of their own: one outline is found once or more."""
     kept: list[int] = []
+    corners = np.array([each for _, each in found]).reshape(-1, 4, 2)
     sides = np.linalg.norm(np.diff(corners, axis=1, append=corners[:, :1]), axis=2).mean(axis=1)
     middles = corners.mean(axis=1)
     for i in np.argsort(-sides).tolist():
-        same = [k for k in kept if identities[k] == identities[i]]
+        same = [k for k in kept if found[k][0] == found[i][0]]
         if all(np.linalg.norm(middles[k] - middles[i]) > 0.5 * sides[i] for k in same):
             kept.append(i)
-    return sorted(kept)
+    return [found[i] for i in sorted(kept)]
 
 
 def find_squares(
@@ -235,14 +231,8 @@ def find_squares(
         return read
     rot90 = 2 if family in APRILTAGS else 0
     corners, identities = detect_markers(image, family, border)
-    read += [
-        (int(identity), np.roll(found.reshape(4, 2).astype(np.float64), -rot90, axis=0))
-        for identity, found in zip(identities[:, 0], corners, strict=True)
-    ]
-    return (
-        [read[k] for k in _without_repeats(np.array([c for _, c in read]), np.array([i for i, _ in read]))]
-        if read
-        else []
+    return _without_repeats(
+        read + [(int(k), np.roll(found, -rot90, axis=0)) for k, found in zip(identities, corners, strict=True)]
     )
 
 
@@ -252,23 +242,12 @@ def _find_apriltag3(image: NDArray[np.uint8], family: str) -> list[tuple[int, Ar
     share = round(4.0 * SIDE_MIN_PX / max(image.shape), 4)
     some, _, others = _detector("DICT_4X4_50", share, 1).detectMarkers(255 - image)
     tags = [read_tag(image, np.reshape(quad, (4, 2)).astype(np.float64), family) for quad in (*some, *others)]
-    found = [tag for tag in tags if tag is not None]
-    if not found:
-        return []
-    kept = _without_repeats(np.array([corners for _, corners in found]), np.array([identity for identity, _ in found]))
-    return [found[i] for i in kept]
+    return _without_repeats([tag for tag in tags if tag is not None])
 
 
 def tag_family(text: str) -> str:
     """Return the family of single tags that a text names: AprilTag 3's too; otherwise as :func:`family_name`."""
-    if name := next(
-        (name for name in LAYOUTS if text.lower() in (name.lower(), name.lower().removeprefix("tag"))), None
-    ):
-        return name
-    try:
-        return family_name(text)
-    except InputError:
-        raise InputError(f"unknown marker family {text!r}; known are {', '.join((*LAYOUTS, *FAMILIES))}") from None
+    return family_name(text, (*LAYOUTS, *FAMILIES))
 
 
 def tag_count(family: str) -> int:

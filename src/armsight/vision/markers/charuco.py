@@ -8,10 +8,8 @@ a fraction of a pixel.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import cv2
 import numpy as np
@@ -85,7 +83,7 @@ class Charuco(Record, CalibrationBoard):
         """
         seen = {name: detect_markers(image, f"{name}{sizes[-2]}") for name, sizes in _USUAL.items()}
         name = max(seen, key=lambda name: len(seen[name][0]))
-        corners, identities = np.reshape(seen[name][0], (-1, 4, 2)).astype(float), seen[name][1]
+        corners, identities = seen[name]
         if len(corners) < _NEIGHBOURS:
             return None
         count, outlined = int(identities.max()) + 1, _outlined(image, corners)
@@ -133,8 +131,8 @@ class Charuco(Record, CalibrationBoard):
 
     def _found(self, image: NDArray[np.uint8]) -> Detections:
         """Find the board with dark markers on light squares."""
-        seen, identities = detect_markers(image, self.family)
-        markers = seen, identities - self.first
+        corners, identities = detect_markers(image, self.family)
+        markers = corners, identities - self.first
         if (wrong := self._contradiction(image, *markers)) is not None:
             return Detections.none(wrong)
         layouts = [self._rough(image, *markers, legacy) for legacy in (False, True)]
@@ -151,27 +149,21 @@ class Charuco(Record, CalibrationBoard):
             return Detections.none(f"{self.body.name} was found but only {kept.sum()} of its corners fit")
         return Detections(np.flatnonzero(kept), fits.uv[kept], fits.cov_uv[kept])
 
-    def _rough(
-        self, image: NDArray[np.uint8], markers: Sequence[NDArray[Any]], identities: NDArray[Any], legacy: bool
-    ) -> Array:
+    def _rough(self, image: NDArray[np.uint8], corners: Array, identities: NDArray[np.int32], legacy: bool) -> Array:
         """Return (rows - 1, columns - 1, 2) rough corners in one of OpenCV's two layouts; NaN where not seen."""
         rough = np.full(((self.rows - 1) * (self.columns - 1), 2), np.nan)
         size = (self.columns, self.rows)
         detector = charuco_detector(size, self.square_m, self.marker_m, self.family, legacy)
-        uv, ids = None, None
-        ours = (identities.ravel() >= 0) & (identities.ravel() < len(self.codes[1]))
-        markers, identities = [m for m, own in zip(markers, ours, strict=True) if own], identities[ours]
-        if len(markers):
-            uv, ids, _, _ = detector.detectBoard(image, markerCorners=markers, markerIds=identities)
-        if ids is not None and uv is not None:
-            rough[np.ravel(ids)] = uv.reshape(-1, 2)
+        ours = (identities >= 0) & (identities < len(self.codes[1]))
+        if ours.any():
+            markers = list(corners[ours, None].astype(np.float32))
+            uv, ids, _, _ = detector.detectBoard(image, markerCorners=markers, markerIds=identities[ours, None])
+            if ids is not None and uv is not None:
+                rough[np.ravel(ids)] = uv.reshape(-1, 2)
         return rough.reshape(self.rows - 1, self.columns - 1, 2)
 
-    def _contradiction(
-        self, image: NDArray[np.uint8], markers: Sequence[NDArray[Any]], identities: NDArray[Any]
-    ) -> str | None:
+    def _contradiction(self, image: NDArray[np.uint8], corners: Array, identities: NDArray[np.int32]) -> str | None:
         """Return a message where an image's markers do not lie as the board has them, or have another side, in squares."""
-        corners = np.reshape(markers, (-1, 4, 2)).astype(float)
         outlined = _outlined(image, corners)
         sides = [self._sides(corners, outlined, identities, legacy) for legacy in (False, True)]
         off, seen_m, px = min(sides, key=lambda found: found[0])
@@ -179,14 +171,14 @@ class Charuco(Record, CalibrationBoard):
             if (first := self._other_first(corners, outlined, identities)) is not None:
                 last = first + len(self.codes[1]) - 1
                 return (
-                    f"{len(markers)} markers of {self.family} in view have the ids {first} to {last} of such a board, and "
+                    f"{len(corners)} markers of {self.family} in view have the ids {first} to {last} of such a board, and "
                     f"{self.body.name} has {self.first} to {self.codes[1][-1]}: if this is the board, give "
                     f"{replace(self, first=first).body.name}"
                 )
             if max(sides)[0] == np.inf:
                 return None  # nothing is known of one layout
             return (
-                f"{len(markers)} markers of {self.family} are in view, but not where {self.body.name} has them: check its "
+                f"{len(corners)} markers of {self.family} are in view, but not where {self.body.name} has them: check its "
                 "counts of squares (columns x rows)"
             )
         if not abs(seen_m - self.marker_m) > max(_SIDE_SHARE * seen_m, _SIDE_PX / px):
@@ -196,9 +188,9 @@ class Charuco(Record, CalibrationBoard):
             f"not of {self.marker_m * 1e3:g} mm: measure the squares and the markers (with their dark border) again"
         )
 
-    def _other_first(self, corners: Array, outlined: NDArray[np.bool_], identities: NDArray[Any]) -> int | None:
+    def _other_first(self, corners: Array, outlined: NDArray[np.bool_], identities: NDArray[np.int32]) -> int | None:
         """Return the first id with which the markers in view lie as the board has them; None where there is none."""
-        ids, count = identities.ravel() + self.first, len(self.codes[1])
+        ids, count = identities + self.first, len(self.codes[1])
         if len(ids) < _NEIGHBOURS:
             return None
         low, high = max(0, int(ids.max()) - count + 1), min(int(ids.min()), family_size(self.family) - count)
@@ -209,7 +201,7 @@ class Charuco(Record, CalibrationBoard):
         return None
 
     def _sides(
-        self, corners: Array, outlined: NDArray[np.bool_], identities: NDArray[Any], legacy: bool
+        self, corners: Array, outlined: NDArray[np.bool_], identities: NDArray[np.int32], legacy: bool
     ) -> tuple[float, float, float]:
         """Compare the markers with where one of OpenCV's layouts has them; infinite and NaN where too few are.
 
@@ -217,12 +209,12 @@ class Charuco(Record, CalibrationBoard):
         metre: medians.
         """
         layout = marker_corners((self.columns, self.rows), self.square_m, self.marker_m, self.family, legacy)
-        known = [k for k, identity in enumerate(identities.ravel()) if 0 <= identity < len(layout)]
+        known = [k for k, identity in enumerate(identities) if 0 <= identity < len(layout)]
         if len(known) < _NEIGHBOURS:
             return np.inf, np.nan, np.nan
         corners, outlined = corners[known], outlined[known]
         middles = corners.mean(axis=1)
-        board = layout[identities.ravel()[known]].mean(axis=1)
+        board = layout[identities[known]].mean(axis=1)
         found = []
         for p in board:
             apart = np.linalg.norm(board - p, axis=1)
