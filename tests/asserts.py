@@ -1,8 +1,12 @@
 """Assertions that tests share; the one finite-difference helper every Jacobian is held against."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 import numpy as np
+import pytest
+
+from armsight.errors import ArmsightError, InputError
 
 
 def numeric_jacobian(f: Callable[[np.ndarray], np.ndarray], x: np.ndarray, step: np.ndarray | float) -> np.ndarray:
@@ -42,3 +46,16 @@ def assert_rotation(R: np.ndarray, atol: float = 1e-14) -> None:
     """Hold a matrix to be orthonormal and right-handed."""
     assert np.abs(R @ R.T - np.eye(3)).max() <= atol
     assert np.linalg.det(R) > 0
+
+
+@contextmanager
+def one_line(
+    *texts: str, match: str | None = None, begins: object = "", error: type[ArmsightError] = InputError
+) -> Iterator[None]:
+    """Hold the error of a block to be one line that begins so, has some texts in it, and matches a pattern."""
+    with pytest.raises(error, match=match) as caught:
+        yield
+    said = str(caught.value)
+    assert said.startswith(str(begins))
+    assert "\n" not in said
+    assert [text for text in texts if text not in said] == [], said

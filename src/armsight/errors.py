@@ -48,15 +48,6 @@ def noted(notes: Sequence[str]) -> Iterator[None]:
         raise
 
 
-@contextmanager
-def naming(where: object) -> Iterator[None]:
-    """Put the name of a file, or of a part of it, before any InputError about its content."""
-    try:
-        yield
-    except InputError as error:
-        raise InputError(f"{where}: {error}") from None
-
-
 def nearest(name: object, known: Iterable[str]) -> str:
     """Return the known names as text: of many those that begin so or are spelt alike, else the first; how many more."""
     names, text = list(known), str(name)

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from armsight.errors import InputError
 from armsight.geometry.pose import log_se3
 from armsight.vision.rig import VERSION, CameraNoise, Shutters, StereoRig
-from asserts import assert_jacobian
+from asserts import assert_jacobian, one_line
 from strategies import CAMERAS, ordinary_rig
 
 
@@ -169,10 +169,8 @@ def test_a_missing_entry_is_named(tmp_path, key, said):
 )
 def test_a_damaged_entry_is_reported(tmp_path, changes, said):
     path = saved(tmp_path, **changes)
-    with pytest.raises(InputError, match=said) as caught:
+    with one_line(match=said, begins=path):
         StereoRig.load(path)
-    assert str(caught.value).startswith(str(path))
-    assert "\n" not in str(caught.value)
 
 
 def test_the_symmetry_asked_of_a_covariance_is_relative():

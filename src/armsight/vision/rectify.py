@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from armsight.data import Array, Image, Record, Side
+from armsight.data import SIDES, Array, Image, Record, Side
 from armsight.errors import InputError
 from armsight.geometry.pose import inverse, pose
 from armsight.vision.camera import Camera
@@ -63,39 +63,42 @@ class Rectification(Record):
             InputError: an image is not of the size its camera was calibrated at.
         """
         out = []
-        for side, camera, image in (("left", self.rig.left, left), ("right", self.rig.right, right)):
+        for side, image in zip(SIDES, (left, right), strict=True):
+            camera, _, raw_uv = self._of(side)
             if (image.shape[1], image.shape[0]) != tuple(camera.image_size_px):
                 width, height = camera.image_size_px
                 raise InputError(
                     f"{side} image: {image.shape[1]}x{image.shape[0]} px, the rig was calibrated at {width}x{height}"
                 )
-            raw_uv = np.nan_to_num(self.map_left if side == "left" else self.map_right, nan=-10.0)
             # OpenCV's cubic and Lanczos kernels displace what they interpolate, by up to 0.05 and 0.015 px.
-            u, v = raw_uv[..., 0], raw_uv[..., 1]
+            u, v = np.moveaxis(np.nan_to_num(raw_uv, nan=-10.0), 2, 0)
             out.append(np.asarray(cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)))
         return out[0], out[1]
 
+    def _of(self, side: Side) -> tuple[Camera, Array, NDArray[np.float32]]:
+        """Return the camera of a side, the rotation (3, 3) to it, and its map."""
+        if side == "left":
+            return self.rig.left, self.T_left_rectleft[:3, :3], self.map_left
+        return self.rig.right, self.T_right_rectright[:3, :3], self.map_right
+
     def seen(self, side: Side) -> NDArray[np.bool_]:
         """(H, W) whether a rectified pixel lies within the raw image; disparity is defined there in the left one."""
-        camera = self.rig.left if side == "left" else self.rig.right
-        raw_uv = self.map_left if side == "left" else self.map_right
+        camera, _, raw_uv = self._of(side)
         high = np.array(camera.image_size_px) - 1
         with np.errstate(invalid="ignore"):
             return np.asarray(((raw_uv >= 0) & (raw_uv <= high)).all(axis=2))
 
     def to_rect(self, uv: Array, side: Side) -> Array:
         """Convert raw pixels (N, 2) to rectified ones (N, 2); NaN where there is none."""
-        camera = self.rig.left if side == "left" else self.rig.right
-        T = self.T_left_rectleft if side == "left" else self.T_right_rectright
-        ray = camera.unproject(uv) @ T[:3, :3]
+        camera, R, _ = self._of(side)
+        ray = camera.unproject(uv) @ R
         z = np.where(ray[:, 2] > 0, ray[:, 2], np.nan)
         return np.asarray(self.focal_px * ray[:, :2] / z[:, None] + self.principal_px)
 
     def to_raw(self, uv_rect: Array, side: Side) -> Array:
         """Convert rectified pixels (N, 2) to raw ones (N, 2); NaN where the camera sees nothing."""
-        camera = self.rig.left if side == "left" else self.rig.right
-        T = self.T_left_rectleft if side == "left" else self.T_right_rectright
-        return camera.project(_rays(uv_rect, self.focal_px, self.principal_px) @ T[:3, :3].T)
+        camera, R, _ = self._of(side)
+        return camera.project(_rays(uv_rect, self.focal_px, self.principal_px) @ R.T)
 
     def points(self, uv_rect: Array, disparity: Array) -> Array:
         """Convert pixels (N, 2) of the rectified left image and their disparities (N,) to points (N, 3), m, left frame.

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from supersampled import board, expose, paint, picture, project, view
 
-from armsight.errors import InputError
 from armsight.geometry.pose import pose
 from armsight.geometry.rotation import exp_so3
 from armsight.sim.render.optics import Optics, Sensor
@@ -18,6 +17,7 @@ from armsight.sim.render.scene import PosedBody, chessboard
 from armsight.vision.camera import Camera
 from armsight.vision.markers.aruco import cells
 from armsight.vision.markers.board import BOARDS, board_in_view, open_board
+from asserts import one_line
 
 SPECS = {
     "chessboard": "chessboard:9x6:25mm",
@@ -394,11 +394,8 @@ def test_boards_are_frozen():
     ],
 )
 def test_a_malformed_spec_says_what_is_wrong_and_what_is_right(spec, texts):
-    with pytest.raises(InputError) as error:
+    with one_line(*texts):
         open_board(spec)
-    for word in texts:
-        assert word in str(error.value)
-    assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize(("text", "metres"), [("25mm", 0.025), ("2.5cm", 0.025), ("0.025m", 0.025), ("1in", 0.0254)])

@@ -8,6 +8,7 @@ from armsight.errors import InputError
 from armsight.geometry.rotation import from_quaternion_wxyz
 from armsight.vision.markers.body_file import load_body_csv, save_body_csv
 from armsight.vision.markers.targets import MARKERS, Composite, open_body, open_target
+from asserts import one_line
 
 TAG = """
 [[markers]]
@@ -58,10 +59,8 @@ def test_csv_takes_both_headers_blank_lines_and_a_byte_order_mark(tmp_path):
     ],
 )
 def test_a_wrong_csv_names_file_and_line(tmp_path, lines, texts):
-    with pytest.raises(InputError) as error:
+    with one_line(*["ball.csv", *texts]):
         load_body_csv(written(tmp_path, "ball.csv", lines))
-    for word in ["ball.csv", *texts]:
-        assert word in str(error.value)
 
 
 def test_tags_sit_where_the_file_says(tmp_path):
@@ -120,11 +119,8 @@ def test_tags_sit_where_the_file_says(tmp_path):
     ],
 )
 def test_a_wrong_body_file_names_file_and_marker(tmp_path, text, texts):
-    with pytest.raises(InputError) as error:
+    with one_line(*["plate.toml", *texts]):
         open_target(written(tmp_path, "plate.toml", text))
-    for word in ["plate.toml", *texts]:
-        assert word in str(error.value)
-    assert "\n" not in str(error.value)
 
 
 def test_one_tag_twice_on_a_body_is_rejected(tmp_path):
@@ -144,10 +140,8 @@ def test_one_tag_twice_on_a_body_is_rejected(tmp_path):
     ],
 )
 def test_what_is_no_target_says_what_is(spec, texts):
-    with pytest.raises(InputError) as error:
+    with one_line(*texts):
         open_target(spec)
-    for word in texts:
-        assert word in str(error.value)
 
 
 class Part:

@@ -15,6 +15,7 @@ from armsight.vision.markers.board import open_board
 from armsight.vision.markers.body_file import read_body_file
 from armsight.vision.markers.discs import DiscTarget
 from armsight.vision.markers.targets import open_target, read_layout
+from asserts import one_line
 
 TRIANGLE = ((-55, 0, 0), (55, 0, 0), (0, 85, 0))
 
@@ -49,11 +50,8 @@ def written(tmp_path, positions, more="", **looks):
 def test_what_no_body_may_be_is_rejected_when_it_is_opened(tmp_path, positions, looks, texts):
     path = written(tmp_path, positions, **looks)
     for opened in (open_target, read_layout):
-        with pytest.raises(InputError) as error:
+        with one_line(*["plate.toml", *texts]):
             opened(path)
-        for word in ["plate.toml", *texts]:
-            assert word in str(error.value)
-        assert "\n" not in str(error.value)
 
 
 def test_five_thousand_discs_are_compared_with_their_neighbours_only(tmp_path):
@@ -193,11 +191,8 @@ def test_a_board_on_a_body_is_found_under_its_names(tmp_path, monkeypatch):
     ],
 )
 def test_a_board_that_cannot_be_named_on_a_body_is_rejected(tmp_path, spec, texts):
-    with pytest.raises(InputError) as error:
+    with one_line(*["board.toml", *texts]):
         open_target(boarded(tmp_path, spec))
-    for word in ["board.toml", *texts]:
-        assert word in str(error.value)
-    assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize(

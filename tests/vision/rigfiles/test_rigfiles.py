@@ -18,6 +18,7 @@ from armsight.errors import InputError
 from armsight.geometry.pose import inverse, transform
 from armsight.vision.rig import StereoRig
 from armsight.vision.rigfiles import EXPORTED, FORMATS, export_rig, import_rig
+from asserts import one_line
 from strategies import CAMERAS, ordinary_rig
 
 FILES = {
@@ -324,9 +325,8 @@ def data(*values):
 def test_other_yaml_files(tmp_path, name, text):
     for path in paths(tmp_path, name):
         path.write_text(text)
-    with pytest.raises(InputError, match=r"(left|camchain|intrinsics)\.ya?ml: .*(YAML|holds )") as caught:
+    with one_line(match=r"(left|camchain|intrinsics)\.ya?ml: .*(YAML|holds )"):
         import_rig(name, paths(tmp_path, name))
-    assert "\n" not in str(caught.value)
 
 
 # --- Kalibr ----------------------------------------------------------------------------------------------------------

@@ -24,6 +24,7 @@ from armsight.vision.sources.bag.images import decoded_image
 from armsight.vision.sources.bag.pairing import pair, stamps_of
 from armsight.vision.sources.bag.states import read_joints, read_track
 from armsight.vision.sources.bag.tags import read_tags
+from asserts import one_line
 from bag_files import (
     CONTAINERS,
     EPOCH_NS,
@@ -308,10 +309,8 @@ def test_topics_that_are_no_stereo_pair_are_named(tmp_path, change, words):
     if words is None:  # the pair is known by its names
         assert open_source(f"bag:{path}").topics == (LEFT, RIGHT)
         return
-    with pytest.raises(InputError) as error:
+    with one_line(*words):
         open_source(f"bag:{path}")
-    for word in words:
-        assert word in str(error.value)
     assert open_source(f"bag:{path},left={LEFT},right={RIGHT}") if words[0].startswith("nothing") else True
 
 
@@ -344,10 +343,8 @@ def test_a_file_that_was_cut_short_is_one_line_or_is_read_as_far_as_it_goes(tmp_
     data = file.read_bytes()
     file.write_bytes(data[: int(0.6 * len(data))])
     if container != "foxglove":  # rosbags writes MCAP as one chunk
-        with pytest.raises(InputError, match=r"index|damaged|cut short") as error:
+        with one_line(str(path), match=r"index|damaged|cut short"):
             shots(f"bag:{path}")
-        assert str(path) in str(error.value)
-        assert "\n" not in str(error.value)
         return
     found, notes = shots(f"bag:{path}")
     assert 10 < sum(shot.problem is None for shot in found) < 30
@@ -395,9 +392,8 @@ def test_what_is_no_recording_is_one_line(tmp_path, name, content, word):
     path = tmp_path / name
     if content is not None:
         path.write_bytes(content)
-    with pytest.raises(InputError, match=word) as error:
+    with one_line(match=word):
         open_source(f"bag:{path}")
-    assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize(("name", "module"), [("a.bag", "rosbags.highlevel"), ("a.mcap", "mcap.stream_reader")])

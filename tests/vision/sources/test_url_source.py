@@ -13,9 +13,10 @@ import cv2
 import numpy as np
 import pytest
 
-from armsight.errors import DeviceError, InputError
+from armsight.errors import DeviceError
 from armsight.vision.sources import open_source, url
 from armsight.vision.sources.url import MjpegStream, RtspStream, UrlSource
+from asserts import one_line
 
 pytestmark = pytest.mark.real_time
 
@@ -267,9 +268,8 @@ def test_user_and_password_are_sent_and_not_shown(server, films):
     ],
 )
 def test_addresses_that_cannot_be(rest, said):
-    with pytest.raises(InputError) as caught:
+    with one_line(said):
         open_source(f"url:{rest}")
-    assert said in str(caught.value)
 
 
 class HandFed:

@@ -8,10 +8,10 @@ along each principal axis of the covariance, and interpolated.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
 
 from armsight.data import Array, Record
 from armsight.vision.dense.method import Disparity
@@ -95,16 +95,6 @@ def _calibration(rectification: Rectification, disparity: NDArray[np.float32], m
         v, u = np.nonzero(measured[strip])
         inverse = 1 / disparity[strip][v, u].astype(np.float64)
         positions = ((v + top) / max(height - 1, 1), u / max(width - 1, 1), (inverse - low) / (high - low))
-        out[strip][v, u] = _between(share, *(np.clip(p, 0, 1) for p in positions))
-    return out
-
-
-def _between(grid: Array, *positions: Array) -> Array:
-    """Interpolate an evenly spaced grid linearly, (N,); positions are 0 to 1 along each axis."""
-    out = np.zeros(len(positions[0]))
-    cells = [np.minimum((p * (n - 1)).astype(int), n - 2) for p, n in zip(positions, grid.shape, strict=True)]
-    parts = [p * (n - 1) - c for p, n, c in zip(positions, grid.shape, cells, strict=True)]
-    for corner in product((0, 1), repeat=grid.ndim):
-        weight = np.prod([t if k else 1 - t for k, t in zip(corner, parts, strict=True)], axis=0)
-        out += weight * grid[tuple(c + k for c, k in zip(cells, corner, strict=True))]
+        cells = [p * (n - 1) for p, n in zip(positions, share.shape, strict=True)]
+        out[strip][v, u] = map_coordinates(share, cells, order=1, mode="nearest")
     return out

@@ -23,6 +23,7 @@ from armsight.data import Array, Body, Detections, Ids, Record
 from armsight.errors import InputError
 from armsight.files import read_toml, write_text
 from armsight.geometry.check import checked
+from armsight.vision.camera_file import naming
 from armsight.vision.markers.board import open_board
 from armsight.vision.markers.body_file import VERSION
 from armsight.vision.markers.marker import CalibrationBoard, Target
@@ -76,10 +77,8 @@ def load_board_file(path: str | Path) -> EstimatedBoard:
         raise InputError(f"{path}: version {version!r}; this program reads board files of version 1 to {VERSION}")
     if not isinstance(spec, str):
         raise InputError(f'{path}: board must be a spec in quotes, such as board = "chessboard:9x6:25mm"')
-    try:
+    with naming(path):
         drawing = open_board(spec)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
     drawn = drawing.body.points
     points = 1e-3 * checked(document.get("points_mm", []), drawn.shape, f"{path}: points_mm of {spec}")
     off = np.linalg.norm(points - drawn, axis=1)

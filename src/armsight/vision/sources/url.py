@@ -18,7 +18,6 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
-from typing import Protocol
 from urllib.parse import unquote, urlsplit
 
 import cv2
@@ -37,30 +36,29 @@ _MAX_FRAME = 64 << 20  # bytes; beyond it the stream is not MJPEG
 Frame = tuple[float, bytes | Image | None]
 
 
-class Stream(Protocol):
+class Stream:
     """One stream of frames; ``url`` is how messages call it, without a password."""
-
-    url: str
-
-    def frames(self) -> Iterator[Frame]:
-        """Connect, and yield time of arrival, s, and a JPEG file or an image; raise DeviceError when that ends."""
-        ...
-
-    def close(self) -> None:
-        """Make ``frames`` end soon; called from another thread."""
-        ...
-
-
-class MjpegStream:
-    """MJPEG over HTTP or HTTPS, with the user and password of the address if it has them."""
 
     def __init__(self, url: str, timeout_s: float = STALL_S) -> None:
         self.url = shown(url)
-        self._address, self._timeout_s = urlsplit(url), timeout_s
-        self._socket: socket.socket | None = None
+        self._address, self._timeout_s = url, timeout_s
         self._stop = threading.Event()
 
-    def frames(self) -> Iterator[tuple[float, bytes]]:
+    def frames(self) -> Iterator[Frame]:
+        """Connect, and yield time of arrival, s, and a JPEG file or an image; raise DeviceError when that ends."""
+        raise NotImplementedError
+
+    def close(self) -> None:
+        """Make ``frames`` end at the next frame; called from another thread."""
+        self._stop.set()
+
+
+class MjpegStream(Stream):
+    """MJPEG over HTTP or HTTPS, with the user and password of the address if it has them."""
+
+    _socket: socket.socket | None = None
+
+    def frames(self) -> Iterator[Frame]:
         """Connect, and yield time of arrival, s, and JPEG file of each part; DeviceError where it stalls or ends."""
         with self._named_errors(), contextlib.ExitStack() as stack:
             response = self._connect(stack)
@@ -79,14 +77,14 @@ class MjpegStream:
 
     def close(self) -> None:
         """Wake a thread that waits for data; ``frames`` then ends."""
-        self._stop.set()
+        super().close()
         if self._socket is not None:
             with contextlib.suppress(OSError):
                 self._socket.shutdown(socket.SHUT_RDWR)
 
     def _connect(self, stack: contextlib.ExitStack) -> http.client.HTTPResponse:
         """Ask for the stream; the stack closes what was opened."""
-        address, headers = self._address, {}
+        address, headers = urlsplit(self._address), {}
         if address.username is not None:
             login = f"{unquote(address.username)}:{unquote(address.password or '')}"
             headers["Authorization"] = "Basic " + base64.b64encode(login.encode()).decode()
@@ -133,15 +131,10 @@ class MjpegStream:
             raise DeviceError(f"{self.url}: {reason}") from None
 
 
-class RtspStream:
-    """RTSP through OpenCV's FFmpeg, over TCP."""
+class RtspStream(Stream):
+    """RTSP through OpenCV's FFmpeg, over TCP; OpenCV's capture must not be released while it grabs."""
 
-    def __init__(self, url: str, timeout_s: float = STALL_S) -> None:
-        self.url = shown(url)
-        self._address, self._timeout_s = url, timeout_s
-        self._stop = threading.Event()
-
-    def frames(self) -> Iterator[tuple[float, Image | None]]:
+    def frames(self) -> Iterator[Frame]:
         """Connect, and yield time of arrival, s, and image, None where it cannot be decoded; DeviceError at its end."""
         limit_ms = int(self._timeout_s * 1000)
         limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, limit_ms, cv2.CAP_PROP_READ_TIMEOUT_MSEC, limit_ms]
@@ -160,10 +153,6 @@ class RtspStream:
                 yield t_s, image if ok else None
         finally:
             capture.release()
-
-    def close(self) -> None:
-        """End ``frames`` at the next frame: OpenCV's capture must not be released while it grabs."""
-        self._stop.set()
 
 
 #: What an address begins with -> how to connect; another protocol is one line here.
