@@ -83,6 +83,15 @@ def verging_rigs(draw) -> VergingRig:
     )
 
 
+#: x (1 - 0.3 x^2) never exceeds 0.703 at x = 1.054: a pixel further out than that belongs to no ray.
+FOLDING = Camera(SIZE, "brown4", np.array([500.0, 500, 640, 360]), np.array([-0.3, 0.0, 0.0, 0.0]))
+
+
+def folding_rig() -> StereoRig:
+    """Return two cameras side by side of which outer pixels have no ray."""
+    return StereoRig(FOLDING, FOLDING, pose(np.eye(3), np.array([0.1, 0, 0])), np.zeros((22, 22)), 0.1)
+
+
 def ordinary_rig(model: str = "brown5", seed: int = 0) -> StereoRig:
     """Return a rig with a full covariance, numbers that use every digit, and a provenance."""
     rng = np.random.default_rng(seed)

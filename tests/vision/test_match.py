@@ -6,10 +6,9 @@ import pytest
 
 from armsight.data import Correspondences, Detections
 from armsight.geometry.rotation import skew
-from armsight.vision.camera import Camera
 from armsight.vision.match import GATE_PX, GATE_SIGMAS, epipolar_distances, gate, join, match, renamed
 from armsight.vision.rig import StereoRig
-from strategies import CAMERAS, SIZE, ordinary_rig
+from strategies import CAMERAS, folding_rig, ordinary_rig
 from views import board, body_of, both_pixels, pixels, seen, somewhere
 
 
@@ -149,11 +148,7 @@ def test_renaming_is_by_the_permutation():
 
 
 def test_pixels_without_a_ray_are_dropped_without_a_word_from_numpy():
-    # x (1 - 0.3 x^2) never exceeds 0.703: a pixel further out belongs to no ray.
-    camera = Camera(SIZE, "brown4", np.array([500.0, 500, 640, 360]), np.array([-0.3, 0.0, 0.0, 0.0]))
-    T = np.eye(4)
-    T[0, 3] = 0.1
-    rig = StereoRig(camera, camera, T, np.zeros((22, 22)), 0.1)
+    rig = folding_rig()
     far = Detections(np.arange(3), np.array([[1000.0, 360], [1010, 360], [1020, 360]]), np.zeros((3, 2, 2)))
     near = Detections(np.arange(3), np.array([[600.0, 360], [610, 360], [620, 360]]), np.zeros((3, 2, 2)))
     found = match(rig, body_of(board(3, 1)), far, near, symmetries=(np.arange(2, -1, -1),))
@@ -162,10 +157,7 @@ def test_pixels_without_a_ray_are_dropped_without_a_word_from_numpy():
 
 
 def test_flips_are_evaluated_by_what_has_a_ray():
-    camera = Camera(SIZE, "brown4", np.array([500.0, 500, 640, 360]), np.array([-0.3, 0.0, 0.0, 0.0]))
-    T = np.eye(4)
-    T[0, 3] = 0.1
-    rig = StereoRig(camera, camera, T, np.zeros((22, 22)), 0.1)
+    rig = folding_rig()
     p = np.array([[-0.1, -0.1, 1.0], [0.0, 0.0, 1.0], [0.1, 0.1, 1.0]])
     uv = both_pixels(rig, p)
     left = Detections(np.arange(3), np.concatenate([uv[:2, 0], [[1010, 360]]]), np.zeros((3, 2, 2)))

@@ -71,10 +71,10 @@ def whitened(model, state, observations, x):
 
 
 def dense_jacobian(model, state, observations):
-    """(2N, Q + 6S) Jacobian of the whitened predictions, no structure exploited."""
+    """(2N, Q + 6S), of bodies in motion (2N, Q + 12S), Jacobian of the whitened predictions, no structure exploited."""
     W = whiteners(observations, SIGMA_PX)
     _, J_shared, J_pose = predict(model, state, observations)
-    by_pose = np.zeros((*J_pose.shape[:2], observations.shot_count, 6))
+    by_pose = np.zeros((*J_pose.shape[:2], observations.shot_count, J_pose.shape[2]))
     by_pose[np.arange(len(J_pose)), :, observations.shot] = W @ J_pose
     n = 2 * len(J_pose)
     return np.concatenate([(W @ J_shared).reshape(n, -1), by_pose.reshape(n, -1)], axis=1)
@@ -239,12 +239,7 @@ def test_minimum_and_covariance_with_motions_are_those_of_the_dense_problem():
     solution = minimise(model, start, observations, SIGMA_PX, robust=False)
     assert solution.converged
     state, q = solution.state, size(model, truth)
-    W = whiteners(observations, SIGMA_PX)
-    _, J_shared, J_shot = predict(model, state, observations)
-    by_shot = np.zeros((*J_shot.shape[:2], 5, 12))
-    by_shot[np.arange(len(J_shot)), :, observations.shot] = W @ J_shot
-    n = 2 * len(J_shot)
-    J = np.concatenate([(W @ J_shared).reshape(n, -1), by_shot.reshape(n, -1)], axis=1)
+    W, J = whiteners(observations, SIGMA_PX), dense_jacobian(model, state, observations)
     own = q + (12 * np.arange(5)[:, None] + np.arange(6, 12)).ravel()
     prior = np.zeros((30, J.shape[1]))
     prior[np.arange(30), own] = 1 / model.motion_sigmas.ravel()

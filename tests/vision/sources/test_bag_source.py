@@ -1,6 +1,8 @@
 """Recordings of ROS and Foxglove, written by rosbags and mcap, read back as shots, rig, tags, joints and poses."""
 
+import struct
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -54,6 +56,12 @@ def images(count=4, late_ns=1_000_000, shape=(12, 16)):
     ]
 
 
+def both(image, **options):
+    """One image on both topics, two times."""
+    content = image if isinstance(image, Pixels) else Pixels(image)
+    return [Sent(t, EPOCH_NS + k, content, options=options) for k in (0, STEP_NS) for t in (LEFT, RIGHT)]
+
+
 def shots(spec):
     source, found = open_source(spec), []
     while (shot := source.read()) is not None:
@@ -94,31 +102,16 @@ def test_compressed_images_come_with_the_bytes_of_the_camera(tmp_path, container
 def test_ros_encodings_become_grey_or_bgr(tmp_path):
     rgb = np.random.default_rng(0).integers(0, 255, (4, 6, 3), np.uint8)
     deep = np.arange(24, dtype=np.uint16).reshape(4, 6) * 900
-    sent = [Sent(t, EPOCH_NS, Pixels(rgb), options={"encoding": "rgb8"}) for t in (LEFT, RIGHT)]
-    sent += [Sent(t, EPOCH_NS + STEP_NS, Pixels(rgb), options={"encoding": "rgb8"}) for t in (LEFT, RIGHT)]
-    found, _ = shots(f"bag:{write_bag(tmp_path / 'a', 'ros1', sent)}")
+    found, _ = shots(f"bag:{write_bag(tmp_path / 'a', 'ros1', both(rgb, encoding='rgb8'))}")
     np.testing.assert_array_equal(found[0].left, rgb[..., ::-1])
-    sent = [Sent(t, EPOCH_NS + k * STEP_NS, Pixels(deep)) for k in range(2) for t in (LEFT, RIGHT)]
-    found, _ = shots(f"bag:{write_bag(tmp_path / 'b', 'mcap', sent)}")
+    found, _ = shots(f"bag:{write_bag(tmp_path / 'b', 'mcap', both(deep))}")
     np.testing.assert_array_equal(found[1].right, deep)
-    dark_first = [deep // 300, deep // 300, deep // 6, deep // 6]  # 12 bits; by themselves the first would be 10
-    sent = [Sent(t, EPOCH_NS + k // 2 * STEP_NS, Pixels(dark_first[k])) for k, t in enumerate([LEFT, RIGHT] * 2)]
-    found, notes = shots(f"bag:{write_bag(tmp_path / 'd', 'ros1', sent)}")
-    np.testing.assert_array_equal(found[0].right, dark_first[1] << 4)
+    dark_first = both(deep // 300)[:2] + both(deep // 6)[2:]  # 12 bits; by themselves the first would be 10
+    found, notes = shots(f"bag:{write_bag(tmp_path / 'd', 'ros1', dark_first)}")
+    np.testing.assert_array_equal(found[0].right, deep // 300 << 4)
     assert "its 16-bit images are read as 12 bits, which hold their pixels" in notes
-    sent = [
-        Sent(t, EPOCH_NS + k, Pixels(rgb), options={"encoding": "nv24"}) for k in (0, STEP_NS) for t in (LEFT, RIGHT)
-    ]
-    found, _ = shots(f"bag:{write_bag(tmp_path / 'c', 'mcap', sent)}")
+    found, _ = shots(f"bag:{write_bag(tmp_path / 'c', 'mcap', both(rgb, encoding='nv24'))}")
     assert "encoding 'nv24' is not read" in found[0].problem
-
-
-def sent_as(encoding, image):
-    return [
-        Sent(t, EPOCH_NS + k, Pixels(image), options={"encoding": encoding})
-        for k in (0, STEP_NS)
-        for t in (LEFT, RIGHT)
-    ]
 
 
 @pytest.mark.parametrize("encoding", ["nv12", "nv21"])
@@ -127,10 +120,8 @@ def test_luminance_with_half_the_colours_behind_it_is_read(tmp_path, encoding):
     planes = cv2.cvtColor(red, cv2.COLOR_BGR2YUV_I420)
     u, v = planes[8:10].reshape(4, 8), planes[10:12].reshape(4, 8)
     colours = np.dstack([u, v] if encoding == "nv12" else [v, u]).reshape(4, 16)
-    sent = sent_as(encoding, np.vstack([planes[:8], colours]))
-    path = write_bag(tmp_path / "a", "mcap", sent)
-    whole = Bag(path)
-    for message in whole.messages([LEFT]):
+    path = write_bag(tmp_path / "a", "mcap", both(np.vstack([planes[:8], colours]), encoding=encoding))
+    for message in Bag(path).messages([LEFT]):
         decoded = message.decode()
         decoded.height, decoded.step = 8, 16  # as drivers say it: the rows of the luminance
         np.testing.assert_allclose(decoded_image(message.kind, decoded)[0], red, atol=4)
@@ -139,8 +130,8 @@ def test_luminance_with_half_the_colours_behind_it_is_read(tmp_path, encoding):
 @pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
 def test_bayer_patterns_of_16_bits_are_those_of_8(tmp_path, pattern):
     raw = np.random.default_rng(1).integers(0, 255, (12, 16), np.uint8)
-    eight, _ = shots(f"bag:{write_bag(tmp_path / '8', 'ros1', sent_as(f'bayer_{pattern}8', raw))}")
-    sixteen, _ = shots(f"bag:{write_bag(tmp_path / '16', 'ros1', sent_as(f'bayer_{pattern}16', raw * np.uint16(257)))}")
+    eight, _ = shots(f"bag:{write_bag(tmp_path / '8', 'ros1', both(raw, encoding=f'bayer_{pattern}8'))}")
+    sixteen, _ = shots(f"bag:{write_bag(tmp_path / '16', 'ros1', both(raw * np.uint16(257), encoding=f'bayer_{pattern}16'))}")
     np.testing.assert_allclose(sixteen[0].left / 257, eight[0].left, atol=1)
 
 
@@ -149,17 +140,16 @@ def test_a_compressed_mosaic_is_the_image_of_the_raw_one(tmp_path, pattern, bits
     """compressed_image_transport gives imencode a mosaic, and "bayer_rggb8; png compressed " as the format."""
     dtype = np.dtype(f"u{bits // 8}")
     raw = np.random.default_rng(2).integers(0, np.iinfo(dtype).max, (12, 16), dtype)
-    plain, _ = shots(f"bag:{write_bag(tmp_path / 'raw', 'mcap', sent_as(f'bayer_{pattern}{bits}', raw))}")
+    plain, _ = shots(f"bag:{write_bag(tmp_path / 'raw', 'mcap', both(raw, encoding=f'bayer_{pattern}{bits}'))}")
     packed = Pixels(raw, f"bayer_{pattern}{bits}; png compressed ", cv2.imencode(".png", raw)[1].tobytes())
-    sent = [Sent(t, EPOCH_NS + k, packed) for k in (0, STEP_NS) for t in (LEFT, RIGHT)]
-    found, _ = shots(f"bag:{write_bag(tmp_path / 'packed', 'mcap', sent)}")
+    found, _ = shots(f"bag:{write_bag(tmp_path / 'packed', 'mcap', both(packed))}")
     np.testing.assert_array_equal(found[0].left, plain[0].left)
     assert found[0].left.shape == (12, 16, 3)
     assert found[0].encoded is None  # the file would be taken for a grey image
 
 
 def test_distances_are_said_to_be_no_picture(tmp_path):
-    found, _ = shots(f"bag:{write_bag(tmp_path / 'a', 'sqlite3', sent_as('32FC1', np.zeros((8, 8), np.float32)))}")
+    found, _ = shots(f"bag:{write_bag(tmp_path / 'a', 'sqlite3', both(np.zeros((8, 8), np.float32), encoding='32FC1'))}")
     assert found[0].problem.startswith("left image: its 32FC1 holds distances of a depth camera")
     sent = images(3)
     for each in [*sent]:
@@ -282,24 +272,22 @@ def test_pairing_is_that_of_an_exhaustive_search():
         assert found.pairs == tuple(mutual)
 
 
+def renamed(sent, left, right):
+    return [Sent(s.topic.replace("left", left).replace("right", right), s.stamp_ns, s.content) for s in sent]
+
+
+def other(topic):
+    return Sent(topic, EPOCH_NS, Pixels(np.zeros((4, 4), np.uint8)))
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
         (lambda sent: [s for s in sent if s.topic == LEFT], ["images of one camera only", LEFT]),
         (lambda sent: [Sent("/joint_states", EPOCH_NS, Joints(["a"], [0.0]))], ["holds no images", "/joint_states"]),
+        (lambda sent: sent + [other("/third/image_raw")] * 2 + [other("/fourth/image_raw")], None),
         (
-            lambda sent: (
-                sent
-                + [Sent("/third/image_raw", EPOCH_NS, Pixels(np.zeros((4, 4), np.uint8)))] * 2
-                + [Sent("/fourth/image_raw", EPOCH_NS, Pixels(np.zeros((4, 4), np.uint8)))]
-            ),
-            None,
-        ),
-        (
-            lambda sent: (
-                [Sent(s.topic.replace("left", "x").replace("right", "y"), s.stamp_ns, s.content) for s in sent]
-                + [Sent("/z/image_raw", EPOCH_NS, Pixels(np.zeros((4, 4), np.uint8)))]
-            ),
+            lambda sent: [*renamed(sent, left="x", right="y"), other("/z/image_raw")],
             ["which images are left and right"],
         ),
     ],
@@ -311,7 +299,6 @@ def test_topics_that_are_no_stereo_pair_are_named(tmp_path, change, words):
         return
     with one_line(*words):
         open_source(f"bag:{path}")
-    assert open_source(f"bag:{path},left={LEFT},right={RIGHT}") if words[0].startswith("nothing") else True
 
 
 @pytest.mark.parametrize("container", CONTAINERS)
@@ -322,11 +309,9 @@ def test_a_recording_without_joints_has_none(tmp_path, container):
 
 
 def test_the_user_names_the_topics(tmp_path):
-    sent = [Sent(s.topic.replace("left", "b").replace("right", "a"), s.stamp_ns, s.content) for s in images()]
-    path = write_bag(tmp_path / "a", "mcap", sent)
-    assert (
-        open_source(f"bag:{path},left=/stereo/b/image_raw,right=/stereo/a/image_raw").topics[0] == "/stereo/b/image_raw"
-    )
+    path = write_bag(tmp_path / "a", "mcap", renamed(images(), left="b", right="a"))
+    named = open_source(f"bag:{path},left=/stereo/b/image_raw,right=/stereo/a/image_raw")
+    assert named.topics[0] == "/stereo/b/image_raw"
     for text, word in (
         ("left=/x,right=/stereo/a/image_raw", "/x is no topic"),
         ("left=/a", "name both"),
@@ -352,6 +337,8 @@ def test_a_file_that_was_cut_short_is_one_line_or_is_read_as_far_as_it_goes(tmp_
 
 
 def test_chunks_of_an_unknown_compression_are_named(tmp_path):
+    from mcap.records import Chunk
+    from mcap.stream_reader import StreamReader
     from mcap.writer import CompressionType, Writer
 
     path = tmp_path / "a.mcap"
@@ -363,13 +350,8 @@ def test_chunks_of_an_unknown_compression_are_named(tmp_path):
         writer.add_message(channel, 1, b"{}" * 100, 1)
         writer.finish()
     # a chunk's compression is a text with its length before it: of an empty one make "xz"
-    from mcap.records import Chunk
-    from mcap.stream_reader import StreamReader
-
     with path.open("rb") as file:
         chunk = next(r for r in StreamReader(file, emit_chunks=True).records if isinstance(r, Chunk))
-    import struct
-
     head = struct.pack(
         "<QQQI", chunk.message_start_time, chunk.message_end_time, chunk.uncompressed_size, chunk.uncompressed_crc
     )
@@ -405,17 +387,19 @@ def test_a_missing_package_is_one_line(tmp_path, monkeypatch, name, module):
         Bag(tmp_path / name)
 
 
-def info(camera, R, P):
-    model = {"fisheye": "equidistant", "brown8": "rational_polynomial"}.get(camera.model, "plumb_bob")
-    d = camera.distortion if camera.distortion.size != 4 or camera.model == "fisheye" else [*camera.distortion, 0.0]
-    return Info(camera.image_size_px, model, np.array(d), camera.matrix, R, P)
+def infos(rig):
+    """The camera info of both cameras."""
+    R1, R2, P1, P2, _ = rectification(rig)
+    model = "equidistant" if rig.left.model == "fisheye" else "plumb_bob"
+    return [
+        Sent(f"/stereo/{side}/camera_info", EPOCH_NS, Info(c.image_size_px, model, c.distortion, c.matrix, R, P))
+        for side, c, R, P in (("left", rig.left, R1, P1), ("right", rig.right, R2, P2))
+    ]
 
 
 def test_foxgloves_name_of_the_fisheye_model_is_read_and_written(tmp_path):
     rig = ordinary_rig("fisheye")
-    R1, R2, P1, P2, _ = rectification(rig)
-    sent = [Sent(f"/stereo/{side}/camera_info", EPOCH_NS, info(camera, R, P))
-            for side, camera, R, P in (("left", rig.left, R1, P1), ("right", rig.right, R2, P2))]  # fmt: skip
+    sent = infos(rig)
     for each in sent:
         each.content.model = "kannala_brandt"
     found = open_rig(f"bag:{write_bag(tmp_path / 'a', 'foxglove', sent)}")
@@ -427,28 +411,21 @@ def test_foxgloves_name_of_the_fisheye_model_is_read_and_written(tmp_path):
 @pytest.mark.parametrize("model", ["brown5", "fisheye"])
 def test_camera_info_of_a_stereo_pair_is_the_rig(tmp_path, container, model):
     rig = ordinary_rig(model)
-    R1, R2, P1, P2, _ = rectification(rig)
-    sent = [
-        Sent("/stereo/left/camera_info", EPOCH_NS, info(rig.left, R1, P1)),
-        Sent("/stereo/right/camera_info", EPOCH_NS, info(rig.right, R2, P2)),
-    ]
-    path = write_bag(tmp_path / "a", container, sent)
-    found = open_rig(f"bag:{path}")
+    sent = infos(rig)
+    found = open_rig(f"bag:{write_bag(tmp_path / 'a', container, sent)}")
     np.testing.assert_allclose(found.T_left_right, rig.T_left_right, atol=1e-12)
     for ours, theirs in zip(found.cameras, rig.cameras, strict=True):
         np.testing.assert_allclose(ours.parameters[: theirs.parameters.size], theirs.parameters, atol=1e-12)
-    alone = write_bag(tmp_path / "b", container, [sent[0], Sent(sent[1].topic, EPOCH_NS, info(rig.right, R1, P1))])
+    sent[1].content = infos(replace(rig, right=rig.left))[0].content
     with pytest.raises(InputError, match="no baseline"):
-        bag_rig(Bag(alone))
+        bag_rig(Bag(write_bag(tmp_path / "b", container, sent)))
 
 
 @pytest.mark.parametrize("container", ["ros1", "mcap"])
 def test_camera_info_of_a_window_of_the_sensor_is_of_its_images(tmp_path, container):
     """Its matrices are of the whole sensor, images of its window (x, y, height, width), binned."""
     rig = ordinary_rig("brown5")
-    R1, R2, P1, P2, _ = rectification(rig)
-    sent = [Sent(f"/stereo/{side}/camera_info", EPOCH_NS, info(camera, R, P))
-            for side, camera, R, P in (("left", rig.left, R1, P1), ("right", rig.right, R2, P2))]  # fmt: skip
+    sent = infos(rig)
     sent[0].content.binning, sent[0].content.roi = (2, 2), (100, 40, 400, 800)
     sent[1].content.binning = (4, 2)
     found = open_rig(f"bag:{write_bag(tmp_path / 'a', container, sent)}")
@@ -492,10 +469,7 @@ def test_joints_and_transforms_are_streams(tmp_path):
         np.testing.assert_allclose(
             read_track(bag, "flange", "base").Ts @ track.Ts, np.tile(np.eye(4), (5, 1, 1)), atol=1e-9
         )
-        with pytest.raises(
-            InputError,
-            match="no frame 'wrist'; there are base, flange, tool0".replace("'wrist'; ", "'wrist' in its transforms; "),
-        ):
+        with pytest.raises(InputError, match="no frame 'wrist' in its transforms; there are base, flange, tool0"):
             read_track(bag, "base", "wrist")
 
 
@@ -539,11 +513,8 @@ def test_recorded_tags_are_detections_in_our_order_of_corners(tmp_path):
 def test_recorded_tags_of_the_apriltag_library_are_in_our_pixels(tmp_path):
     # What pupil-apriltags 1.0.4 finds of a tag whose outline is the pixels 100 to 179 of both axes, blurred by 0.8 px.
     library = np.array([[179.857, 99.943], [100.127, 99.850], [99.798, 179.913], [179.913, 179.857]])
-    sent = [
-        Sent(f"/{side}/tags", EPOCH_NS + k * STEP_NS, Tags([(5, library)]))
-        for k in range(3)
-        for side in ("left", "right")
-    ]
+    tags = Tags([(5, library)])
+    sent = [Sent(f"/{side}/tags", EPOCH_NS + k * STEP_NS, tags) for k in range(3) for side in ("left", "right")]
     body = Body("plate", tuple(f"5.{k}" for k in range(4)), np.eye(4, 3))
     found, _ = read_tags(f"bag:{write_bag(tmp_path / 'tags', 'mcap', sent)}", body)
     edges = np.array([[99.5, 179.5], [99.5, 99.5], [179.5, 99.5], [179.5, 179.5]])  # of pixels whose centres are whole
