@@ -71,14 +71,10 @@ def test_a_table_as_a_spreadsheet_saves_it(read, tmp_path):
     assert read_detections(tmp_path / "d.csv", BODY)[0].name == "1"
 
 
-def test_a_null_byte_is_a_mistake_in_one_line(read):
+@pytest.mark.parametrize("marker", ["9\x00", "9" * 200_000], ids=["null byte", "field without end"])
+def test_no_text_of_a_marker_is_more_than_a_mistake_in_one_line(read, marker):
     with pytest.raises(InputError):
-        read(HEADER + "1,left,9\x00,1,2\n")
-
-
-def test_a_field_without_end_is_a_mistake(read):
-    with pytest.raises(InputError):
-        read(HEADER + "1,left," + "9" * 200_000 + ",1,2\n")
+        read(HEADER + f"1,left,{marker},1,2\n")
 
 
 # The intrinsics that --cameras takes.

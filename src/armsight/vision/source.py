@@ -6,10 +6,11 @@ To add a kind of source: write one file with a class that derives from :class:`S
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Generator, Iterator
 from typing import Protocol, Self
 
 from armsight.data import Shot
+from armsight.vision.image import BitDepth, images_of
 
 #: A shot that is younger by its own stamp was stamped by a live camera, s; half: a slow start passes for a recording,
 #: double: a recording that was just made passes for live.
@@ -69,3 +70,34 @@ class Source(Protocol):
     def __exit__(self, *exception: object) -> None:
         """Close it."""
         self.close()
+
+
+class PlayedSource(Source):
+    """A recording of ``count`` shots that ``shots`` reads, from the first at each call; 16-bit images have one depth."""
+
+    count: int | None = None
+    timed = True
+
+    def __init__(
+        self,
+        shots: Callable[[], Generator[Shot]],
+        count: int,
+        notes: tuple[str, ...] = (),
+        depth: BitDepth | None = None,
+    ) -> None:
+        self.count, self._notes, self._shots = count, notes, shots()
+        self._depth = depth or BitDepth(lambda: images_of(shots()))
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What was left out, or is odd, a line each."""
+        return self._notes + self._depth.notes
+
+    def read(self) -> Shot | None:
+        """Return the next shot, or None at the end."""
+        shot = next(self._shots, None)
+        return None if shot is None else self._depth.shot(shot)
+
+    def close(self) -> None:
+        """Hand out no more shots, and close what is open."""
+        self._shots.close()

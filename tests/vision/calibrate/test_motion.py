@@ -9,11 +9,11 @@ from scipy.stats import chi2
 from armsight.geometry.pose import inverse, log_se3, pose, transform
 from armsight.geometry.rotation import exp_so3
 from armsight.vision.calibrate import boards
-from armsight.vision.calibrate.boards import calibrate_boards, calibrate_recording
+from armsight.vision.calibrate.boards import calibrate_boards, calibrate_recording, rigid_board
 from armsight.vision.calibrate.heldout import pair_errors, summary
 from armsight.vision.calibrate.motion import ExposureMotion
 from armsight.vision.match import join, renamed
-from armsight.vision.pose.bundle import BundleModel, BundleState, Observations, minimise
+from armsight.vision.pose.bundle import BundleState, Observations, minimise
 from armsight.vision.pose.measure import measure_detections
 from armsight.vision.triangulate import optimal_points
 from board_views import SIZES, board_pairs, rig_and_board, rig_error
@@ -182,8 +182,7 @@ def test_learning_ends_at_the_scale_of_what_is_plainly_seen():
     true, board, Ts = rig_and_board(count=3)
     points = board.body.points
     rows = Observations.from_shots([join(p.left, p.right) for p in board_pairs(true, points, Ts)])
-    model = BundleModel(points, np.zeros((0, len(points), 3)), 1.0, True)
-    solution = minimise(model, BundleState(true.cameras, true.T_left_right, np.array(Ts), np.zeros(0)), rows, 0.1)
+    solution = minimise(rigid_board(points), BundleState(true.cameras, true.T_left_right, np.array(Ts), np.zeros(0)), rows, 0.1)
     # Student's t of four degrees of freedom, seen without noise: EM finds its scale.
     count = 4000
     inverse_variance = rng.gamma(2.0, 0.5, size=(count, 1))

@@ -7,22 +7,18 @@ from armsight.data import Array
 from armsight.errors import CalibrationError
 from armsight.geometry.pose import inverse, log_se3
 from armsight.geometry.rotation import exp_so3
-from armsight.vision.calibrate.boards import calibrate_boards
+from armsight.vision.calibrate.boards import calibrate_boards, rigid_board
 from armsight.vision.calibrate.heldout import cross_validate, folds_of, pair_errors, residual_epipolar_rms, summary
 from armsight.vision.calibrate.screen import merged_notes, noise_px, robust_sigma, screen
 from armsight.vision.calibrate.start import agreed_symmetries, pinhole, relative_poses, start_board
 from armsight.vision.calibrate.weak import coverage, require_order, weaknesses
 from armsight.vision.match import join, renamed
-from armsight.vision.pose.bundle import BundleModel, BundleState, Observations, minimise
+from armsight.vision.pose.bundle import BundleState, Observations, minimise
 from board_views import SIZES, board_pairs, rig_and_board
 
 
 def observed(pairs):
     return Observations.from_shots([join(p.left, p.right) for p in pairs])
-
-
-def flat(points):
-    return BundleModel(points, np.zeros((0, len(points), 3)), 1.0, True)
 
 
 def truth(rig, Ts):
@@ -72,7 +68,7 @@ def test_most_shots_decide_the_relative_pose():
 def test_the_noise_is_read_off_the_residuals():
     true, board, Ts = rig_and_board()
     observations = observed(board_pairs(true, board.body.points, Ts, sigma=0.2))
-    solution = minimise(flat(board.body.points), truth(true, Ts), observations, 0.2)
+    solution = minimise(rigid_board(board.body.points), truth(true, Ts), observations, 0.2)
     # 4320 residuals: sqrt(1 / 8640) is 1.1%; four times that. The median is 1.44 times as vague as the mean square.
     assert noise_px(solution, observations, 24) == pytest.approx(0.2, rel=0.045)
     assert robust_sigma(solution) == pytest.approx(0.2, rel=0.065)
@@ -83,7 +79,7 @@ def test_only_what_is_wrong_is_thrown_out():
     pairs = board_pairs(true, board.body.points, Ts)
     observations = observed(pairs)
     names = tuple(p.name for p in pairs)
-    clean = screen(flat(board.body.points), truth(true, Ts), observations, names)
+    clean = screen(rigid_board(board.body.points), truth(true, Ts), observations, names)
     assert clean.rejected == clean.notes == ()
     assert clean.kept.tolist() == list(range(len(pairs)))
     uv = np.array(observations.uv)
@@ -91,7 +87,7 @@ def test_only_what_is_wrong_is_thrown_out():
     uv[rows] += 8.0 * np.random.default_rng(0).normal(size=(len(rows), 2))
     single = int(np.flatnonzero((observations.shot == 2) & (observations.camera == 0))[11])
     uv[single] += (5.0, 0.0)
-    dirty = screen(flat(board.body.points), truth(true, Ts), replace(observations, uv=uv), names)
+    dirty = screen(rigid_board(board.body.points), truth(true, Ts), replace(observations, uv=uv), names)
     assert [r.pair for r in dirty.rejected] == ["p06"]
     assert dirty.notes == ("p02: 1 of 108 points of both images dropped as gross errors",)
     assert 6 not in dirty.kept

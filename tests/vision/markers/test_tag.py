@@ -156,7 +156,8 @@ def test_a_body_is_found_with_its_points_in_order():
 def test_plain_tags_are_read_quickly_and_only_what_is_left_is_searched_again(monkeypatch):
     painted, truth = seen(30, 2, 11)
     image, slow = expose(painted, 130, 2, np.random.default_rng(5)), []
-    monkeypatch.setattr(aruco, "detect_markers", lambda *_: slow.append(1) or ((), np.zeros((0, 1), np.int32)))
+    nothing = np.zeros((0, 4, 2)), np.zeros(0, np.int32)
+    monkeypatch.setattr(aruco, "detect_markers", lambda *_: slow.append(1) or nothing)
     found = dict(find_squares(image, "tag36h11", requested=[30, 11]))
     assert sorted(found) == [2, 11, 30]
     assert np.abs(np.concatenate([found[k] for k in (30, 2, 11)]) - truth).max() < 0.5

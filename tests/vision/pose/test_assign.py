@@ -27,10 +27,6 @@ def shot_of(rig, points, Ts, rng):
     return shot, [owner[o] for o in orders]
 
 
-def found_in(rig, points, shot):
-    return instances(points, rig, shot)
-
-
 def test_names_that_stand_once_are_plain():
     rig, points, rng = ordinary_rig(), ball(), np.random.default_rng(0)
     shot, _ = shot_of(rig, points, [somewhere(rng)], rng)
@@ -50,7 +46,7 @@ def test_bodies_take_their_own_detections_and_none_twice(model, seed):
     rig, points, rng = ordinary_rig(model), ball(), np.random.default_rng(seed)
     Ts = [somewhere(rng, middle=(x, 0.0, 0.6), spread=(0.02, 0.05, 0.05)) for x in (-0.05, 0.25)]
     shot, _ = shot_of(rig, points, Ts, rng)
-    found = found_in(rig, points, shot)
+    found = instances(points, rig, shot)
     assert len(found) == 2
     used = [set(), set()]
     taken = set()
@@ -73,7 +69,7 @@ def test_a_wrong_name_is_left_out():
     ids = np.array(shot.ids[0])
     a, b = (int(np.flatnonzero(ids == n)[0]) for n in (0, 13))  # opposite ends of the ball
     ids[[a, b]] = ids[[b, a]]
-    ((_, seen),) = found_in(rig, points, SeenShot("1", (ids, shot.ids[1]), shot.uv))
+    ((_, seen),) = instances(points, rig, SeenShot("1", (ids, shot.ids[1]), shot.uv))
     assert not seen.seen[[0, 13], 0].any()
     assert seen.seen[:, 1].all()
     assert seen.seen[1:13].all()
@@ -82,5 +78,5 @@ def test_a_wrong_name_is_left_out():
 def test_nothing_is_no_body():
     rig, points = ordinary_rig(), ball()
     nothing = SeenShot("1", (np.zeros(0, np.int64),) * 2, (np.zeros((0, 2)),) * 2)
-    assert found_in(rig, points, nothing) == []
+    assert instances(points, rig, nothing) == []
     assert plain(nothing).ids.size == 0

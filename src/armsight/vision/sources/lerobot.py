@@ -19,8 +19,8 @@ import numpy as np
 from armsight.data import SIDES, Array, Image, Record, Shot
 from armsight.errors import InputError
 from armsight.files import opened, read_json
-from armsight.vision.image import BitDepth, decoded, images_of
-from armsight.vision.source import Source
+from armsight.vision.image import decoded
+from armsight.vision.source import PlayedSource
 from armsight.vision.sources.video import Film
 
 #: Columns of a table by name.
@@ -174,10 +174,8 @@ class LeRobotDataset:
         raise InputError(f"{self.folder}: meta/episodes does not describe episode {episode}")
 
 
-class LeRobotSource(Source):
+class LeRobotSource(PlayedSource):
     """Two cameras of a dataset; a frame that cannot be decoded is a shot with a problem."""
-
-    timed = True
 
     def __init__(self, dataset: LeRobotDataset, keys: tuple[str, str], episode: int | None) -> None:
         table = dataset.table(["timestamp", "episode_index", "frame_index"])
@@ -202,28 +200,8 @@ class LeRobotSource(Source):
         if len(missing) == len(numbers):
             raise InputError(next(iter(missing.values())))
         self._missing = missing
-        self._notes = tuple(f"episode {number}: {why}: left out" for number, why in missing.items())
-        self._shots = self._read()
-        self._depth = BitDepth(lambda: images_of(self._read()))
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """What was left out, or is odd, a line each."""
-        return self._notes + self._depth.notes
-
-    @property
-    def count(self) -> int | None:
-        """How many frames there are, those of missing videos included."""
-        return len(self._rows)
-
-    def read(self) -> Shot | None:
-        """Return the next shot, or None at the end."""
-        shot = next(self._shots, None)
-        return None if shot is None else self._depth.shot(shot)
-
-    def close(self) -> None:
-        """Close the videos."""
-        self._shots.close()
+        notes = tuple(f"episode {number}: {why}: left out" for number, why in missing.items())
+        super().__init__(self._read, len(self._rows), notes)
 
     def _read(self) -> Generator[Shot]:
         number, views = None, tuple[_View, ...]()

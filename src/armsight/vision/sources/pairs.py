@@ -11,7 +11,7 @@ import glob
 import os
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import overload
@@ -22,7 +22,7 @@ from armsight.data import Image, Shot
 from armsight.errors import InputError
 from armsight.files import natural_key
 from armsight.vision.image import DEPTH_IMAGES, BitDepth, images_of, read_image
-from armsight.vision.source import Source
+from armsight.vision.source import PlayedSource
 
 #: Endings of video files, in lower case.
 VIDEOS = {".avi", ".mkv", ".mov", ".mp4", ".webm"}
@@ -67,25 +67,18 @@ def halves(file: Path) -> tuple[Image, Image]:
     return np.ascontiguousarray(image[:, : width // 2]), np.ascontiguousarray(image[:, width // 2 :])
 
 
-class StoredSource(Source):
+class StoredSource(PlayedSource):
     """A source over ``pairs`` of image files, read one by one; a part of a source has its bits, ``depth``."""
 
     def __init__(self, pairs: Sequence[StoredPair], depth: BitDepth | None = None) -> None:
         self.pairs = tuple(pairs)
         every = max(1, -(-2 * len(self.pairs) // DEPTH_IMAGES))
-        self._depth = depth or BitDepth(lambda: images_of(pair.load() for pair in self.pairs[::every]))
+        depth = depth or BitDepth(lambda: images_of(pair.load() for pair in self.pairs[::every]))
+        super().__init__(self._load, len(self.pairs), depth=depth)
         self.timed = any(pair.t_s is not None for pair in self.pairs)
-        self._rest = iter(self.pairs)
 
-    @property
-    def count(self) -> int:
-        """How many there are."""
-        return len(self.pairs)
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """What its images were taken for."""
-        return self._depth.notes
+    def _load(self) -> Generator[Shot]:
+        yield from (pair.load() for pair in self.pairs)
 
     @property
     def files(self) -> tuple[Path, ...]:
@@ -106,16 +99,7 @@ class StoredSource(Source):
 
     def __iter__(self) -> Iterator[Shot]:
         """Load all shots, each time from the first; ``read`` goes on where it was."""
-        return (self._depth.shot(pair.load()) for pair in self.pairs)
-
-    def read(self) -> Shot | None:
-        """Return the next shot, or None at the end."""
-        pair = next(self._rest, None)
-        return None if pair is None else self._depth.shot(pair.load())
-
-    def close(self) -> None:
-        """Let ``read`` return no more shots; no file is open."""
-        self._rest = iter(())
+        return map(self._depth.shot, self._load())
 
 
 class PairsSource(StoredSource):

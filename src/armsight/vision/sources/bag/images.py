@@ -11,7 +11,7 @@ says so in the format. Distances of depth cameras are no images.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from pathlib import Path
 
 import cv2
@@ -20,8 +20,8 @@ import numpy as np
 from armsight import MOST_PIXELS
 from armsight.data import SIDES, Image, Shot
 from armsight.errors import InputError
-from armsight.vision.image import BitDepth, decoded, images_of
-from armsight.vision.source import Source
+from armsight.vision.image import decoded
+from armsight.vision.source import PlayedSource
 from armsight.vision.sources.bag.pairing import Pairing, Stamps, pair, planned_shots, stamps_of
 from armsight.vision.sources.bag.reader import Bag, BagMessage, Decoded
 
@@ -74,40 +74,17 @@ _HELD_MB = 128
 _SAMPLED = 61  # of so many bytes one distinguishes messages of a stamp; half: 20 us an image more, double: less
 
 
-class BagSource(Source):
+class BagSource(PlayedSource):
     """The stereo images of a recording in the order of time; an image without a partner is a shot with a problem.
 
     ``topics``: of the left and of the right images.
     """
 
-    timed = True
-
     def __init__(self, bag: Bag, topics: tuple[str, str], pairing: Pairing, stamps: tuple[Stamps, Stamps]) -> None:
-        self.topics, self._notes = topics, (*bag.notes, *pairing.notes)
-        self._depth = BitDepth(lambda: images_of(self._read()))
-        self._bag = bag
-        self._planned = planned_shots(pairing, stamps)
-        self._shots: Iterator[Shot] = map(self._depth.shot, self._read())
+        self.topics, self._bag, self._planned = topics, bag, planned_shots(pairing, stamps)
+        super().__init__(self._read, len(self._planned), (*bag.notes, *pairing.notes))
 
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """What was left out, or is odd, a line each."""
-        return self._notes + self._depth.notes
-
-    @property
-    def count(self) -> int | None:
-        """How many shots there are, those without a partner included."""
-        return len(self._planned)
-
-    def read(self) -> Shot | None:
-        """Return the next shot, or None at the end."""
-        return next(self._shots, None)
-
-    def close(self) -> None:
-        """Hand out no more shots."""
-        self._shots = iter(())
-
-    def _read(self) -> Iterator[Shot]:
+    def _read(self) -> Generator[Shot]:
         whole = [tuple(enumerate(planned.messages)) if planned.problem is None else () for planned in self._planned]
         due = {key: k for k, needed in enumerate(whole) for key in needed}
         held: dict[tuple[int, int | None], BagMessage] = {}
