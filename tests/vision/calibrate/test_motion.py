@@ -182,7 +182,8 @@ def test_learning_ends_at_the_scale_of_what_is_plainly_seen():
     true, board, Ts = rig_and_board(count=3)
     points = board.body.points
     rows = Observations.from_shots([join(p.left, p.right) for p in board_pairs(true, points, Ts)])
-    solution = minimise(rigid_board(points), BundleState(true.cameras, true.T_left_right, np.array(Ts), np.zeros(0)), rows, 0.1)
+    start = BundleState(true.cameras, true.T_left_right, np.array(Ts), np.zeros(0))
+    solution = minimise(rigid_board(points), start, rows, 0.1)
     # Student's t of four degrees of freedom, seen without noise: EM finds its scale.
     count = 4000
     inverse_variance = rng.gamma(2.0, 0.5, size=(count, 1))

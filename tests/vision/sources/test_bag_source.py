@@ -131,7 +131,8 @@ def test_luminance_with_half_the_colours_behind_it_is_read(tmp_path, encoding):
 def test_bayer_patterns_of_16_bits_are_those_of_8(tmp_path, pattern):
     raw = np.random.default_rng(1).integers(0, 255, (12, 16), np.uint8)
     eight, _ = shots(f"bag:{write_bag(tmp_path / '8', 'ros1', both(raw, encoding=f'bayer_{pattern}8'))}")
-    sixteen, _ = shots(f"bag:{write_bag(tmp_path / '16', 'ros1', both(raw * np.uint16(257), encoding=f'bayer_{pattern}16'))}")
+    deep = both(raw * np.uint16(257), encoding=f"bayer_{pattern}16")
+    sixteen, _ = shots(f"bag:{write_bag(tmp_path / '16', 'ros1', deep)}")
     np.testing.assert_allclose(sixteen[0].left / 257, eight[0].left, atol=1)
 
 
@@ -149,7 +150,9 @@ def test_a_compressed_mosaic_is_the_image_of_the_raw_one(tmp_path, pattern, bits
 
 
 def test_distances_are_said_to_be_no_picture(tmp_path):
-    found, _ = shots(f"bag:{write_bag(tmp_path / 'a', 'sqlite3', both(np.zeros((8, 8), np.float32), encoding='32FC1'))}")
+    found, _ = shots(
+        f"bag:{write_bag(tmp_path / 'a', 'sqlite3', both(np.zeros((8, 8), np.float32), encoding='32FC1'))}"
+    )
     assert found[0].problem.startswith("left image: its 32FC1 holds distances of a depth camera")
     sent = images(3)
     for each in [*sent]:

@@ -110,7 +110,7 @@ def recorded(path, codec, kept, late=0, ticks=1, sound_s=0.0, live=False):
     """
     opened = {"format": "matroska", "options": {"live": "1"}} if live else {}
     with av.open(str(path), "w", **opened) as file:
-        stream = file.add_stream(codec, rate=30)
+        stream = file.add_stream(codec, rate=30, bit_rate=1_000_000)
         sound = file.add_stream("aac", rate=48000) if sound_s else None
         stream.height, stream.width, stream.pix_fmt = 64, 128, "yuvj420p" if codec == "mjpeg" else "yuv420p"
         stream.codec_context.time_base = Fraction(1, 30 * ticks)
@@ -226,12 +226,12 @@ def test_stamps_that_jitter_are_paired_up_to_half_a_frame_apart(tmp_path):
 @pytest.mark.parametrize("codec", ["libsvtav1", "libx264", "mpeg4", "libvpx-vp9", "mjpeg"])
 def test_what_cameras_and_datasets_write_is_read(tmp_path, codec):
     path = tmp_path / "both.mkv"
-    recorded(path, codec, range(12))
+    recorded(path, codec, range(0, 24, 2))
     found = shots(f"video:{path}")
     assert [shot.problem for shot in found] == [None] * 12
-    assert [shot.t_s for shot in found] == pytest.approx([k / 30 for k in range(12)], abs=1e-3)
+    assert [shot.t_s for shot in found] == pytest.approx([k / 15 for k in range(12)], abs=1e-3)
     greys = [[np.mean(image) for image in (shot.left, shot.right)] for shot in found]
-    np.testing.assert_allclose(greys, [[5 * k, 5 * k] for k in range(12)], atol=2.5)
+    np.testing.assert_allclose(greys, [[10 * k, 10 * k] for k in range(12)], atol=4)
 
 
 def test_a_file_that_names_others_is_no_video(film, picture, tmp_path):

@@ -109,8 +109,9 @@ def detect_markers(image: NDArray[np.uint8], family: str, border: int = 1) -> tu
     image = _full_range(image)
     share = round(4.0 * SIDE_MIN_PX / max(image.shape), 4)
     found, read, unread = _detector(family, share, border).detectMarkers(image)
-    identities = [] if read is None else np.ravel(read).tolist()
-    markers = [(identity, np.reshape(quad, (4, 2))) for identity, quad in zip(identities, found, strict=True)]
+    identities = [] if read is None else map(int, np.ravel(read))
+    quads = [np.asarray(quad, np.float64).reshape(4, 2) for quad in found]
+    markers = list(zip(identities, quads, strict=True))
     for quad in unread if _dictionary(family).markerSize >= _CODE_CELLS else ():
         if (code := _nearest_code(image, np.reshape(quad, (4, 2)), family, border)) is not None:
             markers.append(code)

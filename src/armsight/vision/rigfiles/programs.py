@@ -133,7 +133,7 @@ def _basalt_entries(documents: Sequence[Document], paths: Sequence[Path]) -> Ent
     entries = {}
     for i, (camera, size, T) in enumerate(zip(cameras, sizes, poses, strict=True)):
         kind = camera.get("camera_type")
-        plain = {"distortion": []} if kind == "pinhole" else {}
+        plain: Mapping[str, object] = {"distortion": []} if kind == "pinhole" else {}
         entries[f"cam{i}"] = {**camera, **plain, "distortion_model": kind, "resolution": size, "pose": T}
     return entries
 

@@ -230,7 +230,7 @@ def _shared(left: Stamps, right: Stamps) -> Sequence[tuple[int, int]]:
 
 
 @dataclass(frozen=True)
-class Planned:
+class PlannedShot:
     """A shot to be: the message numbers of its left and right image, None where one has no partner; its time, s."""
 
     messages: tuple[int | None, int | None]
@@ -238,12 +238,12 @@ class Planned:
     problem: str | None
 
 
-def planned_shots(pairing: Pairing, stamps: tuple[Stamps, Stamps]) -> list[Planned]:
+def planned_shots(pairing: Pairing, stamps: tuple[Stamps, Stamps]) -> list[PlannedShot]:
     """Return the shots in the order of time, messages without a partner included."""
-    rows = [(pairing.due_ns[0, k], Planned((k, n), stamps[0].t_ns[k] / S_NS, None)) for k, n in pairing.pairs]
+    rows = [(pairing.due_ns[0, k], PlannedShot((k, n), stamps[0].t_ns[k] / S_NS, None)) for k, n in pairing.pairs]
     for (side, n), problem in pairing.alone.items():
         messages = (n, None) if side == 0 else (None, n)
-        rows.append((pairing.due_ns[side, n], Planned(messages, stamps[side].t_ns[n] / S_NS, problem)))
+        rows.append((pairing.due_ns[side, n], PlannedShot(messages, stamps[side].t_ns[n] / S_NS, problem)))
     return [planned for _, planned in sorted(rows, key=lambda row: row[0])]
 
 
