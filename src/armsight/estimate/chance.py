@@ -44,6 +44,11 @@ def _log_upper_gamma(a: float, x: float) -> float:
     return front + math.log(h)
 
 
+def squares_of(left: Array, cov: Array) -> Array:
+    """Return the squared Mahalanobis distance (...,) of residuals (..., m) with covariances (..., m, m)."""
+    return np.asarray(np.einsum("...i,...i->...", left, np.linalg.solve(cov, left[..., None])[..., 0]))
+
+
 def chi_square_chance(freedom: float, square: float) -> float:
     """Return the probability that a sum of squares of ``freedom`` standard normal numbers exceeds ``square``."""
     return math.exp(_log_upper_gamma(freedom / 2, square / 2)) if square > 0.0 else 1.0

@@ -14,6 +14,7 @@ from scipy.linalg.lapack import dtrtri
 from scipy.special import chdtri
 
 from armsight.data import Array, Record
+from armsight.estimate.chance import squares_of
 from armsight.estimate.linear import Linear
 
 OPEN = 1e-13  # information about a direction, as a share of each unknown's own, below which it is open
@@ -115,11 +116,6 @@ def by_chance(squares: Array, numbers: int, chance: float, least: float = 1e-300
     """
     scale = max(float(np.median(squares)) / float(chdtri(numbers, 0.5)), least)
     return np.asarray(squares <= scale * chdtri(numbers, chance))
-
-
-def squares_of(left: Array, cov: Array) -> Array:
-    """Return the squared Mahalanobis distance (N,) of residuals (N, m) with covariances (N, m, m)."""
-    return np.asarray(np.einsum("ni,ni->n", left, np.linalg.solve(cov, left[..., None])[..., 0]))
 
 
 def log_density(left: Array, cov: Array) -> Array:

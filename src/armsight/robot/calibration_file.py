@@ -68,14 +68,8 @@ def read_calibration(path: str | Path, nominal: Arm) -> Arm:
     arm = replace(
         nominal,
         name=f"{nominal.name}_calibrated",
-        a=rows.a,
-        d=rows.d,
-        alpha=rows.alpha,
-        offset=rows.offset,
-        direction=rows.direction,
         convention="standard",
-        T_base_0=rows.T_base_0,
-        T_flange_tool=rows.T_flange_tool,
+        **rows._asdict(),
         source=f"calibration {Path(path).name}; nominal: {nominal.source}",
     )
     check_same(f"{path}", arm, links)

@@ -129,7 +129,7 @@ def test_the_estimate_is_what_dense_least_squares_gives():
     for t, estimate in rows:
         watch.take(estimate, t)
     sums, size = watch._summed(watch._stays).of(watch._size), watch._size
-    found, L, F = watch._estimated(watch._in_priors(sums).reduced(size)), watch.prior, watch._by_fault
+    found, L, F = watch._estimated(sums.by(watch._scaled[:, : size + 7]).reduced(size)), watch.prior, watch._by_fault
     wide = np.diag(np.array([0.1, 0.1, 1, 1, 1, 1, 0.1]) ** 2.0)
     L = L + 1e-9 * np.eye(size)  # the skew's prior is none
     prior = np.linalg.inv(np.block([[L @ L.T, np.zeros((size, 7))], [np.zeros((7, size)), wide]]))

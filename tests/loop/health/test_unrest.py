@@ -76,8 +76,10 @@ def test_images_seen_before_say_nothing_new():
             often.take(estimate, t_s + 3.0 * k)
             if k == 0:
                 once.take(estimate, t_s)
-        kept = [each._ended()._wholes.kept for each in (often, once)]
-    np.testing.assert_array_equal(*([each.M for each in tests] for tests in kept))
+        ended = [each.copied() for each in (often, once)]
+        for each in ended:
+            each._decide(ends=True)
+    np.testing.assert_array_equal(*([test.M for test in each._wholes.kept] for each in ended))
 
 
 def test_unrest_finds_a_variance_and_no_other():

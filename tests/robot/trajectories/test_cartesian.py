@@ -149,46 +149,6 @@ def test_bends_are_passed_at_a_steady_pace_and_lines_faster():
         waypoints(arm, q, corners, blend_m=0.02, duration_s=0.9 * motion.duration_s)
 
 
-@pytest.mark.parametrize(
-    ("name", "step"),
-    [
-        ("six_r", [0.03, 0.04, -0.03]),
-        ("puma560", [0.03, 0.04, -0.03]),
-        ("ur5", [0.0, 0.1, 0.0]),
-        ("ur10", [0.0, 0.0, -0.1]),
-        ("irb120", [0.03, 0.04, -0.03]),
-    ],
-)
-def test_a_line_planned_anew_from_its_own_middle_goes_on_as_fast(name, step):
-    # Half way a joint is braked as hard as it may be: little but the motion itself leads to the end from there.
-    arm, q = MODELS[name], start(name)
-    goal = shifted(arm.forward(q), step)
-    first = line(arm, q, goal)
-    now = first.at(0.5 * first.duration_s)
-    motion = line(arm, now.q, goal, qd_start=now.qd, qdd_start=now.qdd)
-    within(arm, motion)
-    for before, after in zip(now, motion.at(0.0), strict=True):
-        np.testing.assert_allclose(before, after, atol=1e-7)
-    assert motion.duration_s < 1.03 * 0.5 * first.duration_s  # a step of the scales that are tried
-
-
-def test_waypoints_are_taken_up_from_a_moving_state():
-    arm, q = MODELS["ur5"], start("ur5")
-    T = arm.forward(q)
-    first = line(arm, q, shifted(T, [0.0, 0.3, 0.0]))
-    now = first.at(0.2 * first.duration_s)
-    corners = [shifted(T, [0.0, 0.3, 0.0]), shifted(T, [0.0, 0.3, -0.1])]
-    motion = waypoints(arm, now.q, corners, blend_m=0.03, qd_start=now.qd, qdd_start=now.qdd)
-    within(arm, motion)
-    for before, after in zip(now, motion.at(0.0), strict=True):
-        np.testing.assert_allclose(before, after, atol=1e-7)
-    with pytest.raises(InputError, match="duration_s cannot be asked for"):
-        waypoints(arm, now.q, corners, blend_m=0.03, qd_start=now.qd, qdd_start=now.qdd, duration_s=5.0)
-    near = [arm.forward(first.at(0.23 * first.duration_s).q), corners[1]]
-    with pytest.raises(InputError, match="cannot reach the pace of the first bend"):
-        waypoints(arm, now.q, near, blend_m=0.001, qd_start=now.qd, qdd_start=now.qdd)
-
-
 def test_a_long_motion_is_looked_through_in_pieces():
     t = check_times(50.0005)
     parts = pieces(t)
@@ -292,36 +252,6 @@ def test_whole_revolutions_are_kept():
     assert np.abs(np.diff(moved, axis=0)).max() < 0.01
     with pytest.raises(MotionRejected, match=r"joint 6 at 360.000 deg is outside its limits"):
         line(arm, q, shifted(arm.forward(q), [0.02, 0.03, 0.0], [0, 0, -0.6]))
-
-
-# Moving starts.
-
-
-def test_a_line_goes_on_from_a_line_without_a_step():
-    arm, q = MODELS["ur5"], start("ur5")
-    T = arm.forward(q)
-    first = line(arm, q, shifted(T, [0.0, 0.3, 0.0]))
-    now = first.at(0.4 * first.duration_s)
-    second = line(arm, now.q, shifted(T, [0.0, 0.35, 0.0]), qd_start=now.qd, qdd_start=now.qdd)
-    for before, after in zip(now, second.at(0.0), strict=True):
-        np.testing.assert_allclose(before, after, atol=1e-7)
-    within(arm, second)
-    assert off_line(arm, second.at(check_times(second.duration_s)).q, T, [0, 1, 0]) < 1e-9
-
-
-def test_a_start_that_moves_elsewhere_is_rejected():
-    arm, q = MODELS["ur5"], start("ur5")
-    T = arm.forward(q)
-    now = (first := line(arm, q, shifted(T, [0.0, 0.3, 0.0]))).at(0.4 * first.duration_s)
-    with pytest.raises(InputError, match="qd_start does not carry the tool along the path"):
-        line(arm, now.q, shifted(T, [0.1, 0.3, 0.0]), qd_start=now.qd, qdd_start=now.qdd)
-    with pytest.raises(InputError, match="qdd_start does not carry the tool along the path"):
-        line(arm, now.q, shifted(T, [0.0, 0.35, 0.0]), qd_start=now.qd, qdd_start=now.qdd + 0.1)
-    with pytest.raises(InputError, match="carries the tool backwards"):
-        line(arm, now.q, T, qd_start=now.qd, qdd_start=now.qdd)
-    ahead = arm.forward(first.at(0.41 * first.duration_s).q)
-    with pytest.raises(InputError, match="no motion to the end of the path keeps"):
-        line(arm, now.q, ahead, qd_start=now.qd, qdd_start=now.qdd)
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ from scipy.special import chdtri
 
 from armsight.app.run.tracks import Part, ToolTrack, Tracks, errors
 from armsight.data import Array, Record
-from armsight.estimate.solve import squares_of
+from armsight.estimate.chance import squares_of
 from armsight.loop.servo import CORRECTED_ABOVE
 from armsight.robot.kinematics.arm import Arm
 

@@ -30,6 +30,7 @@ from scipy.special import chdtri, expit, fdtri
 
 from armsight.data import Array, Record
 from armsight.errors import CalibrationError, InputError, noted, require
+from armsight.estimate.chance import squares_of
 from armsight.estimate.linear import Linear
 from armsight.estimate.solve import Solved, covariances, left_out, log_density, solve
 from armsight.estimate.variance import SPEAKS, integrate, most_probable, posterior, scores
@@ -848,10 +849,9 @@ def _far(
     P = everything.J.shape[2]
     C = C + (known := everything.J @ solved.root[:P]) @ np.swapaxes(known, 1, 2)
     moved = everything.e + everything.J @ solved.x[:P]
-    far = np.einsum("ni,ni->n", moved, np.linalg.solve(C, moved[..., None])[..., 0])
-    left, C = left_out(solved)
-    far[rows] = np.einsum("ni,ni->n", left, np.linalg.solve(C, left[..., None])[..., 0])
-    return np.asarray(far)
+    far = squares_of(moved, C)
+    far[rows] = squares_of(*left_out(solved))
+    return far
 
 
 def _held_out_errors(whole: _Problem, guess: _Guess, residual: Array, rows: NDArray[np.int64]) -> HeldOut:

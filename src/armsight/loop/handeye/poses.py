@@ -88,15 +88,14 @@ AGREE, MOST_AGREEING = 0.15, 300
 LEVER_M = 0.3
 
 
-def starts(A: Array, B: Array, seed: int = 0) -> list[tuple[Array, Array]]:
+def starts(A: Array, B: Array) -> list[tuple[Array, Array]]:
     """Return candidates for X and Z of ``A_i X = Z B_i``, smallest median residual first.
 
     Args:
         A: (N, 4, 4) poses, N >= 3.
         B: (N, 4, 4) poses.
-        seed: of the choice of parts.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     found = [kronecker(A, B)]
     if len(A) > PART:
         parts = np.array([rng.choice(len(A), PART, replace=False) for _ in range(PARTS)])

@@ -1,6 +1,6 @@
 """Changes of rig, body, joints and clock as hypotheses: their likelihoods, what they do to poses, and how they are said.
 
-Hypotheses that the tests of ``fixed`` and ``closure`` fitted: what they may do to a pose widens it; the best is named.
+Hypotheses that closure fitted: what they may do to a pose widens it; the best is named.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from armsight.data import Array, Record
-from armsight.estimate.chance import chi_square_limit
 from armsight.geometry.pose import adjoint, inverse
 from armsight.loop.finding import ALIKE, CAUSES, LEVER_M, Cause, HealthFinding, displacement_m, make_finding, sized
 
@@ -28,13 +27,8 @@ DATED_S = 0.7
 MARGIN = 1.4
 #: The estimate of a drift is off by about this share of it, in any direction (simulated drifts of constant rate).
 _OTHERWISE = 0.08
-#: Chi-square (5) below which a motion of the cameras may be one along their optical axis alone, but for one in a
-#: hundred.
-_ALONG = chi_square_limit(5, 0.01)
 #: Priors so wide that they decide nothing: of a motion (m, rad), of a time, s, and of an angle, rad.
 WIDE, _WIDE_S, _WIDE_RAD = np.repeat([0.05, 0.1], 3), 0.05, 0.1
-#: What the pair alone cannot distinguish from that.
-FOCAL = "; both focal lengths that changed alike look the same to the pair"
 
 Kind = Literal["rig", "drift", "body", "bend", "joint", "backlash", "time", "rate", "zoom", "shake"]
 
@@ -288,24 +282,6 @@ def widened(measurement: PoseMeasurement, changes: Sequence[Change]) -> PoseMeas
     """Return a pose measurement of the tool with what may have moved it in its common covariance."""
     extra = suspected(measurement, changes)
     return measurement if extra is None else replace(measurement, cov_common=measurement.cov_common + extra)
-
-
-def along_axis(motion: Array, cov: Array, axis: Array) -> bool:
-    """Return whether a motion is one along an axis alone, within its sigma.
-
-    Both focal lengths that are longer by the same share displace all points along the optical axis, in proportion to their
-    depth, and rotate nothing: at one depth that is such a motion of the cameras.
-
-    Args:
-        motion: (6,) tangent [m; rad].
-        cov: (6, 6) its covariance.
-        axis: (3,) unit vector in the same frame.
-    """
-    across = np.zeros((5, 6))
-    across[:2, :3], across[2:, 3:] = np.linalg.svd(axis[None])[2][1:], np.eye(3)
-    off, along = across @ motion, float(axis @ motion[:3])
-    chi_square = float(off @ np.linalg.solve(across @ cov @ across.T, off))
-    return chi_square < _ALONG and along**2 > 4.0 * float(axis @ cov[:3, :3] @ axis)
 
 
 def finding(changes: Sequence[Change], names: Sequence[str]) -> HealthFinding:

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from armsight.data import Array, Body, Missed, PoseEstimate, Record
+from armsight.estimate.chance import squares_of
 from armsight.geometry.pose import adjoint, exp_se3, inverse, log_se3
 from armsight.geometry.rotation import skew
 from armsight.loop.estimators import Mounting
@@ -219,7 +220,6 @@ class RigFollower:
         since_s: float,
         poses: Sequence[tuple[float, PoseEstimate]],
         at_s: float,
-        settle_s: float = TEST_S,
         mounted: bool = False,
     ) -> RigCorrection | None:
         """Return the cameras put right; None where the poses do not suffice, as ``rejected`` says.
@@ -228,12 +228,11 @@ class RigFollower:
             since_s: since when the cameras are found to have moved, s.
             poses: time, s, and pose of shots measured with the rig as it is, in order of time.
             at_s: the time, s.
-            settle_s: so long after ``since_s`` shots may still be from before, s.
             mounted: whether hand-eye stands on the poses before: then only the change may be estimated, which needs them.
         """
-        used = _differing([pose for t_s, pose in poses if t_s >= since_s + settle_s])
-        before = _differing([pose for t_s, pose in poses if t_s < since_s - settle_s])
-        new = _differing([pose for t_s, pose in poses if t_s > max(self._tried_s, since_s + settle_s)])
+        used = _differing([pose for t_s, pose in poses if t_s >= since_s + TEST_S])
+        before = _differing([pose for t_s, pose in poses if t_s < since_s - TEST_S])
+        new = _differing([pose for t_s, pose in poses if t_s > max(self._tried_s, since_s + TEST_S)])
         if len(used) < LEAST_STAYS or len(new) < _NEW * self._tried:
             self.rejected = (
                 self.rejected or f"cameras: {len(used)} shots since they moved differ, {LEAST_STAYS} are needed"
@@ -329,8 +328,7 @@ class RigFollower:
         if moved is None:
             return None
         by, cov = moved.at(moved.Ts_base_tool[-1])
-        more = float(by[:3] @ np.linalg.solve(cov[:3, :3], by[:3])) > _MORE
-        if moved.sigma_m > _REFINED * right.tool_m[1] and not more:
+        if moved.sigma_m > _REFINED * right.tool_m[1] and squares_of(by[:3], cov[:3, :3]) < _MORE:
             return None
         return self._by_arm(right.since_s, T_base_rig, at_s, moved, right)
 

@@ -19,15 +19,17 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from armsight.data import Array, PoseEstimate
+from armsight.estimate.chance import chi_square_limit, squares_of
 from armsight.geometry.pose import adjoint, inverse, log_se3
 from armsight.loop.finding import HealthFinding, alarm_limit, make_finding, sized
-from armsight.loop.health.change import FOCAL, along_axis
 
 #: Poses of a mean.
 _SHOTS = 5
 #: Of a pose's noise this share of the variance stays in each mean, and of the calibration's covariance this share
 #: differs.
 _STAYS, _DIFFERS = 0.1, 2.5e-3
+#: Chi-square (5) below which a motion may be one along the optical axis alone, but for one in a hundred.
+_ALONG = chi_square_limit(5, 0.01)
 #: A body that moved by less, m, is not reported.
 _LEAST_M = 1e-4
 
@@ -66,7 +68,7 @@ class _Landmark:
         if self.newest is None:
             return False
         xi, cov, _ = self.newest
-        return self.shift_m > _LEAST_M and float(xi @ np.linalg.solve(cov, xi)) > _limit(6)
+        return self.shift_m > _LEAST_M and bool(squares_of(xi, cov) > _limit(6))
 
 
 def _limit(freedom: int) -> float:
@@ -186,20 +188,22 @@ def _agreed(last: tuple[Array, Array] | None, now: tuple[Array, Array] | None) -
     """Return the newer of two motions (6,) with covariance (6, 6) if they agree."""
     if last is None or now is None:
         return None
-    apart = now[0] - last[0]
-    return now if float(apart @ np.linalg.solve(now[1] + last[1], apart)) < _limit(6) else None
+    return now if squares_of(now[0] - last[0], now[1] + last[1]) < _limit(6) else None
 
 
 def _cameras(common: tuple[Array, Array], marks: Sequence[_Landmark]) -> HealthFinding:
     m, cov = common
-    lens = along_axis(m, cov, np.array([0.0, 0.0, 1.0]))
+    # At one depth both focal lengths that are longer by the same share look like a motion along the optical axis alone.
+    across = np.array([0, 1, 3, 4, 5])
+    along = squares_of(m[across], cov[np.ix_(across, across)]) < _ALONG and m[2] ** 2 > 4.0 * cov[2, 2]
+    more = "; both focal lengths that changed alike look the same to the pair" if along else ""
     begins = [each.newest[2] for each in marks if each.newest is not None and each.newest[2] is not None]
     return make_finding(
         "together",
         sized(m[:3], cov[:3, :3]),
         min(begins) if begins else None,
-        also=("lens",) if lens else (),
-        words={"angle_deg": np.degrees(np.linalg.norm(m[3:])), "count": len(marks), "more": FOCAL if lens else ""},
+        also=("lens",) if along else (),
+        words={"angle_deg": np.degrees(np.linalg.norm(m[3:])), "count": len(marks), "more": more},
     )
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array, Body, Ids, PoseEstimate
-from armsight.estimate.chance import chi_square_limit
+from armsight.estimate.chance import chi_square_limit, squares_of
 from armsight.geometry.pose import inverse, pose
 from armsight.loop.health.rows import LENS, differentiated, eliminate_pose
 from armsight.vision.camera import pair_arguments
@@ -360,8 +360,7 @@ def largest_square(effects: Sequence[tuple[Array, Array]], by: Array) -> float:
     ``effects``: responses (6, K) of poses to all parameters, and their covariances (6, 6).
     """
     responses, covs = map(np.array, zip(*effects, strict=True))
-    shift = responses[..., : len(by)] @ by
-    return float(np.max(np.einsum("ni,ni->n", shift, np.linalg.solve(covs, shift[..., None])[..., 0])))
+    return float(squares_of(responses[..., : len(by)] @ by, covs).max())
 
 
 def evidence_of_scales(M: Array, scales: Array) -> Array:

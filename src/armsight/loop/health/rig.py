@@ -398,7 +398,7 @@ class RigWatch:
     def explained(self, estimates: Sequence[PoseEstimate]) -> tuple[StereoRig, Body, HealthFinding]:
         """Return the rig and the body with the change that poses show, which are known to be wrong, and what it is."""
         sums, self._poses = self.information(estimates)
-        change = self._estimated(self._in_priors(sums).reduced(self._size))
+        change = self._estimated(sums.by(self._scaled[:, : self._size + len(_WIDE)]).reduced(self._size))
         more = {part: change.chi_square - change.without[part] for part in ("rig", "body")}
         part: Part = max(("rig", "body"), key=lambda each: (more[each], change.alone[each]))
         sure = more[part] > _NEEDED[part]
@@ -602,10 +602,6 @@ class RigWatch:
         self._alarms, self.alarm, self.alarmed = 0, False, False
         self.suspected = self._found = self.lens = None
 
-    def _in_priors(self, sums: ResidualSums) -> ResidualSums:
-        """Return sums of the parameters and the seven numbers, in units of their priors, from those of the parameters."""
-        return sums.by(self._scaled[:, : self._size + len(_WIDE)])
-
     def _lens(self) -> LensError | None:
         """Return what the camera models lack; None where a change of the seven explains as much, or it hardly matters."""
         K, sums, faults = self._size, self._wholes.since(self._wholes.always), len(_WIDE)
@@ -686,7 +682,10 @@ class RigWatch:
 
     def findings(self, *, ends: bool = True) -> tuple[HealthFinding, ...]:
         """Return what was found so far, where the running test ``ends`` by that one as well: nothing without an alarm."""
-        ended = self._ended() if ends and self._stays else self
+        ended = self
+        if ends and self._stays:  # a copy, as this one goes on with the test
+            ended = self.copied()
+            ended._decide(ends=True)
         return ended.passing.among(ended._stays_changed(), timed=self._timed)
 
     def _stays_changed(self) -> tuple[HealthFinding, ...]:
@@ -733,18 +732,12 @@ class RigWatch:
         assert change is not None
         parts = self._to_blame(change)
         alone = len(parts) == 1 and not self._needed(change, parts[0])
-        said = tuple(self._said(change, part, since_s, alone=alone) for part in parts)
-        return said if self._poses > 1 or (self._timed and self._shots > 1) else tuple(map(_of_one_pose, said))
-
-    def _said(self, change: RigChange, part: Part, since_s: float | None, *, alone: bool) -> HealthFinding:
-        return _part_finding(
-            change, part, since_s, alone=alone, cost_m=self._cost_m(self._of_part(change, _PARTS[part]))
+        costs = [self._cost_m(self._of_part(change, _PARTS[part])) for part in parts]
+        said = tuple(
+            _part_finding(change, part, since_s, alone=alone, cost_m=cost_m)
+            for part, cost_m in zip(parts, costs, strict=True)
         )
-
-    @property
-    def _shaped(self) -> bool:
-        """Whether displaced points or focal lengths explain what the seven numbers would."""
-        return self._shape.found is not None and not self._shape.found.seven_needed
+        return said if self._poses > 1 or (self._timed and self._shots > 1) else tuple(map(_of_one_pose, said))
 
     def copied(self) -> RigWatch:
         """Return a copy that says what was found so far; this one goes on."""
@@ -756,15 +749,11 @@ class RigWatch:
         copied._stays = [stay.copy() for stay in self._stays]
         return copied
 
-    def _ended(self) -> RigWatch:
-        """Return a copy whose running test was made; this one goes on with it."""
-        ended = self.copied()
-        ended._decide(ends=True)
-        return ended
-
     def moved_since_s(self) -> float | None:
         """Return since when the cameras alone are found to have moved, s; None where nothing, or more, was found."""
-        if not (self.alarm and self._timed and self.suspected is not None) or self.lens is not None or self._shaped:
+        shape = self._shape.found
+        shaped = shape is not None and not shape.seven_needed  # that explains what the seven numbers would
+        if not (self.alarm and self._timed and self.suspected is not None) or self.lens is not None or shaped:
             return None
         return None if self.only_newest() or self._to_blame(self.suspected) != ["rig"] else self._since_s
 

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import SIDES, Array, Image, Shot
+from armsight.estimate.chance import squares_of
 from armsight.geometry.pose import inverse, transform
 from armsight.geometry.rotation import skew
 from armsight.loop.finding import HealthFinding, alarm_limit, make_finding, sized
@@ -78,8 +79,7 @@ class CameraMotion(NamedTuple):
     @property
     def chi_square(self) -> float:
         """Of no rotation, a mount's own breathing included."""
-        rotated, cov = self.rotation
-        return float(rotated @ np.linalg.solve(cov, rotated))
+        return float(squares_of(*self.rotation))
 
     def sized(self) -> tuple[tuple[float, float], str, str]:
         """Return size and sigma (SI), unit and words of a shift where it explains it clearly, else of a rotation."""
@@ -358,7 +358,7 @@ class SceneWatch:
         R = self._rig.T_left_right[:3, :3]
         apart = left.rotation[0] - R @ right.rotation[0]
         cov = left.rotation[1] + R @ right.rotation[1] @ R.T
-        return float(apart @ np.linalg.solve(cov, apart)) < _LIMIT
+        return bool(squares_of(apart, cov) < _LIMIT)
 
     def _cost_m(self, moved: dict[int, CameraMotion], p_left: Array, *, together: bool) -> float:
         """Return by how much a measured point (3,) is displaced by rotations of the cameras, m."""

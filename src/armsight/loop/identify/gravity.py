@@ -107,7 +107,7 @@ def check_rests(where: str, count: int) -> None:
 
 
 def gravity_shows(
-    arm: Arm, sensor: Inertial, q: Array, readings: Sequence[Reading], prior: Prior | None = None
+    arm: Arm, sensor: Inertial, q: Array, readings: Sequence[Reading]
 ) -> tuple[list[Shown], ReferenceCalibration[Inertial]]:
     """Return the base's tilt about x and y and the zeros, by gravity at rests.
 
@@ -116,7 +116,6 @@ def gravity_shows(
         sensor: calibrated; its ``cov`` says how far it may be off.
         q: (N, n) readings of the joints at the rests, rad.
         readings: N of the accelerometer, the mean of each rest; their times are the rests' rows.
-        prior: how far the arm may be off.
 
     Raises:
         InputError: too few rests.
@@ -124,7 +123,7 @@ def gravity_shows(
     check_rests(sensor.name, len(q))
     if any(reading.channel != ACCELEROMETER for reading in readings):
         raise InputError(f"{sensor.name}: rests need readings of the accelerometer only")
-    carrier = ArmRests(arm, prior or Prior(), q)
+    carrier = ArmRests(arm, Prior(), q)
     sensor = replace(sensor, delay_s=0.0, sigma_delay_s=0.0)  # a rest's time is its row
     found = calibrate(sensor, readings, carrier)
     assert isinstance(found.carrier, ArmRests)

@@ -193,13 +193,13 @@ def _gravity_lever(arm: Arm, levers: Array, joint: int) -> Array:
     return np.asarray(levers[:, joint, joint:] @ beyond / mass.sum())
 
 
-def gravity_levers(arm: Arm, q: Array, up_base: Array = UP) -> Array:
+def gravity_levers(arm: Arm, q: Array) -> Array:
     """Return the levers (N, n), m, of the gravity load beyond each joint at joint angles (N, n), rad.
 
-    For links that are rods of one mass per metre; positive where the load pulls to larger angles. ``up_base`` is the unit
-    vector against gravity, base.
+    For links that are rods of one mass per metre, of an arm that stands upright; positive where the load pulls to larger
+    angles.
     """
-    levers = _levers(arm, q, up_base)
+    levers = _levers(arm, q, UP)
     return np.stack([_gravity_lever(arm, levers, joint) for joint in range(arm.joints)], axis=1)
 
 

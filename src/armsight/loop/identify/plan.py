@@ -398,13 +398,13 @@ class MountingPlan(Record):
     reasons: tuple[str, ...]  #: what each pose lowers most
 
 
-def plan_mounting(found: HandEye, poses: Poses, count: int, seed: int = 0) -> MountingPlan:
+def plan_mounting(found: HandEye, poses: Poses, count: int) -> MountingPlan:
     """Choose the poses that lower the sigma of the mounting most (a radian counting as 0.3 m).
 
     Candidates lie near poses that the arm has taken: each rotates one of them about the target's middle, the flange stays
     within its space, a fifth more, and the target within the part of the image and the distances in which it was seen.
     """
-    A, B = _near(found, poses.rows(found.used), np.random.default_rng(seed))
+    A, B = _near(found, poses.rows(found.used), np.random.default_rng(0))
     J = found.whitened(Poses(A, B, np.tile(poses.cov.mean(axis=0), (len(A), 1, 1)), poses.in_hand, poses.centre))
     chosen, _ = greedy(J, found.cov, np.diag(np.concatenate([np.zeros(6), np.repeat([1.0, LEVER_M], 3)])), count)
     informations = np.cumsum(J[chosen].swapaxes(1, 2) @ J[chosen], axis=0)

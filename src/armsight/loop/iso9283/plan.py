@@ -58,7 +58,6 @@ def plan_check(
     *,
     centre: Array | None = None,
     wide: bool = False,
-    seed: int = 0,
     allowed: Callable[[Array], NDArray[np.bool_]] = everywhere,
     feasible: Callable[[CheckPlan], bool] = lambda plan: True,
 ) -> CheckPlan:
@@ -68,7 +67,6 @@ def plan_check(
         arm: the arm.
         centre: (3,) of the cube in the base, m; None: on the side where the tool is at home, where the cube is largest.
         wide: a hundred poses all over the cube, rotated too, instead of the standard's five.
-        seed: of the hundred.
         allowed: returns which poses (N, 4, 4) may be used, such as those that the cameras see.
         feasible: returns whether a plan can be carried out; if not, the next cube is tried.
 
@@ -81,7 +79,7 @@ def plan_check(
     centres = _centres(arm, home[:3, 3]) if centre is None else centre[None]
     for side in CUBES_M:
         for middle in centres:
-            Ts = _wide(home, middle, side, seed) if wide else _five(home, middle, side)
+            Ts = _wide(home, middle, side) if wide else _five(home, middle, side)
             for q in _reached(arm, Ts, allowed):
                 rows = np.flatnonzero(np.isfinite(q).all(axis=1))[: MANY if wide else len(Ts)]
                 if len(rows) < (MANY if wide else len(Ts)):
@@ -131,9 +129,9 @@ def _five(home: Array, middle: Array, side: float) -> Array:
     return np.array([pose(home[:3, :3], middle + far * corner) for corner in corners])
 
 
-def _wide(home: Array, middle: Array, side: float, seed: int) -> Array:
+def _wide(home: Array, middle: Array, side: float) -> Array:
     """Return twice as many random poses (N, 4, 4) as are needed, over the cube about its middle (3,), and rotated so."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     positions = middle + rng.uniform(-side / 2, side / 2, (2 * MANY, 3))
     positions[0] = middle  # sets the configuration of all
     rotations = exp_so3(rng.uniform(-MAX_ROTATION_RAD, MAX_ROTATION_RAD, (2 * MANY, 3)))

@@ -28,6 +28,7 @@ from armsight.loop.iso9283.statistic import (
 
 #: Fewest attained poses for a scatter.
 MIN_POSES = 3
+_GROUPS = 5  # of equal count, in order of time, whose means show a drift
 #: Where an integral is summed: beyond its ends lie 1e-6 of it.
 _U = np.linspace(-28.0, 28.0, 113)
 
@@ -186,18 +187,17 @@ def distance_metrics(from_m: Array, to_m: Array, commanded_m: float, cov: Array)
     return AD, scatter(S, np.atleast_2d(noise), len(d), lambda S: 3 * np.sqrt(S[..., 0, 0]), 1.0)
 
 
-def drift(t_s: Array, p: Array, groups: int = 5) -> tuple[Array, Array, Metric]:
+def drift(t_s: Array, p: Array) -> tuple[Array, Array, Metric]:
     """Return the drift of one pose's position (7.5).
 
     Args:
         t_s: (n,) times, s.
         p: (n, 3) positions attained, m.
-        groups: parts of equal count in order of time.
 
     Returns:
-        (groups,) middle times, s; (groups,) distances of each group's barycentre from the first one's, m; the largest.
+        (G,) middle times of the groups, s; (G,) distances of each group's barycentre from the first one's, m; the largest.
     """
-    order = np.array_split(np.argsort(t_s, kind="stable"), min(groups, len(p)))
+    order = np.array_split(np.argsort(t_s, kind="stable"), min(_GROUPS, len(p)))
     middles = np.array([p[rows].mean(axis=0) for rows in order])
     times = np.array([t_s[rows].mean() for rows in order])
     within = np.concatenate([p[rows] - p[rows].mean(axis=0) for rows in order])  # one scatter for all: groups are small

@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 
 from armsight.data import Array, Record
 from armsight.errors import InputError
+from armsight.estimate.chance import squares_of
 from armsight.estimate.linear import Linear
-from armsight.estimate.solve import Solved, by_chance, left_out, solve, squares_of
+from armsight.estimate.solve import Solved, by_chance, left_out, solve
 from armsight.estimate.variance import restricted
 from armsight.geometry.pose import exp_se3, inverse, log_se3
 from armsight.loop.references.reference import Reading, Reference, ToolMotion

@@ -23,6 +23,8 @@ from armsight.robot.trajectories import Joints, Trajectory
 PERIOD_S = 0.004
 #: A joint that lifts the tool by more than this, m per rad, carries a gravity load.
 LOADED_M = 0.15
+#: Amplitude of the joints in a sweep, rad: with half, the delay is known half as well; with twice, the body leaves view.
+REACH_RAD = 0.12
 
 
 class Controller(Protocol):
@@ -81,14 +83,13 @@ class Sweep:
     Args:
         arm: the nominal arm, its base upright.
         q_middle: (n,) joint angles about which they move, rad; the trajectory begins and ends there.
-        reach_rad: amplitude, rad.
         duration_s: duration, s.
     """
 
-    def __init__(self, arm: Arm, q_middle: Array, reach_rad: float = 0.12, *, duration_s: float) -> None:
+    def __init__(self, arm: Arm, q_middle: Array, *, duration_s: float) -> None:
         self.duration_s, self._middle = duration_s, q_middle
         lifts = np.abs(arm.jacobian(q_middle)[2])  # of the tool by each joint, m/rad
-        self._reach = reach_rad * (lifts > LOADED_M)
+        self._reach = REACH_RAD * (lifts > LOADED_M)
         self._rates = 2 * np.pi * np.array([0.9, 0.7, 1.1, 1.3, 0.8, 1.0, 1.2])[: arm.joints]
 
     def at(self, t_s: float | Array) -> Joints:

@@ -18,7 +18,7 @@ import numpy as np
 
 from armsight.data import Array, Shot
 from armsight.errors import ArmsightError, DeviceError, InputError
-from armsight.estimate.solve import squares_of
+from armsight.estimate.chance import squares_of
 from armsight.loop.estimators.estimator import Estimator, Innovation, Outcome
 from armsight.loop.estimators.kalman import KalmanEstimator
 from armsight.loop.references.file import Entry, read_recording
@@ -261,7 +261,7 @@ class Fused:
                 self.impacts.append(innovation.t_s)
             self._impact_s = innovation.t_s
         else:
-            self._squares += float(squares_of(z[None], innovation.cov[None])[0]) / len(z)
+            self._squares += float(squares_of(z, innovation.cov)) / len(z)
 
     def row(self, covs: Array, before: tuple[float, float] | None = None) -> FusedRow | HeadingRow:
         """Return what it did to estimates with covariances (N, 6, 6) since the first window.

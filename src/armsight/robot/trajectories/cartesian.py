@@ -1,36 +1,26 @@
 """Travel a path of the tool: a jerk-limited share of the way over time, joints by inverse kinematics, limits at 1 kHz.
 
-In: an arm, a path and a start state. Out: a :class:`PathMotion`, checked; or :class:`MotionRejected`.
+In: an arm and a path, at whose begin it rests. Out: a :class:`PathMotion`, checked; or :class:`MotionRejected`.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, TypedDict
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from armsight.data import Array
 from armsight.errors import InputError
-from armsight.robot.trajectories.law import CLOSE, Law, fit_chain, fit_law, moving_laws, time_of
-from armsight.robot.trajectories.limits import ROUNDING, Worst, outside, start_state, worst
+from armsight.robot.trajectories.law import CLOSE, Law, fit_chain, fit_law, time_of
+from armsight.robot.trajectories.limits import ROUNDING, Worst, inside, outside, worst
 from armsight.robot.trajectories.lookahead import Obstacle, Walk, derivatives, refined, walk
 from armsight.robot.trajectories.path import Path
 from armsight.robot.trajectories.trajectory import Joints, MotionRejected, check_duration, check_times, clamped, pieces
 
 if TYPE_CHECKING:
     from armsight.robot.kinematics.arm import Arm
-
-ALONG = 1e-6  # how far from the path a start's speeds and accelerations may point, as a share of the limits
-
-
-class Beginning(TypedDict, total=False):
-    """How a motion along a path begins, and how long it takes; from rest, and as short as the limits allow, without."""
-
-    qd_start: ArrayLike | None  #: (n,) speeds to start with, rad/s; they must carry the tool along the path
-    qdd_start: ArrayLike | None  #: (n,) accelerations to start with, rad/s^2, likewise
-    duration_s: float | None  #: how long it is to take, s
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,8 +53,6 @@ def follow(
     path: Path,
     q_start: ArrayLike,
     *,
-    qd_start: ArrayLike | None = None,
-    qdd_start: ArrayLike | None = None,
     duration_s: float | None = None,
     cruises: Array | None = None,
 ) -> PathMotion:
@@ -74,57 +62,28 @@ def follow(
         arm: the arm.
         path: the path.
         q_start: (n,) angles to start from, rad.
-        qd_start: (n,) speeds to start with, rad/s; they must carry the tool along the path. None for rest.
-        qdd_start: (n,) accelerations to start with, rad/s^2.
         duration_s: how long it is to take, s; None for as short as the limits allow.
         cruises: (C, 2) shares between which the pace is to be steady: the bends of the path. None for none.
 
     Raises:
         MotionRejected: the path leaves the reach or the joint limits, or meets a singularity.
-        InputError: bad numbers, a start that does not move along the path, or a duration that cannot be met.
+        InputError: bad numbers, or a duration that cannot be met.
     """
     check_duration(duration_s)
-    start = start_state(arm, q_start, qd_start, qdd_start)
-    guide, obstacle = walk(arm, path, start.q, np.zeros((0, 2)) if cruises is None else cruises)
+    guide, obstacle = walk(arm, path, inside(arm, q_start, "q_start"), np.zeros((0, 2)) if cruises is None else cruises)
     if obstacle is not None and obstacle.share == 0:
         raise _rejection(path, obstacle, 0.0)
-    share = _share_state(start, guide, arm)
-    if start.qd.any() or start.qdd.any():
-        return _from_moving(arm, path, guide, obstacle, share, duration_s, cruises)
     law: Law
     if obstacle is not None:
         clear = Walk(*(part[: obstacle.clear] for part in guide))
-        law = fit_law(arm, clear) if cruises is None else fit_chain(arm, clear, share, cruises)
+        law = fit_law(arm, clear) if cruises is None else fit_chain(arm, clear, cruises)
         scale = 1.0 if duration_s is None else duration_s / law.duration_s
         raise _rejection(path, obstacle, scale * time_of(law, obstacle.share))
-    law = fit_law(arm, guide) if cruises is None else fit_chain(arm, guide, share, cruises)
+    law = fit_law(arm, guide) if cruises is None else fit_chain(arm, guide, cruises)
     motion = PathMotion(arm, path, law, guide)
     while (most := _check_whole(motion)).ratio > 1 + ROUNDING:
         motion = replace(motion, law=motion.law.slower(most.time_scale * (1 + CLOSE / 10)))
     return motion if duration_s is None else _lasting(motion, duration_s)
-
-
-def _from_moving(
-    arm: Arm,
-    path: Path,
-    guide: Walk,
-    obstacle: Obstacle | None,
-    start: Joints,
-    duration_s: float | None,
-    cruises: Array | None,
-) -> PathMotion:
-    """Plan to travel a path from a moving start, (1,) as a share of the way."""
-    if duration_s is not None and cruises is not None:
-        raise InputError("duration_s cannot be asked for on way-points from a moving start")
-    if obstacle is not None:
-        # How it would be travelled from here cannot be said where its end cannot be reached: at the pace of the start.
-        raise _rejection(path, obstacle, obstacle.share / float(start.qd[0]) if start.qd[0] > 0 else 0.0)
-    laws: list[Law] = [fit_chain(arm, guide, start, cruises)] if cruises is not None else []
-    for law in laws or moving_laws(arm, guide, start, duration_s):
-        motion = PathMotion(arm, path, law, guide)
-        if (most := _check_whole(motion)).ratio <= 1 + ROUNDING:
-            return motion
-    raise _rejection(path, Obstacle(float(motion.law.at(most.t_s).q[0]), most.what), most.t_s)
 
 
 def _lasting(shortest: PathMotion, duration_s: float) -> PathMotion:
@@ -144,22 +103,6 @@ def _rejection(path: Path, obstacle: Obstacle, t_s: float) -> MotionRejected:
     """Return the rejection of a motion at an obstacle, at a time, s."""
     p_base = path.at(np.array([obstacle.share])).T_base_tool[0, :3, 3]
     return MotionRejected(obstacle.reason, share=obstacle.share, t_s=t_s, p_base=p_base)
-
-
-def _share_state(start: Joints, guide: Walk, arm: Arm) -> Joints:
-    """Return the start as share, its speed and its acceleration (1,)."""
-    along, bend = guide.q1[0], guide.q2[0]
-    speed = float(along @ start.qd / (along @ along))
-    acceleration = float(along @ (start.qdd - bend * speed**2) / (along @ along))
-    for name, value, needed, limit in (
-        ("qd_start", start.qd, along * speed, arm.qd_max),
-        ("qdd_start", start.qdd, along * acceleration + bend * speed**2, arm.qdd_max),
-    ):
-        if (np.abs(value - needed) > ALONG * limit).any():
-            raise InputError(f"{name} does not carry the tool along the path: give speeds that do, or start from rest")
-    if speed < 0:
-        raise InputError("qd_start carries the tool backwards on the path")
-    return Joints(np.zeros(1), np.array([speed]), np.array([acceleration]))
 
 
 def _check_whole(motion: PathMotion) -> Worst:

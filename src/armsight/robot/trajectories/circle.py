@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Unpack
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,7 +12,7 @@ from armsight.data import Array, Record
 from armsight.errors import InputError
 from armsight.geometry.check import checked
 from armsight.geometry.rotation import exp_so3, log_so3
-from armsight.robot.trajectories.cartesian import Beginning, PathMotion, follow
+from armsight.robot.trajectories.cartesian import PathMotion, follow
 from armsight.robot.trajectories.path import PathPoints, checked_pose
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ def circle(
     angle_rad: float = 2 * np.pi,
     *,
     rotation_base: ArrayLike = (0.0, 0.0, 0.0),
-    **begin: Unpack[Beginning],
+    duration_s: float | None = None,
 ) -> PathMotion:
     """Plan a circle of the tool about an axis in space, from where it is.
 
@@ -62,7 +62,7 @@ def circle(
         angle_rad: how far round, rad; a full circle by default, negative for the other way.
         rotation_base: (3,) rotation vector the orientation goes through on the way, rad, base axes; zero keeps it, the
             axis times ``angle_rad`` rotates the tool with the circle.
-        begin: speeds, accelerations and duration: :class:`~armsight.robot.trajectories.cartesian.Beginning`.
+        duration_s: how long it is to take, s; None for as short as the limits allow.
 
     Raises:
         MotionRejected: the circle leaves the reach or the joint limits, or meets a singularity.
@@ -78,7 +78,7 @@ def circle(
     if np.linalg.norm(np.cross(axis, T_base_start[:3, 3] - center)) < TOO_SMALL:
         raise InputError("the tool is on the circle's axis: there is no circle to travel")
     path = ArcPath(T_base_start, center, axis * angle_rad, checked(rotation_base, (3,), "rotation_base"))
-    return follow(arm, path, q_start, **begin)
+    return follow(arm, path, q_start, duration_s=duration_s)
 
 
 def arc(
@@ -86,7 +86,8 @@ def arc(
     q_start: ArrayLike,
     via_base: ArrayLike,
     T_base_goal: ArrayLike,
-    **begin: Unpack[Beginning],
+    *,
+    duration_s: float | None = None,
 ) -> PathMotion:
     """Plan the arc of the tool from where it is through a point to a pose, the orientation rotating evenly (slerp).
 
@@ -95,7 +96,7 @@ def arc(
         q_start: (n,) angles to start from, rad; their configuration is kept.
         via_base: (3,) a point on the arc between start and goal, m, base frame.
         T_base_goal: (4, 4) pose of the tool to end at.
-        begin: speeds, accelerations and duration: :class:`~armsight.robot.trajectories.cartesian.Beginning`.
+        duration_s: how long it is to take, s; None for as short as the limits allow.
 
     Raises:
         MotionRejected: the arc leaves the reach or the joint limits, or meets a singularity.
@@ -106,7 +107,7 @@ def arc(
     center, sweep = through(T_base_start[:3, 3], checked(via_base, (3,), "via_base"), goal[:3, 3])
     rotation_base = log_so3(np.ascontiguousarray(goal[:3, :3] @ T_base_start[:3, :3].T))
     path = ArcPath(T_base_start, center, sweep, rotation_base)
-    return follow(arm, path, q_start, **begin)
+    return follow(arm, path, q_start, duration_s=duration_s)
 
 
 def through(a: Array, via: Array, b: Array) -> tuple[Array, Array]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Unpack
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from armsight.data import Array, Record
 from armsight.errors import InputError
 from armsight.geometry.rotation import exp_so3
-from armsight.robot.trajectories.cartesian import Beginning, PathMotion, follow
+from armsight.robot.trajectories.cartesian import PathMotion, follow
 from armsight.robot.trajectories.path import PathPoints, checked_pose, way
 
 if TYPE_CHECKING:
@@ -47,7 +47,8 @@ def line(
     arm: Arm,
     q_start: ArrayLike,
     T_base_goal: ArrayLike,
-    **begin: Unpack[Beginning],
+    *,
+    duration_s: float | None = None,
 ) -> PathMotion:
     """Plan a straight line of the tool from where it is.
 
@@ -55,11 +56,11 @@ def line(
         arm: the arm.
         q_start: (n,) angles to start from, rad; their configuration is kept.
         T_base_goal: (4, 4) pose of the tool to end at.
-        begin: speeds, accelerations and duration: :class:`~armsight.robot.trajectories.cartesian.Beginning`.
+        duration_s: how long it is to take, s; None for as short as the limits allow.
 
     Raises:
         MotionRejected: the line leaves the reach or the joint limits, or meets a singularity.
         InputError: bad numbers, nothing to travel, or a duration that cannot be met.
     """
     path = LinePath.between(arm.forward(q_start), checked_pose(T_base_goal, "T_base_goal"))
-    return follow(arm, path, q_start, **begin)
+    return follow(arm, path, q_start, duration_s=duration_s)

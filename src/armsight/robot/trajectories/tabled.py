@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.interpolate import PPoly
 
 from armsight.data import Array
 from armsight.robot.trajectories.trajectory import Joints, Trajectory, clamped
@@ -23,29 +24,18 @@ class Tabled:
         """Fill the table."""
         self.duration_s = motion.duration_s
         last = max(self.duration_s, STEP_S)  # a motion that takes no time stands
-        self._t_s = np.append(np.arange(0.0, last - 1e-9, STEP_S), last)
-        q, qd, qdd = motion.at(self._t_s)
-        h = np.diff(self._t_s)[:, None]
+        t_s = np.append(np.arange(0.0, last - 1e-9, STEP_S), last)
+        q, qd, qdd = motion.at(t_s)
+        h = np.diff(t_s)[:, None]
         rise = q[1:] - q[:-1] - h * qd[:-1] - 0.5 * h**2 * qdd[:-1]
         gain = (qd[1:] - qd[:-1] - h * qdd[:-1]) * h
         bend = (qdd[1:] - qdd[:-1]) * h**2
         cubic, quartic = 10 * rise - 4 * gain + 0.5 * bend, -15 * rise + 7 * gain - bend
         quintic = 6 * rise - 3 * gain + 0.5 * bend
-        # (N, 6 powers, 6 joints), in seconds since the sample before.
-        parts = (q[:-1], qd[:-1], 0.5 * qdd[:-1], cubic / h**3, quartic / h**4, quintic / h**5)
-        self._coefficients = np.stack(parts, axis=1)
+        parts = (quintic / h**5, quartic / h**4, cubic / h**3, 0.5 * qdd[:-1], qd[:-1], q[:-1])
+        self._pieces = PPoly(np.stack(parts), t_s)
 
     def at(self, t_s: float | Array) -> Joints:
         """Return the joints, (n,) or (N, n), ``t_s`` seconds after the start."""
         times = clamped(t_s, self.duration_s)
-        piece = np.clip(np.searchsorted(self._t_s, times, side="right") - 1, 0, len(self._coefficients) - 1)
-        x = times - self._t_s[piece]
-        one, none = np.ones_like(x), np.zeros_like(x)
-        powers = np.array(
-            [
-                [one, x, x**2, x**3, x**4, x**5],
-                [none, one, 2 * x, 3 * x**2, 4 * x**3, 5 * x**4],
-                [none, none, 2 * one, 6 * x, 12 * x**2, 20 * x**3],
-            ]
-        )
-        return Joints(*np.einsum("dk...,...kj->d...j", powers, self._coefficients[piece]))
+        return Joints(*(self._pieces(times, order) for order in range(3)))

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING, Unpack
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from armsight.data import Array, Record
 from armsight.errors import InputError
 from armsight.geometry.rotation import exp_so3, skew
-from armsight.robot.trajectories.cartesian import Beginning, PathMotion, follow
+from armsight.robot.trajectories.cartesian import PathMotion, follow
 from armsight.robot.trajectories.path import PathPoints, checked_pose, way
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ def waypoints(
     Ts_base_way: ArrayLike,
     *,
     blend_m: float,
-    **begin: Unpack[Beginning],
+    duration_s: float | None = None,
 ) -> PathMotion:
     """Plan a path of the tool from where it is past way-points to the last of them, without stopping.
 
@@ -83,7 +83,7 @@ def waypoints(
         Ts_base_way: (M, 4, 4) poses of the tool, M >= 2; all but the last are passed at a distance (see the module).
         blend_m: how far before a way-point its blend begins, m; shortened to half the lines beside it. On lines that
             mostly rotate, a radian counts as 0.25 m.
-        begin: speeds, accelerations and duration: :class:`~armsight.robot.trajectories.cartesian.Beginning`.
+        duration_s: how long it is to take, s; None for as short as the limits allow.
 
     Raises:
         MotionRejected: the path leaves the reach or the joint limits, or meets a singularity.
@@ -102,7 +102,7 @@ def waypoints(
     Ts = [arm.forward(q_start), *(checked_pose(T, f"way-point {i + 1}") for i, T in enumerate(given))]
     path = blended(np.array(Ts), blend_m)
     cruises = (path.corners_m[:, None] + path.blends_m[:, None] * [-1.0, 1.0]) / path.length_m
-    return follow(arm, path, q_start, cruises=cruises, **begin)
+    return follow(arm, path, q_start, cruises=cruises, duration_s=duration_s)
 
 
 def blended(Ts_base_tool: Array, blend_m: float) -> BlendedPath:
