@@ -54,11 +54,11 @@ from armsight.vision.calibrate.screen import (
 from armsight.vision.calibrate.start import agreed_symmetries, fits, imitated, residual_rms_px, start_board
 from armsight.vision.calibrate.weak import weaknesses
 from armsight.vision.camera import DISTORTION_MODELS, Camera
-from armsight.vision.discs.bias import apparent_radii
 from armsight.vision.markers.circles import unseen_row
 from armsight.vision.markers.marker import CalibrationBoard
 from armsight.vision.match import join, renamed
 from armsight.vision.pose.bundle import NEAR, BundleModel, BundleSolution, BundleState, Observations, minimise, promised
+from armsight.vision.pose.measure import seen_radius
 from armsight.vision.pose.pnp import body_poses
 from armsight.vision.pose.projection import smooth
 from armsight.vision.pose.shutter import TimedShot, aligned, at_one_time, estimate_shutters
@@ -79,9 +79,7 @@ _START_PX = 0.1  # sigma of a detection before its residuals show it; half, doub
 #: A start that leaves more than this, px RMS, is no minimum to draw conclusions from: names of a symmetric board may
 #: contradict each other, the lens may be another.
 _MISNAMED_PX = 2.0
-#: Rounds of the discs' radius and the poses; a radius given may differ by this factor from what the images show: print and
-#: lens widen or narrow what is dark.
-_RADIUS_ROUNDS, _RADIUS_RATIO = 2, 1.1
+_RADIUS_ROUNDS = 2  # of the discs' radius and the poses; half: 5e-4 off, double: the same
 #: Cameras that are less than so many sigmas apart, or than this share of the boards' distance, are one camera.
 _BASELINE_SIGMAS, _BASELINE_SHARE = 5.0, 1e-3
 #: Rounds of skew and cameras, alternately; the skew has settled where it changes by less than this share of its sigma.
@@ -415,26 +413,17 @@ def _disc_radius(
     ]
     if not seen:
         return None, first
-    points = board.body.points
-    about_m = 0.25 * float(np.linalg.norm(points[1] - points[0]))
+    about_m, problem = None, None
     for _ in range(_RADIUS_ROUNDS):
-        T_right_left = inverse(first.state.T_left_right)
-        radii = []
-        for side, j, found in seen:
-            T = first.state.Ts_left_body[j]
-            T = T if side == 0 else T_right_left @ T
-            camera = first.state.cameras[side]
-            radii.append(apparent_radii(camera, T, points[found.ids], found.shape, about_m))
-        about_m = float(np.nanmedian(np.concatenate(radii)))
-        model = replace(rigid_board(points), disc_radius_m=about_m)
-        first = minimise(model, first.state, observations, 1.0, max_steps=STEPS, least_decrease=ROUGHLY)
-    given_m = board.disc_radius_m
-    if given_m is not None and not 1 / _RADIUS_RATIO < given_m / about_m < _RADIUS_RATIO:
-        raise CalibrationError(
-            f"{board.body.name}: a radius of {1e3 * given_m:.4g} mm is given, and the images show {1e3 * about_m:.4g} mm: "
-            "measure pitch and radius (not the diameter), or leave the radius out"
-        )
-    return about_m if given_m is None else given_m, first
+        state = first.state
+        T_cameras = np.eye(4), inverse(state.T_left_right)
+        views = [(state.cameras[side], T_cameras[side] @ state.Ts_left_body[j], found) for side, j, found in seen]
+        about_m, problem = seen_radius(board, views, about_m)
+        model = replace(rigid_board(board.body.points), disc_radius_m=about_m)
+        first = minimise(model, state, observations, 1.0, max_steps=STEPS, least_decrease=ROUGHLY)
+    if problem is not None:
+        raise CalibrationError(problem)
+    return board.disc_radius_m or about_m, first
 
 
 def _usable(pairs: Sequence[Pair]) -> tuple[list[Pair], list[RejectedPair]]:

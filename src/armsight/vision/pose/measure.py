@@ -12,7 +12,7 @@ discs, detections --identify or assign--> ellipse centres --centred--> disc cent
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -34,6 +34,7 @@ from armsight.data import (
 )
 from armsight.errors import InputError, require
 from armsight.geometry.pose import inverse
+from armsight.vision.camera import Camera
 from armsight.vision.detections import SeenShot
 from armsight.vision.discs.assign import assign
 from armsight.vision.discs.bias import apparent_radii, centred
@@ -161,27 +162,37 @@ def _without_bias(
     rig: StereoRig, target: Target, left: Detections, right: Detections, rough: PoseEstimate
 ) -> PoseEstimate | Missed:
     """Measure a board of discs again from a rough pose: the centres of ellipses are not the images of the middles."""
-    points = target.body.points
     Ts = rough.T_left_body, inverse(rig.T_left_right) @ rough.T_left_body
-    about_m = 0.25 * float(np.linalg.norm(points[1] - points[0]))
-    radii = [
-        apparent_radii(camera, T, points[d.ids], d.shape, about_m)
-        for camera, T, d in zip(rig.cameras, Ts, (left, right), strict=True)
-    ]
-    seen_m = float(np.nanmedian(np.concatenate(radii)))
-    radius_m = seen_m if target.disc_radius_m is None else target.disc_radius_m
-    shape = np.concatenate([left.shape, right.shape])
-    radius_px = float(np.median((shape[:, 0] * shape[:, 2] - shape[:, 1] ** 2) ** 0.25))
-    if abs(radius_m / seen_m - 1.0) > max(_RADIUS_SHARE, _RADIUS_PX / radius_px):
-        return Missed(
-            f"{target.body.name}: a radius of {1e3 * radius_m:.4g} mm is given, and the images show {1e3 * seen_m:.4g} mm: "
-            "measure pitch and radius (not the diameter), or leave the radius out"
-        )
-    n = len(points)
+    seen_m, problem = seen_radius(target, list(zip(rig.cameras, Ts, (left, right), strict=True)))
+    if problem is not None:
+        return Missed(problem)
+    radius_m, n = seen_m if target.disc_radius_m is None else target.disc_radius_m, len(target.body.points)
     discs = DiscTarget(target.body, np.full(n, radius_m), np.zeros(n, bool), np.tile([0.0, 0.0, -1.0], (n, 1)))
     nothing = Correspondences(np.zeros(0, np.int64), np.zeros((0, 2, 2)), np.zeros((0, 2, 2, 2)))
     seen = match(rig, target.body, left, right, symmetries=target.symmetries)
     return locate_discs(rig, target.body, discs, nothing, seen, rough.T_left_body)
+
+
+def seen_radius(
+    board: Target, views: Sequence[tuple[Camera, Array, Detections]], about_m: float | None = None
+) -> tuple[float, str | None]:
+    """Return the radius of a board's discs that views of it show, m, and what is wrong with the one that is given.
+
+    The areas of the ellipses show it, against the spacing of the discs at the poses T_camera_board (4, 4) of the views;
+    ``about_m``: a radius of about the right size.
+    """
+    points = board.body.points
+    about_m = about_m or 0.25 * float(np.linalg.norm(points[1] - points[0]))
+    radii = [apparent_radii(camera, T, points[found.ids], found.shape, about_m) for camera, T, found in views]
+    seen_m, given_m = float(np.nanmedian(np.concatenate(radii))), board.disc_radius_m
+    shape = np.concatenate([found.shape for _, _, found in views])
+    radius_px = float(np.median((shape[:, 0] * shape[:, 2] - shape[:, 1] ** 2) ** 0.25))
+    if given_m is None or abs(given_m / seen_m - 1.0) <= max(_RADIUS_SHARE, _RADIUS_PX / radius_px):
+        return seen_m, None
+    return seen_m, (
+        f"{board.body.name}: a radius of {1e3 * given_m:.4g} mm is given, and the images show {1e3 * seen_m:.4g} mm: "
+        "measure pitch and radius (not the diameter), or leave the radius out"
+    )
 
 
 def size_problem(size_px: tuple[int, int], image: Image, side: str) -> str | None:
