@@ -17,6 +17,7 @@ position_mm = [10, 20, 30]
 {rotation}
 tag = {{ family = "tag36h11", id = 3, size_mm = 40 }}
 """
+UPRIGHT = TAG.format(rotation="quaternion_wxyz = [1, 0, 0, 0]")
 
 
 def written(tmp_path, name, text):
@@ -99,23 +100,14 @@ def test_tags_sit_where_the_file_says(tmp_path):
         (TAG.format(rotation="normal = [0, 0, 0]\nx_axis = [1, 0, 0]"), ["(A)", "normal", "zero"]),
         (TAG.format(rotation="normal = [0, 0, 1]\nx_axis = [1, 0, 1]"), ["(A)", "x_axis", "normal"]),
         (TAG.format(rotation="quaternion_wxyz = [1, 0, 0]"), ["(A)", "quaternion_wxyz", "(3,)"]),
-        (TAG.format(rotation="quaternion_wxyz = [1, 0, 0, 0]") * 2, ["marker 2", "'A'", "marker 1"]),
-        (
-            TAG.format(rotation="quaternion_wxyz = [1, 0, 0, 0]").replace("36h11", "99h9"),
-            ["(A)", "tag99h9", "tag36h11"],
-        ),
-        (
-            TAG.format(rotation="quaternion_wxyz = [1, 0, 0, 0]").replace("id = 3", "id = 587"),
-            ["(A)", "587", "0 to 586"],
-        ),
-        (TAG.format(rotation="quaternion_wxyz = [1, 0, 0, 0]").replace("id = 3", "id = 3.0"), ["(A)", "3.0"]),
-        (TAG.format(rotation="quaternion_wxyz = [1, 0, 0, 0]").replace("= 40", "= 0"), ["(A)", "size_mm", "0"]),
-        (TAG.format(rotation="quaternion_wxyz = [1, 0, 0, 0]").replace("size_mm", "size_m"), ["(A)", "size_mm"]),
-        (
-            TAG.format(rotation="quaternion_wxyz = [1, 0, 0, 0]").replace("= 40", "= 40, ink = 1"),
-            ["(A)", "'ink'", "family"],
-        ),
-        (TAG.format(rotation="quaternion_wxyz = [1, 0, 0, 0]").replace("10,", "1e6,"), ["(A)", "1000 m", "mm"]),
+        (UPRIGHT * 2, ["marker 2", "'A'", "marker 1"]),
+        (UPRIGHT.replace("36h11", "99h9"), ["(A)", "tag99h9", "tag36h11"]),
+        (UPRIGHT.replace("id = 3", "id = 587"), ["(A)", "587", "0 to 586"]),
+        (UPRIGHT.replace("id = 3", "id = 3.0"), ["(A)", "3.0"]),
+        (UPRIGHT.replace("= 40", "= 0"), ["(A)", "size_mm", "0"]),
+        (UPRIGHT.replace("size_mm", "size_m"), ["(A)", "size_mm"]),
+        (UPRIGHT.replace("= 40", "= 40, ink = 1"), ["(A)", "'ink'", "family"]),
+        (UPRIGHT.replace("10,", "1e6,"), ["(A)", "1000 m", "mm"]),
     ],
 )
 def test_a_wrong_body_file_names_file_and_marker(tmp_path, text, texts):
@@ -124,9 +116,8 @@ def test_a_wrong_body_file_names_file_and_marker(tmp_path, text, texts):
 
 
 def test_one_tag_twice_on_a_body_is_rejected(tmp_path):
-    one = TAG.format(rotation="quaternion_wxyz = [1, 0, 0, 0]")
     with pytest.raises(InputError, match=r"marker 2 \(B\).*id 3.*'A'"):
-        open_target(written(tmp_path, "b.toml", one + one.replace('"A"', '"B"')))
+        open_target(written(tmp_path, "b.toml", UPRIGHT + UPRIGHT.replace('"A"', '"B"')))
 
 
 @pytest.mark.parametrize(

@@ -82,14 +82,7 @@ def from_p_right(R, t):
         ("09-opencv-other-names/plain.json", MM, 900, -0.1, (1280, 720), from_p_right(np.eye(3), [-0.2, 0, 0])),
         ("10-filestorage-gz/rig.yml.gz", MM | {"image_size_px": (640, 480)}, 500, -0.1, (640, 480), from_p_right(TEN_DEG, [-0.06, 0, 0])),
         ("20-other-calibrations/camera_array.toml", {}, 900, -0.1, (1280, 720), from_p_right(TEN_DEG, [-0.2, 0, 0.01])),
-        (
-            "20-other-calibrations/SN1.conf",
-            {},
-            700.1,
-            -0.17,
-            (1280, 720),
-            from_p_right(exp_so3(np.array([0.0007, 0.0015, 0.0001])), [-0.1199, -1e-5, -2e-5]),
-        ),
+        ("20-other-calibrations/SN1.conf", {}, 700.1, -0.17, (1280, 720), from_p_right(exp_so3(np.array([0.0007, 0.0015, 0.0001])), [-0.1199, -1e-5, -2e-5])),
     ],
 )  # fmt: skip
 def test_users_files(files, options, fx, k1, size, T_left_right):
@@ -150,10 +143,8 @@ UNITS = [
     for name in ONE_OF
     for unit, right, number in (
         ((1.0, "mm", "0.001"), (1e-6, "mm", "0.001"))
-        if PROGRAMS[name][3].get("unit_m")
+        if PROGRAMS[name][3].get("unit_m") or name == "zed"
         else ((1e-3, "m", "1"), (1e-6, "m", "1"))
-        if name != "zed"
-        else ((1.0, "mm", "0.001"), (1e-6, "mm", "0.001"))
     )
 ]
 #: Wrong counts of files: one of a pair, one too many.
@@ -208,7 +199,8 @@ def test_counts_of_files(tmp_path, name, some, said):
 @pytest.mark.parametrize("name", [name for name, entry in PROGRAMS.items() if len(entry[2]) == 2])
 def test_left_and_right_exchanged_is_remarked(tmp_path, name):
     paths = write(tmp_path, PROGRAMS[name][2])
-    notes = import_rig(None, paths[::-1], **PROGRAMS[name][3]).provenance["notes"]
+    right, notes = (import_rig(None, p, **PROGRAMS[name][3]).provenance["notes"] for p in (paths, paths[::-1]))
+    assert not any("stands left" in note for note in right)
     assert any("stands left of the first" in note and "exchange the files" in note for note in notes)
     with pytest.raises(
         InputError, match="is given twice; give the file of the left camera, then that of the right one"
@@ -336,19 +328,12 @@ def test_stereolabs_is_rectified_as_by_the_vendors_code(tmp_path):
     for key, value in zip(("RX", "CV", "RZ"), r, strict=True):
         file = re.sub(rf"{key}_HD=.*", f"{key}_HD={value}", file)
     rig = import_rig(None, write(tmp_path, {"SN1.conf": file}))
-    d = (np.zeros(5), np.zeros(5))
-    theirs = cv2.stereoRectify(  # calibration.hpp of zed-open-capture
-        rig.left.matrix,
-        d[0],
-        rig.right.matrix,
-        d[1],
-        (1280, 720),
-        cv2.Rodrigues(r)[0],
-        np.array([[baseline], [ty], [tz]]),
+    ours, cameras = (
+        inverse(rig.T_left_right),
+        (rig.left.matrix, np.zeros(5), rig.right.matrix, np.zeros(5), (1280, 720)),
     )
-    ours = inverse(rig.T_left_right)
-    own = cv2.stereoRectify(
-        rig.left.matrix, d[0], rig.right.matrix, d[1], (1280, 720), ours[:3, :3], 1e3 * ours[:3, 3:]
-    )
+    # as calibration.hpp of zed-open-capture
+    theirs = cv2.stereoRectify(*cameras, cv2.Rodrigues(r)[0], np.array([[baseline], [ty], [tz]]))
+    own = cv2.stereoRectify(*cameras, ours[:3, :3], 1e3 * ours[:3, 3:])
     np.testing.assert_allclose(own[0], theirs[0], atol=1e-9)
     np.testing.assert_allclose(own[1], theirs[1], atol=1e-9)

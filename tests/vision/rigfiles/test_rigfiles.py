@@ -140,18 +140,6 @@ def test_a_full_disk_replaces_neither_file_of_a_pair(tmp_path, monkeypatch, full
     assert sorted(os.listdir(tmp_path)) == sorted(path.name for path in targets)
 
 
-@pytest.mark.parametrize("name", EXPORTED)
-def test_a_pair_in_the_wrong_order_is_remarked(tmp_path, name):
-    export_rig(ordinary_rig("brown4"), name, paths(tmp_path, name))
-    rig = import_rig(name, paths(tmp_path, name))
-    assert not any("left of the first" in note for note in rig.provenance["notes"])
-    exchanged = StereoRig(rig.right, rig.left, inverse(rig.T_left_right), rig.cov, 0.1)
-    export_rig(exchanged, name, paths(tmp_path, name))
-    back = import_rig(name, paths(tmp_path, name))
-    np.testing.assert_allclose(back.T_left_right, inverse(rig.T_left_right), atol=2e-15)
-    assert any("left of the first" in note for note in back.provenance["notes"])
-
-
 @pytest.mark.opencv
 def test_vertical_pairs_survive_rectification(tmp_path):
     rig = ordinary_rig("brown5")
