@@ -6,7 +6,7 @@ from armsight.geometry.pose import exp_se3, inverse, log_se3, transform
 from armsight.vision.pose import posefit
 from armsight.vision.pose.bundle import CAUCHY_SCALE
 from armsight.vision.pose.posefit import PixelObservations, fit_pose
-from asserts import assert_jacobian
+from asserts import assert_jacobian, numeric_jacobian
 from strategies import ordinary_rig
 from views import pixels, seen, somewhere
 
@@ -67,16 +67,11 @@ def test_the_minimum_is_that_of_scipy(model, robust):
 def test_the_information_is_that_of_the_minimum():
     rig, points, _, observations, _ = shot("brown4", 4)
     fit = fit_pose(rig.cameras, rig.T_left_right, points, observations, shot("brown4", 4)[2], robust=False)
-    h = np.r_[[1e-6] * 3, [1e-5] * 3]
-    columns = [
-        (
-            whitened(rig, points, observations, fit.T_left_body @ exp_se3(h * e))
-            - whitened(rig, points, observations, fit.T_left_body @ exp_se3(-h * e))
-        ).ravel()
-        / (2 * h[i])
-        for i, e in enumerate(np.eye(6))
-    ]
-    J = np.stack(columns, axis=1)
+    J = numeric_jacobian(
+        lambda xi: whitened(rig, points, observations, fit.T_left_body @ exp_se3(xi)).ravel(),
+        np.zeros(6),
+        np.r_[[1e-6] * 3, [1e-5] * 3],
+    )
     scale = np.sqrt(np.diag(fit.information))
     assert fit.information / np.outer(scale, scale) == pytest.approx(J.T @ J / np.outer(scale, scale), abs=1e-6)
 

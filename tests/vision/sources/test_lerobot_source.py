@@ -45,13 +45,7 @@ def dataset(tmp_path):
         )
         features = {key: {"dtype": "video", "shape": [48, 64, 3]} for key in KEYS}
         features["observation.state"] = {"dtype": "float32", "shape": [2], "names": ["shoulder", "elbow"]}
-        info = {
-            "codebase_version": version,
-            "fps": FPS,
-            "chunks_size": 1000,
-            "video_path": template,
-            "features": features,
-        }
+        info = {"codebase_version": version, "fps": FPS, "video_path": template, "features": features}
         (tmp_path / "meta").mkdir()
         (tmp_path / "meta" / "info.json").write_text(json.dumps(info))
         rows = [(k / FPS, e, k, [0.1 * k, float(e)]) for e in range(2) for k in range(5)]
@@ -78,6 +72,18 @@ def dataset(tmp_path):
     return write
 
 
+def described(folder, change):
+    """Change a dataset's description."""
+    path = folder / "meta" / "info.json"
+    info = json.loads(path.read_text())
+    change(info)
+    path.write_text(json.dumps(info))
+
+
+def shots(folder, tail=""):
+    return list(iter(open_source(f"lerobot:{folder}{tail}").read, None))
+
+
 @pytest.mark.parametrize("version", ["v2.1", "v3.0"])
 def test_frames_of_every_episode_are_shots(dataset, version):
     folder = dataset(version)
@@ -90,7 +96,7 @@ def test_frames_of_every_episode_are_shots(dataset, version):
         for c, image in enumerate((shot.left, shot.right)):
             assert abs(float(np.mean(image)) - (100 * c + 50 * (n // 5) + 10 * (n % 5))) < 4, (n, c)
     assert np.all(np.diff([shot.t_s for shot in found]) > 0)
-    assert len(list(iter(open_source(f"lerobot:{folder},episode=1").read, None))) == 5
+    assert len(shots(folder, ",episode=1")) == 5
     joints = LeRobotDataset(folder).joints()
     assert joints.names == ("shoulder", "elbow")
     np.testing.assert_allclose(joints.values[7], [0.2, 1.0], atol=1e-7)
@@ -115,17 +121,14 @@ def test_images_that_stand_in_the_table_are_shots(dataset, version):
     half = [table.slice(0, 4), table.slice(4)]
     parquet.write_table(half[0], file)
     parquet.write_table(half[1], file.with_name("file-001.parquet"))
-    info = json.loads((folder / "meta" / "info.json").read_text())
-    for key in KEYS:
-        info["features"][key]["dtype"] = "image"
-    (folder / "meta" / "info.json").write_text(json.dumps(info))
-    found = list(iter(open_source(f"lerobot:{folder}").read, None))
+    described(folder, lambda info: [info["features"][key].update(dtype="image") for key in KEYS])
+    found = shots(folder)
     assert [k for k, shot in enumerate(found) if shot.problem] == [7]
     assert found[7].problem.startswith("the left image cannot be read at 0.200 s: ")
     assert [(shot.left[0, 0, 0], shot.right[0, 0, 0]) for shot in found[:7]] == [
         (10 * k, 100 + 10 * k) for k in range(7)
     ]
-    second = list(iter(open_source(f"lerobot:{folder},episode=1").read, None))
+    second = shots(folder, ",episode=1")
     assert [shot.left[0, 0, 0] for shot in second if shot.problem is None] == [50, 60, 80, 90]
 
 
@@ -134,10 +137,8 @@ def test_images_that_stand_in_the_table_are_shots(dataset, version):
 )
 def test_depth_maps_are_no_cameras(dataset, where):
     folder = dataset("v3.0")
-    path = folder / "meta" / "info.json"
-    info = json.loads(path.read_text())
-    info["features"]["observation.images.depth"] = {"dtype": "video", where[0]: {where[1]: True}}
-    path.write_text(json.dumps(info))
+    depth = {"dtype": "video", where[0]: {where[1]: True}}
+    described(folder, lambda info: info["features"].update({"observation.images.depth": depth}))
     assert LeRobotDataset(folder).cameras() == sorted(KEYS)
 
 
@@ -170,12 +171,12 @@ def test_an_episode_without_its_video_is_left_out_and_said(dataset):
 def test_a_video_that_is_cut_short_gives_shots_with_a_problem(dataset):
     folder = dataset("v2.1")
     video(folder / "videos" / "chunk-000" / KEYS[0] / "episode_000000.mp4", [0, 10, 20])
-    found = list(iter(open_source(f"lerobot:{folder}").read, None))
+    found = shots(folder)
     assert [shot.problem is None for shot in found] == [True] * 3 + [False] * 2 + [True] * 5
     assert found[3].problem == "the left video has no frame at 0.300 s of episode 0"
     (folder / "videos" / "chunk-000" / KEYS[0] / "episode_000001.mp4").write_bytes(b"no video")
     with pytest.raises(InputError, match="not a video file"):
-        list(iter(open_source(f"lerobot:{folder},episode=1").read, None))
+        shots(folder, ",episode=1")
 
 
 @pytest.mark.parametrize(
@@ -191,9 +192,6 @@ def test_a_video_that_is_cut_short_gives_shots_with_a_problem(dataset):
 )
 def test_a_dataset_that_cannot_be_read_is_one_line(dataset, change, said):
     folder = dataset("v2.1")
-    path = folder / "meta" / "info.json"
-    info = json.loads(path.read_text())
-    change(info)
-    path.write_text(json.dumps(info))
+    described(folder, change)
     with one_line(match=said):
         open_source(f"lerobot:{folder}")
