@@ -64,3 +64,23 @@ def rendered(seed, size=(360, 270), noise=2.0):
     there = focal * baseline / np.take_along_axis(depth_right, k, axis=1)
     truth = TrueDisparity(d, (column >= 0) & (np.abs(there - d) < 1))
     return with_noise(left, noise, rng), with_noise(right, noise, rng), truth
+
+
+def at(image, y, x):
+    """A grey level, of the nearest pixel where (y, x) is outside of the image."""
+    height, width = image.shape
+    return int(image[min(max(y, 0), height - 1), min(max(x, 0), width - 1)])
+
+
+def raw_costs(left, right, search, steps, absent, cost):
+    """Costs pixel by pixel: ``cost(differ, y, x, d)`` of the census bits at ``steps`` that differ, else ``absent``."""
+
+    def bits(image, y, x):
+        return [at(image, y + j, x + i) < at(image, y, x) for j in steps for i in steps if (i, j) != (0, 0)]
+
+    out = np.full((*left.shape, search.count), absent)
+    for y, x in np.ndindex(left.shape):
+        for d in range(search.first, min(search.first + search.count, x + 1)):
+            differ = sum(a != b for a, b in zip(bits(left, y, x), bits(right, y, x - d), strict=True))
+            out[y, x, d - search.first] = cost(differ, y, x, d)
+    return out

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from dense_scenes import layers
+from dense_scenes import at, layers, raw_costs
 
 from armsight.vision.dense.cost import _RAW_MAX
 from armsight.vision.dense.method import Search
@@ -14,32 +14,16 @@ WAYS = {
 }
 
 
-def raw_costs(left, right, count):
-    """Census distance plus half of Birchfield and Tomasi's dissimilarity, pixel by pixel."""
-    height, width = left.shape
-
-    def at(image, y, x):
-        return int(image[min(max(y, 0), height - 1), min(max(x, 0), width - 1)])
-
-    def bits(image, y, x):
-        return [
-            at(image, y + j, x + i) < at(image, y, x) for j in range(-2, 3) for i in range(-2, 3) if (i, j) != (0, 0)
-        ]
+def birchfield_tomasi(left, right, y, x, d):
+    """Return Birchfield and Tomasi's dissimilarity."""
 
     def span(image, y, x):
         c = at(image, y, x)
         ends = [c, (c + at(image, y, x - 1)) // 2, (c + at(image, y, x + 1)) // 2]
         return c, min(ends), max(ends)
 
-    out = np.full((height, width, count), 13)
-    for y in range(height):
-        for x in range(width):
-            for d in range(min(count, x + 1)):
-                census = sum(a != b for a, b in zip(bits(left, y, x), bits(right, y, x - d), strict=True))
-                (a, a_low, a_high), (b, b_low, b_high) = span(left, y, x), span(right, y, x - d)
-                bt = min(max(0, a - b_high, b_low - a), max(0, b - a_high, a_low - b))
-                out[y, x, d] = census + min(bt, 20) // 2
-    return out
+    (a, a_low, a_high), (b, b_low, b_high) = span(left, y, x), span(right, y, x - d)
+    return min(max(0, a - b_high, b_low - a), max(0, b - a_high, a_low - b))
 
 
 def smoothed(raw):
@@ -79,8 +63,11 @@ def test_semiglobal_totals_are_those_of_the_definition(paths):
     left, right, _ = (a[30:54, 60:100] if isinstance(a, np.ndarray) else a for a in layers(noise=3.0))
     left, right = np.ascontiguousarray(left), np.ascontiguousarray(right)
     count = 12
-    total = totals(smoothed(raw_costs(left, right, count)), left, WAYS[paths])
-    found = Semiglobal(paths).search(left, right, Search(0, count))
+    search = Search(0, count)
+    raw = raw_costs(
+        left, right, search, range(-2, 3), 13, lambda n, *at: n + min(birchfield_tomasi(left, right, *at), 20) // 2
+    )
+    total, found = totals(smoothed(raw), left, WAYS[paths]), Semiglobal(paths).search(left, right, search)
     allowed = np.arange(count)[None, :] <= np.arange(left.shape[1])[:, None]
     masked = np.where(allowed, total, 10**6)
     np.testing.assert_array_equal(found.least, masked.min(axis=2))

@@ -2,31 +2,10 @@
 
 import numpy as np
 import pytest
-from dense_scenes import layers
+from dense_scenes import at, layers, raw_costs
 
 from armsight.vision.dense.block import REACH, Block
 from armsight.vision.dense.method import Search
-
-
-def raw_costs(left, right, first, count):
-    """Twice the census bits that differ and half of the absolute difference, pixel by pixel."""
-    height, width = left.shape
-
-    def at(image, y, x):
-        return int(image[min(max(y, 0), height - 1), min(max(x, 0), width - 1)])
-
-    def bits(image, y, x):
-        around = [(j, i) for j in (-2, 0, 2) for i in (-2, 0, 2) if (i, j) != (0, 0)]
-        return [at(image, y + j, x + i) < at(image, y, x) for j, i in around]
-
-    out = np.full((height, width, count), 10)
-    for y in range(height):
-        for x in range(width):
-            for d in range(first, min(first + count, x + 1)):
-                differ = sum(a != b for a, b in zip(bits(left, y, x), bits(right, y, x - d), strict=True))
-                apart = abs(at(left, y, x) - at(right, y, x - d))
-                out[y, x, d - first] = 2 * differ + min(apart, 20) // 2
-    return out
 
 
 def totals(raw, reach):
@@ -41,7 +20,12 @@ def test_totals_winners_and_agreement_are_those_of_the_definition(first):
     left, right, _ = layers(noise=3.0)
     left, right = np.ascontiguousarray(left[30:54, 60:110]), np.ascontiguousarray(right[30:54, 60:110])
     count = 10
-    total = totals(raw_costs(left, right, first, count), REACH)
+
+    def cost(differ, y, x, d):
+        """Twice the census bits that differ and half of the absolute difference."""
+        return 2 * differ + min(abs(at(left, y, x) - at(right, y, x - d)), 20) // 2
+
+    total = totals(raw_costs(left, right, Search(first, count), (-2, 0, 2), 10, cost), REACH)
     height, width, _ = total.shape
     d = first + np.arange(count)
     total[:, d[None, :] > np.arange(width)[:, None]] = 10**6
