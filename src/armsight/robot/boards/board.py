@@ -30,7 +30,7 @@ from armsight.robot.boards.configuration import (
     check_gains,
     check_pin,
 )
-from armsight.robot.boards.contract import STOPS, WRAP, Abilities
+from armsight.robot.boards.contract import STOPS, WRAP, Abilities, Closing
 from armsight.robot.boards.link import Link
 from armsight.robot.boards.reports import (
     BoardStatus,
@@ -64,7 +64,7 @@ _SET_MESSAGE_INTERVAL, _REBOOT = 511, 246  # MAV_CMD_
 _SLOW_ANGLES_US = 20000
 
 
-class Board:
+class Board(Closing):
     """A board behind a link, connected by :meth:`connect`; the link is closed with it."""
 
     welcome: Welcome  #: who it is
@@ -369,12 +369,6 @@ class Board:
     def close(self) -> None:
         """Close the link; a driven arm then does what its board does without commands."""
         self._link.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _send(self, kind: str, *values: object) -> int:
         """Send a numbered command of this session and return its number."""

@@ -62,7 +62,20 @@ class Abilities:
         return tuple(text for text, holds in texts.items() if holds)
 
 
-class MotionBoard(Protocol):
+class Closing(Protocol):
+    """What ``with`` closes at its end."""
+
+    def close(self) -> None:
+        """Close it."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+class MotionBoard(Closing, Protocol):
     """What drives the joints of an arm and reads them; time passes in :meth:`receive` and in what waits."""
 
     @property
@@ -132,16 +145,12 @@ class MotionBoard(Protocol):
         """Close the link; a driven arm then does what its board does without commands."""
         ...
 
-    def __enter__(self) -> Self: ...
-
-    def __exit__(self, *_: object) -> None: ...
-
 
 #: A goal further from the present position than this is a mistake, not a step of a motion.
 MOST_STEP_RAD = float(np.radians(20.0))
 
 
-class PolledBoard:
+class PolledBoard(Closing):
     """An arm's own controller that is asked for every reading: takes angles alone, and has no clock and no watchdog.
 
     A member says how it is read (``_read``, which sets ``_t_s``), how time passes (``_wait``) and where its joints are.
@@ -236,9 +245,3 @@ class PolledBoard:
     def close(self) -> None:
         """Close the port; the arm goes to its last goal and is held there, where its drives are on."""
         raise NotImplementedError
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()

@@ -87,9 +87,10 @@ def fit_swing(t_s: Array, voltage_v: Array, current_a: Array, angle_rad: Array) 
             f"the swing fits no motor: resistance {resistance:.3g} ohm, constant {constant:.3g} V s/rad; both must be"
             " positive: are current and voltage those of this motor?"
         )
-    inertia, viscous, dry, gravity = _fit_torque(
-        constant, amperes, (volts - resistance * amperes) / constant, q, step_s
-    )
+    motor_rad_s = (volts - resistance * amperes) / constant
+    viscous, dry, gravity, inertia = _fit_torque(constant * amperes, motor_rad_s, q, step_s)
+    if not inertia > 0:
+        raise InputError(f"the swing fits no motor: its inertia comes out as {inertia:.3g} kg m^2; it must be positive")
     motor = MotorFigures(resistance, constant, inertia, max(viscous, 0.0), max(dry, 0.0))
     smooth_v = _smooth(volts, step_s)
     predicted = resistance * _smooth(amperes, step_s) + constant * speed
@@ -146,7 +147,7 @@ def fit_spring(t_s: Array, voltage_v: Array, current_a: Array, angle_rad: Array)
     rotor = max(rotor, 0.05 * link)
     elastic = Elasticity(link / p, damping * link / p, link / (rotor + link))
     motor_rad_s = (volts - resistance * amperes) / constant
-    viscous, dry, gravity = _fit_load(constant * amperes, motor_rad_s, q, step_s, rotor, link)
+    viscous, dry, gravity = _fit_torque(constant * amperes, motor_rad_s, q, step_s, (rotor, link))
     motor = MotorFigures(resistance, constant, rotor + link, max(viscous, 0.0), max(dry, 0.0))
     predicted = resistance * _smooth(amperes, step_s) + constant * _smooth(q, step_s, derivative=True)
     smooth_v = _smooth(volts, step_s)
@@ -231,21 +232,6 @@ def _slow_constant(t: Array, emf_v: Array, amperes: Array, q: Array) -> tuple[fl
     return float(solution[0]), float(solution[1] / solution[0]) if solution[0] else 0.0
 
 
-def _fit_load(
-    torque: Array, motor_rad_s: Array, q: Array, step_s: float, rotor: float, link: float
-) -> tuple[float, float, float]:
-    """Return viscous and dry friction, and gravity's greatest torque, of two known inertias."""
-    speed = _smooth(motor_rad_s, step_s)
-    moved = rotor * _smooth(motor_rad_s, step_s, derivative=True)
-    moved += link * _smooth(np.gradient(q, step_s), step_s, derivative=True)
-    off = q - q.mean()
-    columns = np.column_stack([speed, *(_smooth(each, step_s) for each in (np.sign(speed), np.cos(off), np.sin(off)))])
-    sure = _sure(speed, step_s, _MOTOR_SURE)
-    sure = sure if sure.sum() > _LEAST_READINGS else np.ones(len(q), dtype=bool)
-    viscous, dry, cosine, sine = np.linalg.lstsq(columns[sure], (_smooth(torque, step_s) - moved)[sure], rcond=None)[0]
-    return float(viscous), float(dry), float(np.hypot(cosine, sine))
-
-
 def dead_spots(counts: Array, noise_counts: float, low: float, high: float) -> list[tuple[int, int]]:
     """Return where a potentiometer moved evenly by hand lost contact: first and last reading of each spot.
 
@@ -275,7 +261,6 @@ def _smooth(values: Array, step_s: float, *, derivative: bool = False, sigma_s: 
     if derivative:
         kernel = -at * kernel
         kernel /= -(kernel * at).sum()
-        kernel = kernel.copy()
     padded = np.pad(values, reach, mode="reflect", reflect_type="odd")
     smoothed: Array = np.convolve(padded, kernel, mode="valid")
     return smoothed
@@ -317,22 +302,23 @@ def _fit_flux(
 
 
 def _fit_torque(
-    constant: float, amperes: Array, motor_rad_s: Array, q: Array, step_s: float
-) -> tuple[float, float, float, float]:
-    """Return inertia, viscous and dry friction, and gravity's greatest torque.
+    torque: Array, motor_rad_s: Array, q: Array, step_s: float, inertias: tuple[float, float] | None = None
+) -> tuple[float, ...]:
+    """Return viscous and dry friction, gravity's greatest torque, and, where motor's and joint's are unknown, the inertia.
 
     The speed (n,) is the motor's by its back-EMF: at a reversal the joint stands while the motor crosses the backlash.
     """
-    speed = _smooth(motor_rad_s, step_s)
+    speed, right = _smooth(motor_rad_s, step_s), _smooth(torque, step_s)
+    gained, off = _smooth(motor_rad_s, step_s, derivative=True), q - q.mean()
+    columns = [speed, *(_smooth(each, step_s) for each in (np.sign(speed), np.cos(off), np.sin(off)))]
     sure = _sure(speed, step_s, _MOTOR_SURE)
-    off = q - q.mean()
-    alike = (_smooth(each, step_s) for each in (np.sign(speed), np.cos(off), np.sin(off)))
-    columns = np.column_stack([_smooth(motor_rad_s, step_s, derivative=True), speed, *alike])
-    solution = np.linalg.lstsq(columns[sure], constant * _smooth(amperes, step_s)[sure], rcond=None)[0]
-    inertia, viscous, dry, cosine, sine = (float(each) for each in solution)
-    if not inertia > 0:
-        raise InputError(f"the swing fits no motor: its inertia comes out as {inertia:.3g} kg m^2; it must be positive")
-    return inertia, viscous, dry, float(np.hypot(cosine, sine))
+    if inertias is None:
+        columns.append(gained)
+    else:
+        right -= inertias[0] * gained + inertias[1] * _smooth(np.gradient(q, step_s), step_s, derivative=True)
+        sure |= sure.sum() <= _LEAST_READINGS
+    viscous, dry, cosine, sine, *inertia = np.linalg.lstsq(np.column_stack(columns)[sure], right[sure], rcond=None)[0]
+    return float(viscous), float(dry), float(np.hypot(cosine, sine)), *map(float, inertia)
 
 
 def _signed(t: Array, volts: Array, amperes: Array, q: Array, speed: Array, sure: NDArray[np.bool_]) -> Array:

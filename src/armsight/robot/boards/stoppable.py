@@ -12,14 +12,14 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
 from armsight.data import Array, JointCommand, JointStates
 from armsight.errors import DeviceError
 from armsight.robot.boards.codes import BoardState, Command
-from armsight.robot.boards.contract import Abilities, MotionBoard
+from armsight.robot.boards.contract import Abilities, Closing, MotionBoard
 from armsight.robot.boards.reports import BoardStatus, JointReport, Welcome
 
 #: How long a stop waits for the board's answer, and how often the board is asked meanwhile, s.
@@ -37,7 +37,7 @@ def _of_board(name: str) -> Any:  # noqa: ANN401 - a property
     return property(lambda self: getattr(self._board, name))
 
 
-class StoppableBoard:
+class StoppableBoard(Closing):
     """A board that any thread can stop; ``stopped`` says whether a person did, until :meth:`clear_stop`."""
 
     def __init__(self, board: MotionBoard) -> None:
@@ -142,9 +142,3 @@ class StoppableBoard:
         """Close the link."""
         with self._held() as board:
             board.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()

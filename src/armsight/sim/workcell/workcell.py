@@ -32,7 +32,7 @@ from armsight.robot.boards.configuration import (
     check_configuration,
     pin_number,
 )
-from armsight.robot.boards.contract import MotionBoard
+from armsight.robot.boards.contract import Closing, MotionBoard
 from armsight.robot.boards.emulated import EmulatedLink
 from armsight.robot.boards.emulators import open_emulator
 from armsight.robot.boards.link import TICK_S
@@ -291,7 +291,7 @@ def _driven(
     return plant, link, board, partial(gravity_duty, model, links, motors)
 
 
-class Workcell:
+class Workcell(Closing):
     """An arm, its board, two cameras and a body; :meth:`open` builds one.
 
     ``model`` is the arm as it is assumed to be: all that an estimator may know of it. ``link`` is the wire to our
@@ -476,9 +476,3 @@ class Workcell:
         """End the firmware and the threads; harmless when called twice."""
         self.board.close()
         self.source.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
