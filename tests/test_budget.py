@@ -84,19 +84,21 @@ def circles(graph: dict[str, set[str]]) -> int:
 
 
 def options() -> int:
-    """Options and arguments that are options by name, of all commands, each as often as a command has it."""
+    """Options of all commands as they are declared: a declaration that several commands share counts once."""
     import click
 
     from armsight.app.main import group
 
-    def of(command: click.Command) -> int:
-        own = sum(isinstance(p, click.Option) for p in command.params)
+    def of(command: click.Command) -> set[int]:
+        own = {id(getattr(p, "declaration", p)) for p in command.params if isinstance(p, click.Option)}
         if isinstance(command, click.Group):
             context = click.Context(command)
-            own += sum(of(c) for name in command.list_commands(context) if (c := command.get_command(context, name)))
+            for name in command.list_commands(context):
+                if (below := command.get_command(context, name)) is not None:
+                    own |= of(below)
         return own
 
-    return of(group)
+    return len(of(group))
 
 
 def complexity(function: ast.AST) -> int:

@@ -1,14 +1,26 @@
-"""What many commands have: ``-o`` and ``--stream``, and the kinds of sources and boards that commands open themselves."""
+"""How commands declare their options: as the defaults of a function's parameters, or of a record's fields.
+
+    @click.command("record")
+    @declared
+    def command(source: str = argument(), shots: int | None = option("Stop after so many shots."), as_json: bool = JSON):
+
+A parameter's name is the option's, its annotation says what is read: ``Path``, a number, ``bool`` a flag, ``tuple[X, ...]``
+what may be repeated; without ``| None`` or default it is required. One declaration may serve many commands. Also here: what
+many commands have, and the kinds of sources and boards that commands open themselves.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, fields, is_dataclass
+from functools import wraps
+from inspect import signature
 from pathlib import Path
-from typing import Any, TypeVar
+from types import UnionType
+from typing import Any, get_args, get_type_hints
 
 import click
 
-_Command = TypeVar("_Command", bound=Callable[..., Any])
 #: A file or a folder.
 PATH = click.Path(path_type=Path)
 #: The simulated workcell as cameras.
@@ -21,29 +33,85 @@ LOGGED = "poses:"
 BOARD = "board: "
 #: What a cell is called among the streams.
 CELL = "cell:"
-_HELP = (
-    "Publish meanwhile: foxglove:PORT, json+tcp:PORT, json+udp:HOST:PORT, igtl:PORT or ros2:PORT; cell:NAME[@HUB] or "
-    "cell:FILE.toml reports to the hub of the site; may be repeated (docs/howto/recordings.md, docs/howto/cells.md)."
-)
+_TYPES = {Path: PATH, int: click.INT, float: click.FLOAT}  # others are texts
 
 
-def output(metavar: str, text: str, *name: str, **attributes: Any) -> Callable[..., Any]:  # noqa: ANN401 - click's own
-    """Return the option ``-o``: what is written, what its help says, and the parameter's name where it is another."""
-    shown = "default" in attributes
-    return click.option(
-        "-o", "--output", *name, metavar=metavar, type=PATH, help=text, show_default=shown, **attributes
-    )
+@dataclass(frozen=True, eq=False)
+class Declaration:
+    """An option or an argument: its names, where they do not follow from the parameter's, and click's attributes."""
+
+    names: tuple[str, ...]
+    attributes: Mapping[str, Any]
+    is_argument: bool = False
+
+    def parameter(self, name: str, kind: Any) -> click.Parameter:  # noqa: ANN401 - an annotation
+        """Return it as click's, for a parameter of this name and annotation."""
+        kinds = [each for each in get_args(kind) if each is not type(None)] if isinstance(kind, UnionType) else [kind]
+        many = Ellipsis in get_args(kinds[0])
+        single = get_args(kinds[0])[0] if many else kinds[0]
+        given: dict[str, Any] = {"type": _TYPES.get(single), **self.attributes}
+        if limits := {key: given.pop(key) for key in ("min", "max", "min_open") if key in given}:
+            given["type"] = {int: click.IntRange, float: click.FloatRange}[single](**limits)
+        if "choices" in given:
+            given["type"] = click.Choice(list(given.pop("choices")))
+        if self.is_argument:
+            return click.Argument([name], **{"nargs": -1 if many else 1, **given})
+        names = [name, *(self.names or (f"--{name.replace('_', '-')}",))]
+        if single is bool:
+            return _Option(self, names, is_flag=True, help=given["help"])
+        needed = not (isinstance(kind, UnionType) or many or "default" in given)
+        implied = {"multiple": many, "required": needed, "show_default": given.get("default") is not None}
+        return _Option(self, names, **{**implied, **given})
 
 
-def references_option() -> Callable[[_Command], _Command]:
-    """Give a command ``--references``."""
-    said = "Fuse an inertial unit, or compare a magnetometer (docs/howto/references.md)."
-    return click.option("--references", metavar="REFERENCES.toml", type=PATH, help=said)
+class _Option(click.Option):
+    """An option that knows its declaration, which others may share."""
+
+    def __init__(self, declaration: Declaration, *given: Any, **attributes: Any) -> None:  # noqa: ANN401 - click's
+        super().__init__(*given, **attributes)
+        self.declaration = declaration
 
 
-def stream_option(name: str = "stream") -> Callable[[_Command], _Command]:
-    """Give a command ``--stream``; its argument ``name`` is the tuple of all that is published to."""
-    return click.option("--stream", name, multiple=True, metavar="STREAM", callback=_checked, help=_HELP)
+def option(text: str, *names: str, **attributes: Any) -> Any:  # noqa: ANN401 - the default of a parameter
+    """Declare an option by its help; ``names`` such as ``-n`` where the parameter's name is not its own."""
+    return Declaration(names, {"help": text, **attributes})
+
+
+def argument(metavar: str | None = None, **attributes: Any) -> Any:  # noqa: ANN401 - as above
+    """Declare an argument."""
+    return Declaration((), {"metavar": metavar, **attributes}, True)
+
+
+def out(metavar: str, text: str, **attributes: Any) -> Any:  # noqa: ANN401 - as above
+    """Declare ``-o``: what is written, and what its help says."""
+    return option(text, "-o", "--output", metavar=metavar, **attributes)
+
+
+def _parameters(of: Any) -> Iterator[click.Parameter]:  # noqa: ANN401 - a function or a class
+    """Yield the parameters of a function or a record; a parameter that is a record is all of its fields."""
+    kinds = get_type_hints(of)
+    names = [each.name for each in fields(of)] if is_dataclass(of) else list(signature(of).parameters)
+    defaults = vars(of) if is_dataclass(of) else {k: v.default for k, v in signature(of).parameters.items()}
+    for name in names:
+        if isinstance(declaration := defaults.get(name), Declaration):
+            yield declaration.parameter(name, kinds[name])
+        elif is_dataclass(kinds[name]):
+            yield from _parameters(kinds[name])
+
+
+def declared(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Give a command the parameters that its function declares, in their order."""
+    kinds = get_type_hints(function)
+    records = {name: kinds[name] for name in signature(function).parameters if is_dataclass(kinds[name])}
+
+    @wraps(function)
+    def call(*context: Any, **given: Any) -> Any:  # noqa: ANN401 - click's
+        for name, kind in records.items():
+            given[name] = kind(**{each.name: given.pop(each.name) for each in fields(kind)})
+        return function(*context, **given)
+
+    call.__click_params__ = list(reversed(list(_parameters(function))))  # type: ignore[attr-defined]
+    return call
 
 
 def _checked(_: click.Context, __: click.Parameter, streams: tuple[str, ...]) -> tuple[str, ...]:
@@ -54,3 +122,24 @@ def _checked(_: click.Context, __: click.Parameter, streams: tuple[str, ...]) ->
 
             read_cell(spec.removeprefix(CELL))
     return streams
+
+
+JSON = option("Print one JSON object, SI units.", "--json")
+STREAM = option(
+    "Publish meanwhile: foxglove:PORT, json+tcp:PORT, json+udp:HOST:PORT, igtl:PORT or ros2:PORT; cell:NAME[@HUB] or "
+    "cell:FILE.toml reports to the hub of the site; may be repeated (docs/howto/recordings.md, docs/howto/cells.md).",
+    "--stream",
+    metavar="STREAM",
+    callback=_checked,
+)
+REFERENCES = option(
+    "Fuse an inertial unit, or compare a magnetometer (docs/howto/references.md).", metavar="REFERENCES.toml"
+)
+FIXED = option(
+    "A body in view that does not move; may be repeated. It shows cameras that move.", "--fixed", metavar="BODY"
+)
+ARM = option("The arm: a name (armsight arm list), a .toml or a .urdf file.", "--arm", default="six_r", metavar="ARM")
+FOLLOW_RIG = option("Put the rig right during a run where its cameras, or both, moved (docs/concepts/health.md).")
+ESTIMATOR = option("How poses become one estimate.", choices=("kalman", "latest"), default="kalman")
+SEED = option("Seed of all random numbers.", min=0, default=0)
+SECONDS = option("Stop after this many seconds.", min=0, min_open=True)

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from armsight.app.options import PATH, output
+from armsight.app.options import JSON, SEED, argument, declared, option, out
 from armsight.errors import InputError
-from armsight.files import check_suffix, check_writable, read_text, write_text
+from armsight.files import as_input_error, check_suffix, check_writable, read_text, write_text
 
 if TYPE_CHECKING:
     from armsight.app.arm.description import Shown
@@ -24,9 +24,8 @@ _NUMBERS = {"ignore_unknown_options": True}  # a minus before a number is no opt
 _NARROW_M = 0.15
 _POSE = ("x", "y", "z", "euler_z", "euler_y", "euler_x")
 
-_ARM = click.argument("arm_name", metavar="ARM")
-_JSON = click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
-_ANGLES = click.argument("angles", nargs=-1, metavar="Q1 Q2 ...")
+_ARM = argument("ARM")
+_ANGLES = argument("Q1 Q2 ...")
 
 
 def _print(shown: Shown, as_json: bool) -> None:
@@ -55,8 +54,8 @@ def command() -> None:
 
 
 @command.command("list")
-@_JSON
-def list_(as_json: bool) -> None:
+@declared
+def list_(as_json: bool = JSON) -> None:
     """Print the arms that come with armsight."""
     from armsight.app.arm import description
     from armsight.robot.models import MODELS
@@ -65,10 +64,12 @@ def list_(as_json: bool) -> None:
 
 
 @command.command()
-@_ARM
-@output("ARM.png", "Draw the arm at home; needs armsight[report].")
-@_JSON
-def show(arm_name: str, output: Path | None, as_json: bool) -> None:
+@declared
+def show(
+    arm_name: str = _ARM,
+    output: Path | None = out("ARM.png", "Draw the arm at home; needs armsight[report]."),
+    as_json: bool = JSON,
+) -> None:
     """Print an arm's table, limits and reach."""
     if output is not None:
         _check_written(output, arm_name, suffix=".png", what="a figure of the arm")
@@ -84,10 +85,8 @@ def show(arm_name: str, output: Path | None, as_json: bool) -> None:
 
 
 @command.command(context_settings=_NUMBERS)
-@_ARM
-@_ANGLES
-@_JSON
-def fk(arm_name: str, angles: tuple[str, ...], as_json: bool) -> None:
+@declared
+def fk(arm_name: str = _ARM, angles: tuple[str, ...] = _ANGLES, as_json: bool = JSON) -> None:
     """Print the pose of the tool at joint angles, in degrees.
 
     Of a corrected.toml the angles are readings: curves of the sensors and compliance are corrected, too.
@@ -109,10 +108,8 @@ def fk(arm_name: str, angles: tuple[str, ...], as_json: bool) -> None:
 
 
 @command.command(context_settings=_NUMBERS)
-@_ARM
-@_ANGLES
-@_JSON
-def jacobian(arm_name: str, angles: tuple[str, ...], as_json: bool) -> None:
+@declared
+def jacobian(arm_name: str = _ARM, angles: tuple[str, ...] = _ANGLES, as_json: bool = JSON) -> None:
     """Print the Jacobian of the tool's point in base axes at joint angles, in degrees."""
     from armsight.app.arm import description
     from armsight.robot.arm_file import open_arm
@@ -122,10 +119,10 @@ def jacobian(arm_name: str, angles: tuple[str, ...], as_json: bool) -> None:
 
 
 @command.command(context_settings=_NUMBERS)
-@_ARM
-@click.argument("numbers", nargs=-1, metavar="X Y Z EULER_Z EULER_Y EULER_X")
-@_JSON
-def ik(arm_name: str, numbers: tuple[str, ...], as_json: bool) -> int:
+@declared
+def ik(
+    arm_name: str = _ARM, numbers: tuple[str, ...] = argument("X Y Z EULER_Z EULER_Y EULER_X"), as_json: bool = JSON
+) -> int:
     """Print every set of joint angles that brings the tool to a pose: x y z in mm, Euler angles in degrees.
 
     The rotation is Rz(euler_z) Ry(euler_y) Rx(euler_x); ROS calls euler_x roll. Exit code 1 where no joint angles within
@@ -149,10 +146,8 @@ def ik(arm_name: str, numbers: tuple[str, ...], as_json: bool) -> int:
 
 
 @command.command()
-@_ARM
-@output("ARM.urdf", "The file to write.", required=True)
-@_JSON
-def urdf(arm_name: str, output: Path, as_json: bool) -> None:
+@declared
+def urdf(arm_name: str = _ARM, output: Path = out("ARM.urdf", "The file to write."), as_json: bool = JSON) -> None:
     """Write an arm as a URDF file."""
     _check_written(output, arm_name, suffix=".urdf", what="an arm")
 
@@ -165,17 +160,19 @@ def urdf(arm_name: str, output: Path, as_json: bool) -> None:
 
 
 @command.command()
-@_ARM
-@click.argument("file", metavar="FILE")
-@click.option(
-    *("-o", "--output"),
-    metavar="OUT",
-    type=PATH,
-    help="Write FILE's arm: .urdf, or .yaml as the maker's driver reads it; one that exists is kept as OUT.old.",
-)
-@click.option("--yes", is_flag=True, help="Do not ask before OUT is replaced.")
-@_JSON
-def calibrated(arm_name: str, file: str, output: Path | None, yes: bool, as_json: bool) -> None:
+@declared
+def calibrated(
+    arm_name: str = _ARM,
+    file: str = argument("FILE"),
+    output: Path | None = option(
+        "Write FILE's arm: .urdf, or .yaml as the maker's driver reads it; one that exists is kept as OUT.old.",
+        "-o",
+        "--output",
+        metavar="OUT",
+    ),
+    yes: bool = option("Do not ask before OUT is replaced."),
+    as_json: bool = JSON,
+) -> None:
     """Print how far a single arm's calibrated table puts the tool from that of its kind, ARM; convert it.
 
     FILE is the calibration of a Universal Robots arm (.yaml, or its controller's calibration.conf) or of an xArm (.yaml),
@@ -211,24 +208,19 @@ def calibrated(arm_name: str, file: str, output: Path | None, yes: bool, as_json
 
 
 @command.command()
-@_ARM
-@click.option(
-    "--around",
-    required=True,
-    metavar="RUN",
-    type=PATH,
-    help="An earlier run of this arm before these cameras, such as with the default motion: where the body was seen.",
-)
-@click.option(
-    "--poses", type=click.IntRange(8, 500), default=40, show_default=True, help="Poses, each from both sides."
-)
-@click.option(
-    "--cycles", type=click.IntRange(0, 1000), default=30, show_default=True, help="How often five poses come again."
-)
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seed of the choice.")
-@output("FILE.toml", "The motions to write.", required=True)
-@_JSON
-def plan(arm_name: str, around: Path, output: Path, as_json: bool, **chosen: int) -> None:
+@declared
+def plan(
+    arm_name: str = _ARM,
+    around: Path = option(
+        "An earlier run of this arm before these cameras, such as with the default motion: where the body was seen.",
+        metavar="RUN",
+    ),
+    poses: int = option("Poses, each from both sides.", min=8, max=500, default=40),
+    cycles: int = option("How often five poses come again.", min=0, max=1000, default=30),
+    seed: int = SEED,
+    output: Path = out("FILE.toml", "The motions to write."),
+    as_json: bool = JSON,
+) -> None:
     """Plan the recording of `arm report`: motions for `armsight run --open-loop --motion FILE.toml`.
 
     Poses all over where the body is seen, each from both sides of every joint, and five of them again and again.
@@ -240,7 +232,7 @@ def plan(arm_name: str, around: Path, output: Path, as_json: bool, **chosen: int
     from armsight.robot.arm_file import open_arm
 
     arm = open_arm(arm_name)
-    text, extent = plan_report(arm, seen_angles(around, arm), seen_by(around), **chosen)
+    text, extent = plan_report(arm, seen_angles(around, arm), seen_by(around), poses=poses, cycles=cycles, seed=seed)
     write_text(output, text)
     size = " x ".join(f"{100 * each:.0f}" for each in extent) + " cm"
     if extent.min() < _NARROW_M:
@@ -248,18 +240,20 @@ def plan(arm_name: str, around: Path, output: Path, as_json: bool, **chosen: int
             f"the poses are between those at which {around} saw the body, and cover only {size}: zeros, base "
             "and tool, and lengths will hardly be distinguished; first record a run whose hand-eye poses cover more"
         )
-    answer: dict[str, Any] = {"arm": arm.name, "poses": chosen["poses"], "cycles": chosen["cycles"]}
+    answer: dict[str, Any] = {"arm": arm.name, "poses": poses, "cycles": cycles}
     answer |= {"extent_m": extent.tolist(), "output": str(output)}
-    _print((answer, [f"{output}: {chosen['poses']} poses over {size}"]), as_json)
+    _print((answer, [f"{output}: {poses} poses over {size}"]), as_json)
 
 
 @command.command()
-@click.argument("run", metavar="RUN", type=PATH)
-@click.option("--arm", "arm_name", metavar="ARM", help="The nominal arm; by default the one that the run names.")
-@click.option("--compare", multiple=True, metavar="FILE.json", type=PATH, help="Another arm's report.json.")
-@output("DIR", "Folder for report.html, .pdf and .json; needs armsight[report].")
-@_JSON
-def report(run: Path, arm_name: str | None, compare: tuple[Path, ...], output: Path | None, as_json: bool) -> None:
+@declared
+def report(
+    run: Path = argument("RUN"),
+    arm_name: str | None = option("The nominal arm; by default the one that the run names.", "--arm", metavar="ARM"),
+    compare: tuple[Path, ...] = option("Another arm's report.json.", metavar="FILE.json"),
+    output: Path | None = out("DIR", "Folder for report.html, .pdf and .json; needs armsight[report]."),
+    as_json: bool = JSON,
+) -> None:
     """Report what an arm does, what explains its error, and what each remedy would bring.
 
     RUN is a folder of `armsight run` or `demo`, best with the motions of `armsight arm plan`; its rests in open loop count.
@@ -307,10 +301,8 @@ def _no_options(texts: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def _number(text: str, name: str) -> float:
-    try:
+    with as_input_error(f"{name} is {text!r}; it must be a number", ValueError):
         value = float(text)
-    except ValueError:
-        raise InputError(f"{name} is {text!r}; it must be a number") from None
     if not math.isfinite(value):
         raise InputError(f"{name} is {text}; it must be a finite number")
     return value

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from armsight.app.options import output
+from armsight.app.options import ESTIMATOR, JSON, argument, declared, option, out
 
 OPERATIONS = ("measure", "replay", "identify", "check")
 REPORT = "report"
@@ -15,29 +15,22 @@ _REASONS = 3  # why recordings failed, on the terminal; half: a second mistake i
 
 
 @click.command("batch")
-@click.argument("operation", type=click.Choice((*OPERATIONS, REPORT)))
-@click.argument("recordings", metavar="'GLOB'...", nargs=-1, required=True)
-@output("DIR", "Folder of the results; report needs none.")
-@click.option("--rig", metavar="RIG.json", help="The rig, where the recordings have no camera_info, or instead of it.")
-@click.option("--target", metavar="SPEC|BODY", help="The board or body that is measured.")
-@click.option("--arm", metavar="ARM", help="The arm model.")
-@click.option("--estimator", type=click.Choice(["kalman", "latest"]), default="kalman", show_default=True)
-@click.option(
-    "--workers",
-    metavar="N|tcp://HOST:PORT",
-    help="Processes, by default as many as this machine has cores; or a Dask cluster that exists.",
-)
-@click.option("--json", "as_json", is_flag=True, help="Print the result as one JSON object.")
+@declared
 def command(
-    operation: str,
-    recordings: tuple[str, ...],
-    output: Path | None,
-    rig: str | None,
-    target: str | None,
-    arm: str | None,
-    estimator: str,
-    workers: str | None,
-    as_json: bool,
+    operation: str = argument(choices=(*OPERATIONS, REPORT)),
+    recordings: tuple[str, ...] = argument("'GLOB'...", required=True),
+    output: Path | None = out("DIR", "Folder of the results; report needs none."),
+    rig: str | None = option(
+        "The rig, where the recordings have no camera_info, or instead of it.", metavar="RIG.json"
+    ),
+    target: str | None = option("The board or body that is measured.", metavar="SPEC|BODY"),
+    arm: str | None = option("The arm model.", metavar="ARM"),
+    estimator: str = ESTIMATOR,
+    workers: str | None = option(
+        "Processes, by default as many as this machine has cores; or a Dask cluster that exists.",
+        metavar="N|tcp://HOST:PORT",
+    ),
+    as_json: bool = JSON,
 ) -> None:
     """Measure many recordings, on all cores or on a cluster; started again it goes on where it was.
 

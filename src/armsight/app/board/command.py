@@ -15,7 +15,7 @@ import click
 from click.core import ParameterSource
 
 from armsight.app.board.flash import FLASHED, PROGRAMMERS
-from armsight.app.options import PATH, output
+from armsight.app.options import JSON, SECONDS, argument, declared, option, out
 from armsight.app.show.messages import UNTRUSTED
 from armsight.errors import DeviceError, InputError
 
@@ -26,8 +26,7 @@ if TYPE_CHECKING:
     from armsight.robot.boards.codes import SensorKind
     from armsight.robot.boards.contract import MotionBoard
 
-_JSON = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-_FILE = click.argument("file", type=PATH)
+_FILE = argument()
 NOT_HOMED = "not homed since switched on: its readings are not the arm's angles (armsight board home)"
 #: The steps of a bring-up, in their order, and what each finds of a joint (``found.JointFound``).
 STEPS = {
@@ -47,18 +46,16 @@ def _new_offsets_file() -> Path:
     return unused(Path("old_offsets.json"))
 
 
-_board = click.option(
+_BOARD = option(
+    "emulated: (unicorn, qemu or host behind it), serial:PORT, feetech:PORT[,LEROBOT.json] or ar4:PORT; ,baud=N behind a "
+    "port.",
     "--board",
-    "name",
     default="emulated:unicorn",
-    show_default=True,
     metavar="BOARD",
-    help="emulated: (unicorn, qemu or host behind it), serial:PORT, feetech:PORT[,LEROBOT.json] or ar4:PORT; ,baud=N "
-    "behind a port.",
 )
-_compiler = click.option("--compiler", metavar="NAME", help="zig or gcc; by default the first one that is installed.")
-_folder = output("DIR", "Where the image is written.", default="firmware-build")
-_yes = click.option("--yes", is_flag=True, help="Do not ask.")
+_COMPILER = option("zig or gcc; by default the first one that is installed.", metavar="NAME")
+_FOLDER = out("DIR", "Where the image is written.", default="firmware-build")
+_YES = option("Do not ask.")
 
 
 def _show(as_json: bool, value: object, text: str) -> None:
@@ -93,13 +90,15 @@ def command() -> None:
 
 
 @command.command("build")
-@click.option(
-    "--board", "name", metavar="NAME", help="Build this board's image; by default the firmware that armsight emulates."
-)
-@_folder
-@_compiler
-@_JSON
-def build_(name: str | None, output: Path, compiler: str | None, as_json: bool) -> None:
+@declared
+def build_(
+    name: str | None = option(
+        "Build this board's image; by default the firmware that armsight emulates.", "--board", metavar="NAME"
+    ),
+    output: Path = _FOLDER,
+    compiler: str | None = _COMPILER,
+    as_json: bool = JSON,
+) -> None:
     """Build the firmware: for the emulated boards where armsight finds it, or a real board's image into a folder."""
     from armsight import firmware
     from armsight.app.board import text
@@ -116,12 +115,14 @@ def build_(name: str | None, output: Path, compiler: str | None, as_json: bool) 
 
 
 @command.command("flash")
-@click.option("--board", "name", default=FLASHED[0], show_default=True, metavar="NAME", help="Which board.")
-@click.option("--programmer", type=click.Choice(list(PROGRAMMERS)), help="Default: the first one that is installed.")
-@_folder
-@_compiler
-@_JSON
-def flash_(name: str, programmer: str | None, output: Path, compiler: str | None, as_json: bool) -> None:
+@declared
+def flash_(
+    name: str = option("Which board.", "--board", default=FLASHED[0], metavar="NAME"),
+    programmer: str | None = option("Default: the first one that is installed.", choices=PROGRAMMERS),
+    output: Path = _FOLDER,
+    compiler: str | None = _COMPILER,
+    as_json: bool = JSON,
+) -> None:
     """Build a board's firmware and write it to the board; what the board stored stays."""
     from armsight.app.board import text
     from armsight.app.board.flash import build_firmware, flash
@@ -137,11 +138,13 @@ def flash_(name: str, programmer: str | None, output: Path, compiler: str | None
 
 
 @command.command()
-@_board
-@click.option("--seconds", type=click.FloatRange(min=0, min_open=True), help="Stop after this many seconds.")
-@click.option("--every", type=click.FloatRange(min=0.01), default=0.5, show_default=True, help="Seconds between lines.")
-@_JSON
-def monitor(name: str, seconds: float | None, every: float, as_json: bool) -> None:
+@declared
+def monitor(
+    name: str = _BOARD,
+    seconds: float | None = SECONDS,
+    every: float = option("Seconds between lines.", min=0.01, default=0.5),
+    as_json: bool = JSON,
+) -> None:
     """Print a board's state and angles, line by line, until Ctrl-C; with --json one object per line.
 
     Nothing is commanded: the drives stay as they are.
@@ -165,13 +168,15 @@ def monitor(name: str, seconds: float | None, every: float, as_json: bool) -> No
 
 
 @command.command()
-@_board
-@click.option(
-    "--set", "changes", multiple=True, metavar="JOINT:NAME=VALUE", help="Such as 3:kp_per_rad=5 or all:ki_per_rad_s=0."
-)
-@click.option("--store", is_flag=True, help="Keep them over a restart too; only with the drives off.")
-@_JSON
-def gains(name: str, changes: tuple[str, ...], store: bool, as_json: bool) -> None:
+@declared
+def gains(
+    name: str = _BOARD,
+    changes: tuple[str, ...] = option(
+        "Such as 3:kp_per_rad=5 or all:ki_per_rad_s=0.", "--set", metavar="JOINT:NAME=VALUE"
+    ),
+    store: bool = option("Keep them over a restart too; only with the drives off."),
+    as_json: bool = JSON,
+) -> None:
     """Print the gains of all joints; with --set change them first.
 
     Changes are taken all at once, also in motion, without a jump of the duty; one that is out of range changes nothing.
@@ -197,10 +202,12 @@ def gains(name: str, changes: tuple[str, ...], store: bool, as_json: bool) -> No
 
 
 @command.command("selftest")
-@_board
-@click.option("--drives", is_flag=True, help="Let a real board move its arm, by less than 3 degrees.")
-@_JSON
-def selftest_(name: str, drives: bool, as_json: bool) -> int:
+@declared
+def selftest_(
+    name: str = _BOARD,
+    drives: bool = option("Let a real board move its arm, by less than 3 degrees."),
+    as_json: bool = JSON,
+) -> int:
     """Run the scenario set on a board: motion, a bad wire, a silent host, bad sensors, emergency stop, new gains.
 
     A real board's drives are never switched on without --drives: then it runs only what is safe at rest. Exit code 1 where
@@ -224,44 +231,23 @@ def selftest_(name: str, drives: bool, as_json: bool) -> int:
 
 
 @command.command()
-@_board
-@output(
-    "DIR",
-    "Folder of board.toml, report.html, and bringup.json, where what was found is kept.",
-    "folder",
-    default="bringup",
-)
-@click.option(
-    "--step", "steps", multiple=True, type=click.Choice(tuple(STEPS)), help="Only this step; may be repeated."
-)
-@click.option("--joint", "joints", multiple=True, type=click.IntRange(1, 6), help="Only this joint; may be repeated.")
-@click.option(
-    "--encoder",
-    "encoders",
-    multiple=True,
-    metavar="JOINT:KIND",
-    help="A joint that an encoder reads: 2:absolute, or 3:quadrature:1 with its input; may be repeated.",
-)
-@click.option("--again", is_flag=True, help="Do also what was found before.")
-@click.option(
-    *("--current", "most_current_a"),
-    type=click.FloatRange(0.05, 30),
-    default=2.0,
-    show_default=True,
-    help="What a motor may draw, A.",
-)
-@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Of an emulated board's arm.")
-@_JSON
+@declared
 def bringup(
-    name: str,
-    folder: Path,
-    steps: tuple[str, ...],
-    joints: tuple[int, ...],
-    encoders: tuple[str, ...],
-    again: bool,
-    most_current_a: float,
-    seed: int,
-    as_json: bool,
+    name: str = _BOARD,
+    folder: Path = out(
+        "DIR", "Folder of board.toml, report.html, and bringup.json, where what was found is kept.", default="bringup"
+    ),
+    steps: tuple[str, ...] = option("Only this step; may be repeated.", "--step", choices=STEPS),
+    joints: tuple[int, ...] = option("Only this joint; may be repeated.", "--joint", min=1, max=6),
+    encoders: tuple[str, ...] = option(
+        "A joint that an encoder reads: 2:absolute, or 3:quadrature:1 with its input; may be repeated.",
+        "--encoder",
+        metavar="JOINT:KIND",
+    ),
+    again: bool = option("Do also what was found before."),
+    most_current_a: float = option("What a motor may draw, A.", "--current", min=0.05, max=30, default=2.0),
+    seed: int = option("Of an emulated board's arm.", min=0, default=1),
+    as_json: bool = JSON,
 ) -> None:
     """Bring up an arm of unknown motors and potentiometers or encoders, step by step, and store its configuration.
 
@@ -323,13 +309,13 @@ def _encoders(given: tuple[str, ...]) -> dict[int, tuple[SensorKind, int]]:
 
 
 @command.command()
-@_board
-@click.option(
-    "--at-once", type=click.Choice(["1", "2", "3", "6"]), default="6", show_default=True, help="Joints at a time."
-)
-@_yes
-@_JSON
-def home(name: str, at_once: str, yes: bool, as_json: bool) -> None:
+@declared
+def home(
+    name: str = _BOARD,
+    at_once: str = option("Joints at a time.", choices=["1", "2", "3", "6"], default="6"),
+    yes: bool = _YES,
+    as_json: bool = JSON,
+) -> None:
     """Home an AR4: its joints go to their limit switches, where the encoders are set, and then to rest at 0.
 
     A board with our firmware moves nothing: quadrature encoders take where the arm stands, drives off, for their home_rad.
@@ -365,9 +351,8 @@ def home(name: str, at_once: str, yes: bool, as_json: bool) -> None:
 
 
 @command.command()
-@_board
-@_JSON
-def clear(name: str, as_json: bool) -> None:
+@declared
+def clear(name: str = _BOARD, as_json: bool = JSON) -> None:
     """Reset the emergency stop and the faults whose causes are gone; the drives stay as they are."""
     from armsight.robot.boards.codes import BoardState, Command
 
@@ -382,9 +367,8 @@ def clear(name: str, as_json: bool) -> None:
 
 
 @command.command()
-@_board
-@_JSON
-def release(name: str, as_json: bool) -> None:
+@declared
+def release(name: str = _BOARD, as_json: bool = JSON) -> None:
     """Switch the drives off: the arm sinks, support it."""
     from armsight.robot.boards.codes import Command
 
@@ -396,33 +380,25 @@ def release(name: str, as_json: bool) -> None:
 
 
 @command.command()
-@_board
-@click.option(
-    "--identified", metavar="ARM", help="Correct by what `armsight identify` found; with --arm, the arm it began with."
-)
-@click.option("--arm", "nominal", metavar="ARM", help="The nominal arm of --identified.")
-@click.option(
-    "--further", metavar="DEG,...", help="Correct by these: true angle less reported one of each joint, degrees."
-)
-@click.option("--restore", metavar="FILE", type=PATH, help="Write back what --keep has kept.")
-@click.option(
-    "--keep",
-    metavar="FILE",
-    type=PATH,
-    default=_new_offsets_file,
-    help="New file for the offsets as they were; otherwise old_offsets.json, or with -2, -3 ...",
-)
-@_yes
-@_JSON
+@declared
 def offsets(
-    name: str,
-    identified: str | None,
-    nominal: str | None,
-    further: str | None,
-    restore: Path | None,
-    keep: Path,
-    yes: bool,
-    as_json: bool,
+    name: str = _BOARD,
+    identified: str | None = option(
+        "Correct by what `armsight identify` found; with --arm, the arm it began with.", metavar="ARM"
+    ),
+    nominal: str | None = option("The nominal arm of --identified.", "--arm", metavar="ARM"),
+    further: str | None = option(
+        "Correct by these: true angle less reported one of each joint, degrees.", metavar="DEG,..."
+    ),
+    restore: Path | None = option("Write back what --keep has kept.", metavar="FILE"),
+    keep: Path = option(
+        "New file for the offsets as they were; otherwise old_offsets.json, or with -2, -3 ...",
+        metavar="FILE",
+        default=_new_offsets_file,
+        show_default=False,
+    ),
+    yes: bool = _YES,
+    as_json: bool = JSON,
 ) -> None:
     """Print the zeros where an arm keeps them, or correct them, after asking; the old ones are kept in a file first.
 
@@ -474,10 +450,10 @@ def offsets(
 
 
 @command.command()
-@click.argument("arm", type=click.Choice(["so101", "ar4"]))
-@click.option("--seconds", type=click.FloatRange(min=0, min_open=True), help="Stop after this many seconds.")
-@_JSON
-def emulate(arm: str, seconds: float | None, as_json: bool) -> None:
+@declared
+def emulate(
+    arm: str = argument(choices=["so101", "ar4"]), seconds: float | None = SECONDS, as_json: bool = JSON
+) -> None:
     """Emulate an arm with its controller at a port of this computer, until Ctrl-C: to try everything without an arm.
 
     so101 is a servo bus with backlash and droop, for feetech:PORT; ar4 a Teensy with backlash and a homing that is off.
@@ -507,10 +483,8 @@ def config() -> None:
 
 
 @config.command()
-@_board
-@output("FILE", "Write it there.")
-@_JSON
-def get(name: str, output: Path | None, as_json: bool) -> None:
+@declared
+def get(name: str = _BOARD, output: Path | None = out("FILE", "Write it there."), as_json: bool = JSON) -> None:
     """Print the configuration in use as a board.toml, or write it to a file."""
     from armsight.files import write_text
     from armsight.robot.boards.board_file import configuration_text, entries
@@ -527,10 +501,8 @@ def get(name: str, output: Path | None, as_json: bool) -> None:
 
 
 @config.command()
-@_FILE
-@_board
-@_JSON
-def diff(file: Path, name: str, as_json: bool) -> int:
+@declared
+def diff(file: Path = _FILE, name: str = _BOARD, as_json: bool = JSON) -> int:
     """Print what differs between a board.toml and the board; exit code 1 where anything does."""
     from armsight.robot.boards.board_file import entries, read_configuration
 
@@ -547,10 +519,8 @@ def diff(file: Path, name: str, as_json: bool) -> int:
 
 
 @config.command()
-@_FILE
-@_board
-@_JSON
-def store(file: Path, name: str, as_json: bool) -> None:
+@declared
+def store(file: Path = _FILE, name: str = _BOARD, as_json: bool = JSON) -> None:
     """Store a board.toml on the board, with the drives off; it is in use after the board's next start."""
     from armsight.robot.boards.board_file import read_configuration
 
@@ -562,10 +532,10 @@ def store(file: Path, name: str, as_json: bool) -> None:
 
 
 @config.command("set")
-@click.argument("changes", nargs=-1, required=True, metavar="PATH=VALUE...")
-@_board
-@_JSON
-def set_(changes: tuple[str, ...], name: str, as_json: bool) -> None:
+@declared
+def set_(
+    changes: tuple[str, ...] = argument("PATH=VALUE...", required=True), name: str = _BOARD, as_json: bool = JSON
+) -> None:
     """Change single values and store them, such as joint.3.soft_max_rad=1.2 or arm.silence_ticks=200."""
     import tomllib
 

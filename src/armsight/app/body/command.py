@@ -7,6 +7,7 @@ import json
 import click
 
 from armsight.app.body import PAPERS
+from armsight.app.options import JSON, argument, declared, option
 from armsight.errors import InputError
 from armsight.files import check_writable
 
@@ -20,23 +21,17 @@ def command() -> None:
 
 
 @command.command()
-@click.argument("path", metavar="BODY.toml")
-@click.option(
-    "--rig",
-    "rig_path",
-    metavar="RIG.json",
-    help="The cameras; by default two perfect HD cameras, f 900 px, 0.2 m apart.",
-)
-@click.option(
-    "--distance",
-    "distances",
-    multiple=True,
-    type=float,
-    metavar="M",
-    help="Distance from the cameras, m; may be repeated. 0.6, 0.8 and 1.2 by default.",
-)
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
-def check(path: str, rig_path: str | None, distances: tuple[float, ...], as_json: bool) -> int:
+@declared
+def check(
+    path: str = argument("BODY.toml"),
+    rig_path: str | None = option(
+        "The cameras; by default two perfect HD cameras, f 900 px, 0.2 m apart.", "--rig", metavar="RIG.json"
+    ),
+    distances: tuple[float, ...] = option(
+        "Distance from the cameras, m; may be repeated. 0.6, 0.8 and 1.2 by default.", "--distance", metavar="M"
+    ),
+    as_json: bool = JSON,
+) -> int:
     """Assess whether a body is identified by its discs, how well its pose is known, and what to change.
 
     Exit code 0: usable at every distance; 1: ambiguous or unusable at one of them; 2: no body file.
@@ -59,19 +54,15 @@ def check(path: str, rig_path: str | None, distances: tuple[float, ...], as_json
 
 
 @command.command()
-@click.argument("paths", nargs=-1, required=True, metavar="BODY.toml|BOARD...")
-@click.option("-o", "--output", required=True, metavar="OUT", help="The drawing: .pdf, .svg or .png.")
-@click.option("--paper", default="a4", show_default=True, type=click.Choice(list(PAPERS), case_sensitive=False))
-@click.option("--split", is_flag=True, help="Split a drawing larger than the paper into several overlapping sheets.")
-@click.option(
-    "--dpi",
-    default=600,
-    show_default=True,
-    type=click.IntRange(72, 2400),
-    help="Resolution of a .png, pixels per inch.",
-)
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
-def draw(paths: tuple[str, ...], output: str, paper: str, split: bool, dpi: int, as_json: bool) -> None:
+@declared
+def draw(
+    paths: tuple[str, ...] = argument("BODY.toml|BOARD...", required=True),
+    output: str = option("The drawing: .pdf, .svg or .png.", "-o", "--output", metavar="OUT"),
+    paper: str = option("", default="a4", type=click.Choice(list(PAPERS), case_sensitive=False)),
+    split: bool = option("Split a drawing larger than the paper into several overlapping sheets."),
+    dpi: int = option("Resolution of a .png, pixels per inch.", default=600, min=72, max=2400),
+    as_json: bool = JSON,
+) -> None:
     """Draw bodies' markers and calibration boards to scale: print at 100%, measure the bar, glue.
 
     BOARD is a spec such as chessboard:9x6:20mm. One page for each board and each plane of a body; .svg and .png have a file

@@ -2,32 +2,45 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from armsight.app.options import JSON, argument, declared, option
 from armsight.errors import InputError
 
 if TYPE_CHECKING:
     from armsight.sim.budget.plan import RigPlan
 
 
+@dataclass(frozen=True)
+class PlanOptions:
+    """The options that are keys of a plan, too."""
+
+    volume: str | None = option("Seen by the cameras: 0.4x0.4x0.3m; or a motion file.", metavar="WxHxD|MOTION.toml")
+    distance: str | None = option("From the cameras to the volume's middle: 0.8m.", metavar="LENGTH")
+    speed: str | None = option("Of the body: 0.3m/s, or 0.3m/s,20deg/s.", metavar="SPEED")
+    want: str | None = option("What 95 % of the errors are to be within: 0.1mm, or 0.1mm,0.05deg.", metavar="ERROR")
+    camera: str | None = option("A class of the catalogue, such as webcam-720p.", metavar="CLASS")
+    body: str | None = option("What is measured: a body file, or chessboard:9x6:25mm.", metavar="FILE|BOARD")
+    rig: str | None = option("A rig that there is, or a run's, beside what the run measured.", metavar="RIG.json|RUN")
+    arm: str | None = option("For the closed loop: a model's name or a file.", metavar="ARM")
+
+
 @click.command("budget")
-@click.argument("plan", nargs=-1, metavar="[PLAN.toml] [KEY=VALUE]...")
-@click.option("--volume", metavar="WxHxD|MOTION.toml", help="Seen by the cameras: 0.4x0.4x0.3m; or a motion file.")
-@click.option("--distance", metavar="LENGTH", help="From the cameras to the volume's middle: 0.8m.")
-@click.option("--speed", metavar="SPEED", help="Of the body: 0.3m/s, or 0.3m/s,20deg/s.")
-@click.option("--want", metavar="ERROR", help="What 95 % of the errors are to be within: 0.1mm, or 0.1mm,0.05deg.")
-@click.option("--camera", metavar="CLASS", help="A class of the catalogue, such as webcam-720p.")
-@click.option("--body", metavar="FILE|BOARD", help="What is measured: a body file, or chessboard:9x6:25mm.")
-@click.option("--rig", metavar="RIG.json|RUN", help="A rig that there is, or a run's, beside what the run measured.")
-@click.option("--arm", metavar="ARM", help="For the closed loop: a model's name or a file.")
-@click.option("--best", "optimise", is_flag=True, help="Choose what is left out, for each class of cameras.")
-@click.option("-o", "--output", metavar="DIR", help="Write report.html, budget.json, the rig and the body to print.")
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
-def command(plan: Sequence[str], optimise: bool, output: str | None, as_json: bool, **options: str | None) -> int:
+@declared
+def command(
+    options: PlanOptions,
+    plan: tuple[str, ...] = argument("[PLAN.toml] [KEY=VALUE]..."),
+    optimise: bool = option("Choose what is left out, for each class of cameras.", "--best"),
+    output: str | None = option(
+        "Write report.html, budget.json, the rig and the body to print.", "-o", "--output", metavar="DIR"
+    ),
+    as_json: bool = JSON,
+) -> int:
     """Say before a rig is bought what it will measure, what limits it, and what would make it better.
 
     What is left out is chosen, and said. PLAN.toml has the same keys and more (docs/howto/budget.md); KEY=VALUE replaces
@@ -39,7 +52,7 @@ def command(plan: Sequence[str], optimise: bool, output: str | None, as_json: bo
     from armsight.sim.budget.plan import planned
     from armsight.sim.budget.result import RigBudget, best, chosen
 
-    path, given = _given(plan, options)
+    path, given = _given(plan, vars(options))
     if output is not None:
         used = [path, *filter(None, map(given.get, ("rig", "arm", "body")))]
         check_folder(output, holding=REPORT_FILES, apart_from=used)
@@ -62,7 +75,7 @@ def command(plan: Sequence[str], optimise: bool, output: str | None, as_json: bo
     return report.echo(as_json=as_json, written=written) or int(not found.reached(found.moving))
 
 
-def _given(plan: Sequence[str], options: dict[str, str | None]) -> tuple[str, dict[str, Any]]:
+def _given(plan: Sequence[str], options: Mapping[str, str | None]) -> tuple[str, dict[str, Any]]:
     """Return the path of the plan, "" without one, and what KEY=VALUE and options say."""
     from armsight.sim.budget.plan import RigPlan
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import click
 
-from armsight.app.options import DETECTIONS, PATH, output
+from armsight.app.options import DETECTIONS, JSON, declared, option, out
 from armsight.app.show.messages import UNTRUSTED
 from armsight.errors import InputError
 from armsight.files import check_folder, check_outputs, check_writable
@@ -20,56 +20,37 @@ from armsight.vision.calibrate import FOLDS, MODELS
 class CalibrateOptions:
     """The options of ``armsight calibrate``, by their names; what each means is in its help."""
 
-    source: str
-    alone: str | None
-    target: str
-    lens_model: str | None
-    flat_target: bool
-    cameras: Path | None
-    refine_body: Path | None
-    folds: int
-    output: Path
-    report: Path | None
-    as_json: bool
+    source: str = option(
+        "Images: 'pairs:L*.png,R*.png', quoted; usb:0,1, recorded first, or a recording, which shows the skew; or "
+        "detections:D.csv of a body.",
+        metavar="SOURCE",
+    )
+    alone: str | None = option(
+        "Globs of more images of the target by one camera alone, or empty.", metavar="LEFT,RIGHT"
+    )
+    target: str = option(
+        "The target, such as chessboard:9x6:25mm (inner corners, square); of detections the body's points.",
+        metavar="SPEC|BODY.csv",
+    )
+    lens_model: str | None = option("Distortion model; by default the held-out error chooses.", choices=MODELS)
+    flat_target: bool = option("Do not estimate the target's deviation from its drawing.")
+    cameras: Path | None = option("Intrinsics of both cameras, with detections.", metavar="CAMERAS.json")
+    refine_body: Path | None = option("Estimate the body's points too, and write them here.", metavar="OUT.csv")
+    folds: int = option("Parts for the held-out errors.", min=2, default=FOLDS)
+    output: Path = out("RIG.json", "The rig to write.")
+    report: Path | None = option("Write an HTML report with figures; needs armsight[report].", metavar="DIR")
+    as_json: bool = JSON
 
 
 @click.command("calibrate")
-@click.option(
-    "--source",
-    required=True,
-    metavar="SOURCE",
-    help="Images: 'pairs:L*.png,R*.png', quoted; usb:0,1, recorded first, or a recording, which shows the skew; or "
-    "detections:D.csv of a body.",
-)
-@click.option("--alone", metavar="LEFT,RIGHT", help="Globs of more images of the target by one camera alone, or empty.")
-@click.option(
-    "--target",
-    required=True,
-    metavar="SPEC|BODY.csv",
-    help="The target, such as chessboard:9x6:25mm (inner corners, square); of detections the body's points.",
-)
-@click.option(
-    "--lens-model", type=click.Choice(MODELS), help="Distortion model; by default the held-out error chooses."
-)
-@click.option("--flat-target", is_flag=True, help="Do not estimate the target's deviation from its drawing.")
-@click.option("--cameras", metavar="CAMERAS.json", type=PATH, help="Intrinsics of both cameras, with detections.")
-@click.option(
-    "--refine-body", metavar="OUT.csv", type=PATH, help="Estimate the body's points too, and write them here."
-)
-@click.option(
-    "--folds", type=click.IntRange(min=2), default=FOLDS, show_default=True, help="Parts for the held-out errors."
-)
-@output("RIG.json", "The rig to write.", required=True)
-@click.option("--report", metavar="DIR", type=PATH, help="Write an HTML report with figures; needs armsight[report].")
-@click.option("--json", "as_json", is_flag=True, help="Print the result as one JSON object.")
-def command(**given: object) -> int:
+@declared
+def command(o: CalibrateOptions) -> int:
     """Calibrate two cameras, and evaluate the calibration on pairs held out of the fit.
 
     From images of a board; from a recording of one that moves before cameras that may not expose at one time; or from
     detections of a known body with known intrinsics. Exit code 3: the images contradict each other, and the rig must not
     be used.
     """
-    o = CalibrateOptions(**given)  # type: ignore[arg-type]
     images = not o.source.startswith(DETECTIONS)
     if images == (o.cameras is not None):
         raise InputError(

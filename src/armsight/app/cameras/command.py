@@ -9,13 +9,15 @@ from typing import TYPE_CHECKING
 
 import click
 
+from armsight.app.options import JSON, declared
+
 if TYPE_CHECKING:
     from armsight.vision.sources.v4l2 import VideoDevice
 
 
 @click.command("cameras")
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
-def command(as_json: bool) -> None:
+@declared
+def command(as_json: bool = JSON) -> None:
     """List the attached cameras and their modes.
 
     Two cameras of one model may share a by-id name; by-path, the USB port, distinguishes them.

@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 
 from armsight.app.check import CYCLES
-from armsight.app.options import PATH, output
+from armsight.app.options import JSON, argument, declared, option, out
 from armsight.errors import InputError
 from armsight.files import check_folder, check_writable, write_text
 
@@ -50,22 +50,20 @@ def command() -> None:
 
 
 @command.command("evaluate", cls=_Evaluate)
-@click.argument("data", metavar="RUN|POSES.csv", type=PATH)
-@click.option("--closed", is_flag=True, help="Of a run: evaluate the motions with the loop closed on vision.")
-@output("DIR", "Folder for report.html, check.json, figures; needs armsight[report].")
-@click.option(
-    "--columns", metavar="NAME=COLUMN,...", help="Names of columns in your CSV, such as x_m=X,command_x_m=X0."
-)
-@click.option(
-    "--limit",
-    "limit_texts",
-    multiple=True,
-    metavar="NAME=LENGTH",
-    help="Limit of a metric, such as AP=0.5mm: prints PASS or FAIL, exit code 1 if one fails. May be repeated.",
-)
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object, SI units.")
+@declared
 def evaluated(
-    data: Path, closed: bool, output: Path | None, columns: str | None, limit_texts: tuple[str, ...], as_json: bool
+    data: Path = argument("RUN|POSES.csv"),
+    closed: bool = option("Of a run: evaluate the motions with the loop closed on vision."),
+    output: Path | None = out("DIR", "Folder for report.html, check.json, figures; needs armsight[report]."),
+    columns: str | None = option(
+        "Names of columns in your CSV, such as x_m=X,command_x_m=X0.", metavar="NAME=COLUMN,..."
+    ),
+    limit_texts: tuple[str, ...] = option(
+        "Limit of a metric, such as AP=0.5mm: prints PASS or FAIL, exit code 1 if one fails. May be repeated.",
+        "--limit",
+        metavar="NAME=LENGTH",
+    ),
+    as_json: bool = JSON,
 ) -> int:
     """Evaluate an arm by ISO 9283: accuracy and repeatability of poses, distance, paths, drift, and a circle.
 
@@ -104,38 +102,23 @@ def evaluated(
 
 
 @command.command("plan")
-@click.option(
-    "--arm", "arm_name", required=True, metavar="ARM", help="The arm: a name (armsight arm list), a .toml or a .urdf."
-)
-@click.option(
-    "--test",
-    "name",
-    type=click.Choice(list(CYCLES)),
-    default="poses",
-    show_default=True,
-    help="Five poses in a cube; a hundred all over it; a line across it; a circle both ways.",
-)
-@click.option(
-    "--cycles", type=click.IntRange(1, 1000), help="Cycles; by default 30 for poses, 1 wide, 10 line, 3 circle."
-)
-@click.option("--centre", nargs=3, type=float, metavar="X Y Z", help="The cube's centre in the base, mm.")
-@click.option(
-    "--speed", type=click.FloatRange(1.0, 1e4), default=100.0, show_default=True, help="Speed on paths, mm/s."
-)
-@click.option(
-    "--visible-in", metavar="RUN", type=PATH, help="An earlier run; both of its cameras must see the whole test."
-)
-@output("FILE", "check.toml for armsight run --motion; .csv: the poses alone.")
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object, SI units.")
+@declared
 def plan(
-    arm_name: str,
-    name: str,
-    cycles: int | None,
-    centre: tuple[float, float, float] | None,
-    speed: float,
-    visible_in: Path | None,
-    output: Path | None,
-    as_json: bool,
+    arm_name: str = option("The arm: a name (armsight arm list), a .toml or a .urdf.", "--arm", metavar="ARM"),
+    name: str = option(
+        "Five poses in a cube; a hundred all over it; a line across it; a circle both ways.",
+        "--test",
+        choices=CYCLES,
+        default="poses",
+    ),
+    cycles: int | None = option("Cycles; by default 30 for poses, 1 wide, 10 line, 3 circle.", min=1, max=1000),
+    centre: tuple[float, float, float] | None = option(
+        "The cube's centre in the base, mm.", nargs=3, type=float, metavar="X Y Z"
+    ),
+    speed: float = option("Speed on paths, mm/s.", min=1.0, max=1e4, default=100.0),
+    visible_in: Path | None = option("An earlier run; both of its cameras must see the whole test.", metavar="RUN"),
+    output: Path | None = out("FILE", "check.toml for armsight run --motion; .csv: the poses alone."),
+    as_json: bool = JSON,
 ) -> None:
     """Plan a test in the largest cube the arm reaches, clear of its limits and of singularities.
 

@@ -7,66 +7,39 @@ from pathlib import Path
 
 import click
 
-from armsight.app.options import output, references_option
+from armsight.app.options import JSON, REFERENCES, SEED, declared, option, out
 from armsight.app.show.messages import require
 
 
 @click.command("demo")
-@output("DIR", "Folder of the run.", default="demo")
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seed of all random numbers.")
-@click.option(
-    "--arm",
-    default="worn",
-    show_default=True,
-    help="The simulated arm: nominal, used, worn, or a TOML file (docs/howto/workcell.md).",
-)
-@click.option(
-    "--model",
-    default="six_r",
-    show_default=True,
-    help="The simulated arm's model: so101 and ar4 with controllers of their own, or six joints with our firmware.",
-)
-@click.option(
-    "--cameras",
-    show_default="1280x720@60; @30 for so101 and ar4",
-    help="[NAME:]WIDTHxHEIGHT@HZ or NAME: webcams, a camera preset such as webcam-good-light, or its TOML file "
-    "(docs/concepts/camera.md).",
-)
-@click.option(
-    "--board",
-    default="emulated:unicorn",
-    show_default=True,
-    help="The controller: emulated:unicorn, emulated:qemu or emulated:host.",
-)
-@click.option(
-    "--layout",
-    default="parallel",
-    show_default=True,
-    type=click.Choice(["parallel", "verging"]),
-    help="Layout of the cameras.",
-)
-@click.option(
-    "--nominal-arm",
-    metavar="FILE",
-    help="The arm model to compute with, such as corrected.toml of armsight identify; by default the nominal table.",
-)
-@click.option("--sync-led", is_flag=True, help="Put an LED on the board's clock in view: it gives delay and skew.")
-@references_option()
-@click.option("--quick", is_flag=True, help="Fewer calibration shots and motions, no studies.")
-@click.option("--json", "as_json", is_flag=True, help="Print the summary as one JSON object.")
+@declared
 def command(
-    output: Path,
-    seed: int,
-    arm: str,
-    model: str,
-    cameras: str | None,
-    board: str,
-    layout: str,
-    nominal_arm: str | None,
-    sync_led: bool,
-    references: Path | None,
-    quick: bool,
-    as_json: bool,
+    output: Path = out("DIR", "Folder of the run.", default="demo"),
+    seed: int = SEED,
+    arm: str = option(
+        "The simulated arm: nominal, used, worn, or a TOML file (docs/howto/workcell.md).", default="worn"
+    ),
+    model: str = option(
+        "The simulated arm's model: so101 and ar4 with controllers of their own, or six joints with our firmware.",
+        default="six_r",
+    ),
+    cameras: str | None = option(
+        "[NAME:]WIDTHxHEIGHT@HZ or NAME: webcams, a camera preset such as webcam-good-light, or its TOML file "
+        "(docs/concepts/camera.md).",
+        show_default="1280x720@60; @30 for so101 and ar4",
+    ),
+    board: str = option(
+        "The controller: emulated:unicorn, emulated:qemu or emulated:host.", default="emulated:unicorn"
+    ),
+    layout: str = option("Layout of the cameras.", default="parallel", choices=["parallel", "verging"]),
+    nominal_arm: str | None = option(
+        "The arm model to compute with, such as corrected.toml of armsight identify; by default the nominal table.",
+        metavar="FILE",
+    ),
+    sync_led: bool = option("Put an LED on the board's clock in view: it gives delay and skew."),
+    references: Path | None = REFERENCES,
+    quick: bool = option("Fewer calibration shots and motions, no studies."),
+    as_json: bool = JSON,
 ) -> None:
     """Calibrate, measure the moving arm, compare the tracks, and close the loop, in a simulated workcell.
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from armsight.app.options import PATH, output
+from armsight.app.options import JSON, argument, declared, option, out
 from armsight.errors import ArmsightError, InputError
 from armsight.files import check_folder
 from armsight.vision.dense import METHODS, open_method
@@ -46,28 +46,15 @@ def command() -> None:
 
 
 @command.command("match")
-@click.argument("paths", nargs=-1, metavar="[RIG.json] [LEFT RIGHT]", type=PATH)
-@click.option(
-    "--method",
-    "name",
-    default="semiglobal",
-    show_default=True,
-    type=click.Choice(list(METHODS)),
-    help="Matching method.",
-)
-@output("DIR", "Folder for the files.", required=True)
-@click.option("--source", metavar="SOURCE", help="A sequence instead of LEFT RIGHT (see armsight record -h).")
-@click.option("--max-disparity", type=int, metavar="N", help="Disparities below N px are tried.")
-@click.option("--near", type=float, metavar="M", help="Nearest depth, m, instead of N; 3 baselines by default.")
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object a pair.")
+@declared
 def match(
-    paths: tuple[Path, ...],
-    name: str,
-    output: Path,
-    source: str | None,
-    max_disparity: int | None,
-    near: float | None,
-    as_json: bool,
+    paths: tuple[Path, ...] = argument("[RIG.json] [LEFT RIGHT]"),
+    name: str = option("Matching method.", "--method", default="semiglobal", choices=METHODS),
+    output: Path = out("DIR", "Folder for the files."),
+    source: str | None = option("A sequence instead of LEFT RIGHT (see armsight record -h).", metavar="SOURCE"),
+    max_disparity: int | None = option("Disparities below N px are tried.", metavar="N"),
+    near: float | None = option("Nearest depth, m, instead of N; 3 baselines by default.", metavar="M"),
+    as_json: bool = option("Print one JSON object a pair.", "--json"),
 ) -> None:
     """Match a pair, or every shot of a source, and write disparity, picture, and with a rig depth and point cloud.
 
@@ -142,13 +129,13 @@ def _arguments(
 
 
 @command.command("evaluate")
-@click.argument("folder", metavar="DIR", type=PATH)
-@click.option(
-    "--method", "names", multiple=True, type=click.Choice(list(METHODS)), help="May be repeated; all by default."
-)
-@output("OUT", "Write the table and error maps there.")
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
-def evaluate(folder: Path, names: tuple[str, ...], output: Path | None, as_json: bool) -> None:
+@declared
+def evaluate(
+    folder: Path = argument("DIR"),
+    names: tuple[str, ...] = option("May be repeated; all by default.", "--method", choices=METHODS),
+    output: Path | None = out("OUT", "Write the table and error maps there."),
+    as_json: bool = JSON,
+) -> None:
     """Evaluate the methods on scenes with a truth, in the folder layouts of the Middlebury benchmark.
 
     DIR is a scene or a folder of scenes. Metrics: share of pixels off by more than 0.5, 1, 2 and 4 px, mean, RMS, and

@@ -7,17 +7,19 @@ from pathlib import Path
 
 import click
 
-from armsight.app.options import output
+from armsight.app.options import JSON, argument, declared, option, out
 
 FORMS = ("csv", "parquet", "mcap", "tum", "ros2")
 
 
 @click.command("export")
-@click.argument("run", metavar="RUN")
-@click.option("--to", "form", required=True, type=click.Choice(FORMS), help="The form.")
-@output("OUT", "New or empty folder; with --to mcap a file.", required=True)
-@click.option("--json", "as_json", is_flag=True, help="Print the written files as one JSON object.")
-def command(run: str, form: str, output: Path, as_json: bool) -> None:
+@declared
+def command(
+    run: str = argument("RUN"),
+    form: str = option("The form.", "--to", choices=FORMS),
+    output: Path = out("OUT", "New or empty folder; with --to mcap a file."),
+    as_json: bool = JSON,
+) -> None:
     """Write the tables of a run or a recording in another form: CSV, Parquet, MCAP, TUM or a ROS 2 bag.
 
     RUN is the folder of armsight run, demo or record, or its run.mcap. csv and parquet: poses, the live track, joints. tum:

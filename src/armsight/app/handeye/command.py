@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from armsight.app.options import PATH, output
+from armsight.app.options import JSON, declared, option, out
 from armsight.errors import InputError, noted
 
 if TYPE_CHECKING:
@@ -27,62 +27,39 @@ if TYPE_CHECKING:
 class Options:
     """What the command line says; the names are its options'."""
 
-    robot: Path
-    eye: str
-    model: str | None
-    columns: tuple[str, ...]
-    seen: Path | None
-    camera: str | None
-    rig: Path | None
-    source: str | None
-    target: str | None
-    streams: bool
-    scale: bool
-    plan: int
-    output: Path | None
-    as_json: bool
+    robot: Path = option("Poses or joints: a table, or a recording with /tf or joint states.", metavar="POSES.csv|BAG")
+    eye: str = option(
+        "Does the arm carry the camera, or the target?",
+        choices=["in-hand", "to-hand", "in_hand", "to_hand"],
+        metavar="in-hand|to-hand",
+        callback=lambda context, option, eye: eye.replace("_", "-"),
+    )
+    model: str | None = option("The arm whose joints the table has: a name, a .toml or a .urdf file.", metavar="ARM")
+    columns: tuple[str, ...] = option(
+        "Names of columns in your table, such as x_mm=X,rx_deg=A, or of all in order, such as rx,ry,rz,x,y,z. Also: "
+        "units=mm, or units=detect where lengths cannot be metres; rotation=rotvec, wxyz, xyzw, xyz (fixed axes), XYZ "
+        "(rotated axes) ...; of a recording frames=base_link:tool0. With seen: of the target's table.",
+        metavar="[seen:]NAME=COLUMN,...",
+    )
+    seen: Path | None = option("Poses of the target in the camera.", metavar="TARGET.csv")
+    camera: str | None = option(
+        "Calibration of one camera, .json or .yaml; fit: from its images.", metavar="CAMERA|fit"
+    )
+    rig: Path | None = option("A calibrated pair of cameras.", metavar="RIG.json")
+    source: str | None = option(
+        "With --camera a quoted glob of images; with --rig a folder, a recording or pairs:LEFT,RIGHT.", metavar="SOURCE"
+    )
+    target: str | None = option("A board such as chessboard:9x6:25mm, or a body file.", metavar="SPEC|BODY")
+    streams: bool = option("Both tables are streams (t_s) whose clocks differ: find the offset.")
+    scale: bool = option("The target's size may be wrong: fit it.")
+    plan: int = option("Choose the next N poses.", metavar="N", min=0, max=50, default=0, show_default=False)
+    output: Path | None = out("DIR", "Folder for the page and the files; needs armsight[report].")
+    as_json: bool = JSON
 
 
 @click.command("handeye")
-@click.option(
-    "--robot",
-    required=True,
-    metavar="POSES.csv|BAG",
-    type=PATH,
-    help="Poses or joints: a table, or a recording with /tf or joint states.",
-)
-@click.option(
-    "--eye",
-    required=True,
-    type=click.Choice(["in-hand", "to-hand", "in_hand", "to_hand"]),
-    metavar="in-hand|to-hand",
-    callback=lambda context, option, eye: eye.replace("_", "-"),
-    help="Does the arm carry the camera, or the target?",
-)
-@click.option("--model", metavar="ARM", help="The arm whose joints the table has: a name, a .toml or a .urdf file.")
-@click.option(
-    "--columns",
-    metavar="[seen:]NAME=COLUMN,...",
-    multiple=True,
-    help="Names of columns in your table, such as x_mm=X,rx_deg=A, or of all in order, such as rx,ry,rz,x,y,z. Also: "
-    "units=mm, or units=detect where lengths cannot be metres; rotation=rotvec, wxyz, xyzw, xyz (fixed axes), XYZ (rotated "
-    "axes) ...; of a recording frames=base_link:tool0. With seen: of the target's table.",
-)
-@click.option("--seen", metavar="TARGET.csv", type=PATH, help="Poses of the target in the camera.")
-@click.option("--camera", metavar="CAMERA|fit", help="Calibration of one camera, .json or .yaml; fit: from its images.")
-@click.option("--rig", metavar="RIG.json", type=PATH, help="A calibrated pair of cameras.")
-@click.option(
-    "--source",
-    metavar="SOURCE",
-    help="With --camera a quoted glob of images; with --rig a folder, a recording or pairs:LEFT,RIGHT.",
-)
-@click.option("--target", metavar="SPEC|BODY", help="A board such as chessboard:9x6:25mm, or a body file.")
-@click.option("--streams", is_flag=True, help="Both tables are streams (t_s) whose clocks differ: find the offset.")
-@click.option("--scale", is_flag=True, help="The target's size may be wrong: fit it.")
-@click.option("--plan", metavar="N", type=click.IntRange(min=0, max=50), default=0, help="Choose the next N poses.")
-@output("DIR", "Folder for the page and the files; needs armsight[report].")
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object, SI units.")
-def command(**given: object) -> int:
+@declared
+def command(options: Options) -> int:
     """Calibrate hand and eye from your own data: robot poses, and images or poses of a target.
 
     Prints both transforms with sigma, the error on poses left out, how much of it is the arm and how much the camera, which
@@ -90,7 +67,7 @@ def command(**given: object) -> int:
     blunders, half of them are off by more than 20 mm, or a transform is known no better: the result must not be trusted.
     Forms of tables, and examples: docs/howto/handeye.md.
     """
-    options = _checked(Options(**given))  # type: ignore[arg-type]
+    options = _checked(options)
 
     from armsight.app.handeye.report import handeye_report, plan_csv
     from armsight.app.progress import steps

@@ -7,28 +7,28 @@ from pathlib import Path
 
 import click
 
-from armsight.app.options import PATH, output
+from armsight.app.options import JSON, argument, declared, option, out
 
-_JSON = click.option("--json", "as_json", is_flag=True, help="Print the result as one JSON object.")
-_HUB = click.option(
-    "--hub", "address", default="127.0.0.1:7447", show_default=True, metavar="HOST[:PORT]",
-    help="Where cells find the hub; port 7447 where none is given.",
-)  # fmt: skip
+_HUB = option(
+    "Where cells find the hub; port 7447 where none is given.", "--hub", default="127.0.0.1:7447", metavar="HOST[:PORT]"
+)
 
 
 @click.group("hub", invoke_without_command=True)
-@click.option(
-    "--listen", default="tcp/127.0.0.1:7447", show_default=True, metavar="ADDRESS",
-    help="Where cells connect: tls/0.0.0.0:7447, with --keys, for other computers.",
-)  # fmt: skip
-@click.option("--http", default="127.0.0.1:8730", show_default=True, metavar="HOST:PORT", help="Where the page is.")
-@click.option("--keys", metavar="DIR", type=PATH, help="Folder of the site's keys (armsight hub keys).")
-@click.option("--mqtt", metavar="ADDRESS", help="Publish Sparkplug B to a broker: mqtt[s]://[USER@]HOST[:PORT].")
-@output("DIR", "Folder of events and history.", default="hub")
-@_JSON
 @click.pass_context
+@declared
 def command(
-    ctx: click.Context, listen: str, http: str, keys: Path | None, mqtt: str | None, output: Path, as_json: bool
+    ctx: click.Context,
+    listen: str = option(
+        "Where cells connect: tls/0.0.0.0:7447, with --keys, for other computers.",
+        default="tcp/127.0.0.1:7447",
+        metavar="ADDRESS",
+    ),
+    http: str = option("Where the page is.", default="127.0.0.1:8730", metavar="HOST:PORT"),
+    keys: Path | None = option("Folder of the site's keys (armsight hub keys).", metavar="DIR"),
+    mqtt: str | None = option("Publish Sparkplug B to a broker: mqtt[s]://[USER@]HOST[:PORT].", metavar="ADDRESS"),
+    output: Path = out("DIR", "Folder of events and history.", default="hub"),
+    as_json: bool = JSON,
 ) -> None:
     """Show many cells on one page, first the one that needs a look; keep their events and history.
 
@@ -67,12 +67,14 @@ def command(
 
 
 @command.command("keys")
-@click.argument("site")
-@click.argument("cells", nargs=-1, metavar="CELL...")
-@output("DIR", "Folder of the keys.", default="site-keys")
-@_HUB
-@_JSON
-def keys_command(site: str, cells: tuple[str, ...], output: Path, address: str, as_json: bool) -> None:
+@declared
+def keys_command(
+    site: str = argument(),
+    cells: tuple[str, ...] = argument("CELL..."),
+    output: Path = out("DIR", "Folder of the keys.", default="site-keys"),
+    address: str = _HUB,
+    as_json: bool = JSON,
+) -> None:
     """Make the keys of SITE: for the hub, and a folder a CELL with the cell.toml that goes to its computer.
 
     Typed again it adds cells and renews what ends within 30 days. Start the hub again after it. DIR/ca.key must stay
@@ -98,14 +100,14 @@ def keys_command(site: str, cells: tuple[str, ...], output: Path, address: str, 
 
 
 @command.command("hold")
-@click.argument("cell")
-@click.argument("reason")
-@click.option(
-    "--keys", default="site-keys", show_default=True, metavar="DIR", type=PATH, help="Folder of the site's keys."
-)
-@_HUB
-@_JSON
-def hold_command(cell: str, reason: str, keys: Path, address: str, as_json: bool) -> None:
+@declared
+def hold_command(
+    cell: str = argument(),
+    reason: str = argument(),
+    keys: Path = option("Folder of the site's keys.", default="site-keys", metavar="DIR"),
+    address: str = _HUB,
+    as_json: bool = JSON,
+) -> None:
     """Ask CELL to bring its arm to rest and hold it. This is no emergency stop, which is at the cell.
 
     A cell does so only where its cell.toml says holds = true, and the request is signed by the site's key. The
@@ -127,10 +129,8 @@ def hold_command(cell: str, reason: str, keys: Path, address: str, as_json: bool
 
 
 @command.command("clocks")
-@click.argument("first", metavar="POSES", type=PATH)
-@click.argument("second", metavar="OTHERS", type=PATH)
-@_JSON
-def clocks_command(first: Path, second: Path, as_json: bool) -> None:
+@declared
+def clocks_command(first: Path = argument("POSES"), second: Path = argument("OTHERS"), as_json: bool = JSON) -> None:
     """Say how far two rigs' clocks are apart, by a motion of one body that both measured.
 
     POSES and OTHERS are tables of poses with times, such as measure -o FILE writes.
@@ -145,12 +145,14 @@ def clocks_command(first: Path, second: Path, as_json: bool) -> None:
 
 
 @command.command("push")
-@click.argument("runs", type=PATH)
-@click.argument("store")
-@click.option("--cell", "spec", required=True, metavar="NAME|cell.toml", help="Whose runs they are.")
-@click.option("--rate", type=click.FloatRange(0.01, 1e4), default=10.0, show_default=True, help="MB/s at most.")
-@_JSON
-def push_command(runs: Path, store: str, spec: str, rate: float, as_json: bool) -> None:
+@declared
+def push_command(
+    runs: Path = argument(),
+    store: str = argument(),
+    spec: str = option("Whose runs they are.", "--cell", metavar="NAME|cell.toml"),
+    rate: float = option("MB/s at most.", min=0.01, max=1e4, default=10.0),
+    as_json: bool = JSON,
+) -> None:
     """Copy the run folders in RUNS to STORE, such as s3://bucket or a folder; started again it goes on where it was.
 
     Each goes to STORE/SITE/DAY/CELL/RUN, with a manifest of sizes and SHA-256 written last. It begins only while no

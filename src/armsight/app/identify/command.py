@@ -10,59 +10,38 @@ from typing import TYPE_CHECKING
 
 import click
 
-from armsight.app.options import PATH, output
+from armsight.app.options import JSON, SEED, declared, option, out
 from armsight.errors import InputError
-from armsight.files import check_folder, check_writable, write_text
+from armsight.files import as_input_error, check_folder, check_writable, write_text
 
 if TYPE_CHECKING:
     from armsight.loop.identify.plan import Plan
 
 
 @click.group("identify", invoke_without_command=True)
-@click.option(
-    "--arm",
-    "arm_name",
-    metavar="ARM",
-    help="Required: the nominal arm, a name (armsight arm list), a .toml or a .urdf file.",
-)
-@click.option(
-    "--data",
-    metavar="POSES.csv",
-    type=PATH,
-    help="Required: joint angles, and measured poses of the tool.",
-)
-@click.option(
-    "--joints",
-    metavar="JOINTS.csv",
-    type=PATH,
-    help="The joint angles, where the poses have none: by name, row or time.",
-)
-@click.option("--validate", "other", metavar="OTHER.csv", type=PATH, help="Poses to validate with.")
-@click.option(
-    "--columns",
-    multiple=True,
-    metavar="NAME=COLUMN,...",
-    help="Names of columns in your tables, such as q1_deg=J1,p1_x_mm=X; rotation=zyx: what rx_deg, ry_deg, rz_deg mean, "
-    "which are not used without.",
-)
-@click.option(
-    "--prior", "priors", multiple=True, metavar="NAME=SIGMA", help="Sigma (m, rad) of a parameter or kind; 0 keeps it."
-)
-@output("DIR", "Folder for the corrected arm and the report; needs armsight[report].")
-@click.option("-v", "--verbose", is_flag=True, help="Print all numbers, and why the others were not fitted.")
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object, SI units.")
 @click.pass_context
+@declared
 def command(
     ctx: click.Context,
-    arm_name: str | None,
-    data: Path | None,
-    joints: Path | None,
-    other: Path | None,
-    columns: tuple[str, ...],
-    priors: tuple[str, ...],
-    output: Path | None,
-    verbose: bool,
-    as_json: bool,
+    arm_name: str | None = option(
+        "Required: the nominal arm, a name (armsight arm list), a .toml or a .urdf file.", "--arm", metavar="ARM"
+    ),
+    data: Path | None = option("Required: joint angles, and measured poses of the tool.", metavar="POSES.csv"),
+    joints: Path | None = option(
+        "The joint angles, where the poses have none: by name, row or time.", metavar="JOINTS.csv"
+    ),
+    other: Path | None = option("Poses to validate with.", "--validate", metavar="OTHER.csv"),
+    columns: tuple[str, ...] = option(
+        "Names of columns in your tables, such as q1_deg=J1,p1_x_mm=X; rotation=zyx: what rx_deg, ry_deg, rz_deg mean, "
+        "which are not used without.",
+        metavar="NAME=COLUMN,...",
+    ),
+    priors: tuple[str, ...] = option(
+        "Sigma (m, rad) of a parameter or kind; 0 keeps it.", "--prior", metavar="NAME=SIGMA"
+    ),
+    output: Path | None = out("DIR", "Folder for the corrected arm and the report; needs armsight[report]."),
+    verbose: bool = option("Print all numbers, and why the others were not fitted.", "-v", "--verbose"),
+    as_json: bool = JSON,
 ) -> None:
     """Identify an arm: its kinematic table, joint zeros, sensor errors, backlash and compliance, each with sigma.
 
@@ -116,19 +95,15 @@ def command(
 
 
 @command.command()
-@click.option(
-    "--arm", "arm_name", required=True, metavar="ARM", help="The nominal arm: a name, a .toml or a .urdf file."
-)
-@click.option("--data", metavar="DONE.csv", type=PATH, help="Poses that were measured already.")
-@click.option("--rig", metavar="RIG.json", type=PATH, help="The cameras that must see the poses.")
-@click.option(
-    "-n", "count", type=click.IntRange(min=1, max=200), default=20, show_default=True, help="Number of poses."
-)
-@click.option("--seed", type=int, default=0, show_default=True, help="Seed of the random candidates.")
-@output("PLAN.csv", "Write the poses here.")
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object, SI units.")
+@declared
 def plan(
-    arm_name: str, data: Path | None, rig: Path | None, count: int, seed: int, output: Path | None, as_json: bool
+    arm_name: str = option("The nominal arm: a name, a .toml or a .urdf file.", "--arm", metavar="ARM"),
+    data: Path | None = option("Poses that were measured already.", metavar="DONE.csv"),
+    rig: Path | None = option("The cameras that must see the poses.", metavar="RIG.json"),
+    count: int = option("Number of poses.", "-n", min=1, max=200, default=20),
+    seed: int = SEED,
+    output: Path | None = out("PLAN.csv", "Write the poses here."),
+    as_json: bool = JSON,
 ) -> None:
     """Choose the most informative poses for an identification, and predict the error after each.
 
@@ -194,8 +169,6 @@ def _priors(texts: tuple[str, ...]) -> dict[str, float]:
     out = {}
     for given in texts:
         name, _, sigma = given.partition("=")
-        try:
+        with as_input_error(f"--prior {given!r} must be NAME=SIGMA, such as a2=0.001 or alpha=0", ValueError):
             out[name] = float(sigma)
-        except ValueError:
-            raise InputError(f"--prior {given!r} must be NAME=SIGMA, such as a2=0.001 or alpha=0") from None
     return out

@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 import secrets
 import time
-from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
-from armsight.app.options import CELL, PATH, output, stream_option
+from armsight.app.options import ARM, CELL, FOLLOW_RIG, JSON, SEED, STREAM, declared, option, out
 from armsight.app.show.messages import require
 from armsight.errors import InputError
 
@@ -18,54 +19,45 @@ if TYPE_CHECKING:
     from armsight.app.live.step import SessionOptions
 
 
+@dataclass(frozen=True)
+class LiveOptions:
+    """The options that a session has (:class:`~armsight.app.live.step.SessionOptions`)."""
+
+    source: str | None = option(
+        "The cameras, such as usb:0,1 (see armsight record -h); sim: is the simulated workcell."
+    )
+    rig: Path | None = option("A calibrated rig; begins with measuring.")
+    target: str | None = option("The body that is measured: a body file or a board.")
+    calibration_board: str | None = option("The calibration board, such as chessboard:9x6:25mm.", metavar="SPEC")
+    board: str | None = option(
+        "The arm's controller: serial:PORT, feetech:PORT,LEROBOT.json, ar4:PORT; poses:FILE where another program moves "
+        "it."
+    )
+    arm: str = ARM
+    servo_calibration: Path | None = option(
+        "LeRobot's calibration file of a servo bus, whose port the page finds.", "--calibration"
+    )
+    motion: Path | None = option("The motions (TOML, docs/howto/run.md).")
+    folder: Path = out("DIR", "Folder of the session.", default="live")
+    follow_rig: bool = FOLLOW_RIG
+    seed: int = SEED
+    streams: tuple[str, ...] = STREAM
+
+
 @click.command("live")
-@click.option("--source", help="The cameras, such as usb:0,1 (see armsight record -h); sim: is the simulated workcell.")
-@click.option("--rig", type=PATH, help="A calibrated rig; begins with measuring.")
-@click.option("--target", help="The body that is measured: a body file or a board.")
-@click.option("--calibration-board", metavar="SPEC", help="The calibration board, such as chessboard:9x6:25mm.")
-@click.option(
-    "--board",
-    help="The arm's controller: serial:PORT, feetech:PORT,LEROBOT.json, ar4:PORT; poses:FILE where another program moves "
-    "it.",
-)
-@click.option(
-    "--arm",
-    default="six_r",
-    show_default=True,
-    help="The arm: a name (armsight arm list), a .toml or a .urdf file.",
-    metavar="ARM",
-)
-@click.option(
-    "--calibration",
-    "servo_calibration",
-    type=PATH,
-    help="LeRobot's calibration file of a servo bus, whose port the page finds.",
-)
-@click.option("--motion", type=PATH, help="The motions (TOML, docs/howto/run.md).")
-@click.option(
-    "--sync-ms",
-    type=click.FloatRange(0.0, 1000.0),
-    default=1.0,
-    show_default=True,
-    help="Sigma of the time between the two exposures of a shot, ms.",
-)
-@output("DIR", "Folder of the session.", "folder", default="live")
-@click.option(
-    "--http",
-    default="127.0.0.1:8722",
-    show_default=True,
-    metavar="HOST:PORT",
-    help="Where the page is; 0.0.0.0:8722 for other computers, too; port 0 takes a free one.",
-)
-@click.option(
-    "--follow-rig",
-    is_flag=True,
-    help="Put the rig right during a run where its cameras, or both, moved (docs/concepts/health.md).",
-)
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of the simulated workcell.")
-@stream_option("streams")
-@click.option("--json", "as_json", is_flag=True, help="Print the address as one JSON object.")
-def command(http: str, sync_ms: float, as_json: bool, **given: Any) -> None:  # noqa: ANN401 - options' fields
+@declared
+def command(
+    given: LiveOptions,
+    sync_ms: float = option(
+        "Sigma of the time between the two exposures of a shot, ms.", min=0.0, max=1000.0, default=1.0
+    ),
+    http: str = option(
+        "Where the page is; 0.0.0.0:8722 for other computers, too; port 0 takes a free one.",
+        default="127.0.0.1:8722",
+        metavar="HOST:PORT",
+    ),
+    as_json: bool = JSON,
+) -> None:
     """Open a page in the browser that leads from two uncalibrated cameras to a closed loop, step by step.
 
     The steps: cameras, board, calibration, body, measuring, arm, recorded, health; each shows its command line.
@@ -87,7 +79,7 @@ def command(http: str, sync_ms: float, as_json: bool, **given: Any) -> None:  # 
     from armsight.vision.sources.usb import is_one, parsed_usb
 
     host, port = host_and_port(http, "--http")
-    options = _with_calibration(SessionOptions(**given, sync_s=1e-3 * sync_ms))
+    options = _with_calibration(SessionOptions(**vars(given), sync_s=1e-3 * sync_ms))
     source = options.source or ""
     if options.source is not None and not source.startswith(SIM):
         check_source(source)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import click
 
-from armsight.app.options import DETECTIONS, PATH, output, stream_option
+from armsight.app.options import DETECTIONS, FIXED, STREAM, argument, declared, option, out
 from armsight.app.show.messages import UNTRUSTED
 
 
@@ -16,18 +15,32 @@ from armsight.app.show.messages import UNTRUSTED
 class MeasureOptions:
     """The options of ``armsight measure``, by their names; what each means is in its help."""
 
-    rig: Path
-    target: str
-    source: str
-    fixed: Sequence[str]
-    skew: str | None
-    readout: str | None
-    save_rig: Path | None
-    output: Path | None
-    stream: Sequence[str]
-    board: str | None
-    view_dir: Path | None
-    as_json: bool
+    rig: Path = argument("RIG.json")
+    target: str = option(
+        "A board such as chessboard:9x6:25mm, a body file, or calibrate's .board.toml.", metavar="SPEC|BODY"
+    )
+    source: str = option(
+        "A folder, 'pairs:L*.png,R*.png', a video, stream or pair of cameras (see armsight record -h); or "
+        "detections:D.csv, detections:bag:FILE for tags in a bag.",
+        metavar="SOURCE",
+    )
+    fixed: tuple[str, ...] = FIXED
+    skew: str | None = option(
+        "The right camera exposes later by this, such as 5ms, or find (recordings).", metavar="TIME"
+    )
+    readout: str | None = option(
+        "Rolling shutters: from the first row to the last, such as 14ms, or find.", metavar="TIME"
+    )
+    save_rig: Path | None = option(
+        "Write the rig with the skew and readout found, and the noise of a moved body's discs.", metavar="RIG2.json"
+    )
+    output: Path | None = out("POSES.csv", "Write the poses as CSV.")
+    stream: tuple[str, ...] = STREAM
+    board: str | None = option(
+        "Publish this board's joint readings, too: serial:, feetech: or ar4:PORT, emulated:.", metavar="BOARD"
+    )
+    view_dir: Path | None = option("Write annotated pictures.", "--view", metavar="DIR")
+    as_json: bool = option("Print one JSON object per shot.", "--json")
 
     @property
     def detections(self) -> str | None:
@@ -36,48 +49,8 @@ class MeasureOptions:
 
 
 @click.command("measure")
-@click.argument("rig", metavar="RIG.json", type=PATH)
-@click.option(
-    "--target",
-    required=True,
-    metavar="SPEC|BODY",
-    help="A board such as chessboard:9x6:25mm, a body file, or calibrate's .board.toml.",
-)
-@click.option(
-    "--source",
-    required=True,
-    metavar="SOURCE",
-    help="A folder, 'pairs:L*.png,R*.png', a video, stream or pair of cameras (see armsight record -h); or "
-    "detections:D.csv, detections:bag:FILE for tags in a bag.",
-)
-@click.option(
-    "--fixed",
-    multiple=True,
-    metavar="BODY",
-    help="A body in view that does not move; may be repeated. It shows cameras that move.",
-)
-@click.option(
-    "--skew", metavar="TIME", help="The right camera exposes later by this, such as 5ms, or find (recordings)."
-)
-@click.option(
-    "--readout", metavar="TIME", help="Rolling shutters: from the first row to the last, such as 14ms, or find."
-)
-@click.option(
-    "--save-rig",
-    metavar="RIG2.json",
-    type=PATH,
-    help="Write the rig with the skew and readout found, and the noise of a moved body's discs.",
-)
-@output("POSES.csv", "Write the poses as CSV.")
-@stream_option()
-@click.option(
-    "--board",
-    metavar="BOARD",
-    help="Publish this board's joint readings, too: serial:, feetech: or ar4:PORT, emulated:.",
-)
-@click.option("--view", "view_dir", metavar="DIR", type=PATH, help="Write annotated pictures.")
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object per shot.")
-def command(**given: object) -> None:
+@declared
+def command(options: MeasureOptions) -> None:
     """Measure the pose of a target in the left camera's frame, with its uncertainty.
 
     RIG.json may also be bag:FILE, a recording that holds the camera_info of a stereo pair. A shot that cannot be read or
@@ -90,5 +63,5 @@ def command(**given: object) -> None:
     """
     from armsight.app.measure.run import measure_shots
 
-    if any(each.forbids for each in measure_shots(MeasureOptions(**given))):  # type: ignore[arg-type]
+    if any(each.forbids for each in measure_shots(options)):
         click.get_current_context().exit(UNTRUSTED)

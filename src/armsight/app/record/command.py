@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from armsight.app.options import output, stream_option
+from armsight.app.options import JSON, SECONDS, STREAM, argument, declared, option, out
 from armsight.errors import ArmsightError
 
 if TYPE_CHECKING:
@@ -18,21 +18,16 @@ if TYPE_CHECKING:
 
 
 @click.command("record")
-@click.argument("source")
-@output("DIR", "New or empty folder.", required=True)
-@click.option("--shots", type=click.IntRange(min=1), help="Stop after so many shots.")
-@click.option("--seconds", type=click.FloatRange(min=0, min_open=True), help="Stop after so many seconds.")
-@stream_option()
-@click.option("--json", "as_json", is_flag=True, help="Print the result as one JSON object.")
 @click.pass_context
+@declared
 def command(
     ctx: click.Context,
-    source: str,
-    output: Path,
-    shots: int | None,
-    seconds: float | None,
-    stream: tuple[str, ...],
-    as_json: bool,
+    source: str = argument(),
+    output: Path = out("DIR", "New or empty folder."),
+    shots: int | None = option("Stop after so many shots.", min=1),
+    seconds: float | None = SECONDS,
+    stream: tuple[str, ...] = STREAM,
+    as_json: bool = JSON,
 ) -> None:
     """Store the shots of SOURCE in a folder, with their time stamps; the folder is then a source itself.
 

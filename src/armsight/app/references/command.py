@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from armsight.app.options import PATH, output
+from armsight.app.options import JSON, argument, declared, option, out
 
 if TYPE_CHECKING:
     from armsight.app.show.report import Grade, Report
@@ -47,9 +47,8 @@ def command() -> None:
 
 
 @command.command()
-@click.argument("path", metavar="REFERENCES.toml", type=PATH)
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
-def check(path: Path, as_json: bool) -> None:
+@declared
+def check(path: Path = argument("REFERENCES.toml"), as_json: bool = JSON) -> None:
     """Say what the recordings of references are like: rate, gaps, clock, noise at rest beside that of their class."""
     from armsight.loop.references.file import read_references
 
@@ -57,11 +56,13 @@ def check(path: Path, as_json: bool) -> None:
 
 
 @command.command()
-@click.argument("path", metavar="REFERENCES.toml", type=PATH)
-@click.option("--poses", required=True, metavar="POSES.csv", help="Poses of the tool in the base, with times t_s.")
-@output("OUT.toml", "Where to write the result.")
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
-def calibrate(path: Path, poses: str, output: Path | None, as_json: bool) -> None:
+@declared
+def calibrate(
+    path: Path = argument("REFERENCES.toml"),
+    poses: str = option("Poses of the tool in the base, with times t_s.", metavar="POSES.csv"),
+    output: Path | None = out("OUT.toml", "Where to write the result."),
+    as_json: bool = JSON,
+) -> None:
     """Find mounting, biases, scales, iron and delay from one sweep with poses by vision or by the arm."""
     from armsight.files import check_writable, write_text
     from armsight.loop.references.file import read_references, written
@@ -78,11 +79,13 @@ def calibrate(path: Path, poses: str, output: Path | None, as_json: bool) -> Non
 
 
 @command.command()
-@click.argument("path", metavar="REFERENCES.toml", type=PATH)
-@click.option("--model", required=True, metavar="ARM", help="The arm: a name of armsight arm list, or a file.")
-@click.option("--joints", required=True, metavar="JOINTS.csv", help="Joint angles of 8 rests or more, with times t_s.")
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
-def gravity(path: Path, model: str, joints: str, as_json: bool) -> None:
+@declared
+def gravity(
+    path: Path = argument("REFERENCES.toml"),
+    model: str = option("The arm: a name of armsight arm list, or a file.", metavar="ARM"),
+    joints: str = option("Joint angles of 8 rests or more, with times t_s.", metavar="JOINTS.csv"),
+    as_json: bool = JSON,
+) -> None:
     """Find the base's tilt and the joint zeros that gravity shows at rests; the others are named as open."""
     from armsight.loop.references.file import read_references
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from armsight.app.options import PATH, output, references_option, stream_option
+from armsight.app.options import ESTIMATOR, JSON, REFERENCES, STREAM, argument, declared, option, out
 
 if TYPE_CHECKING:
     from armsight.app.replay.run import Replayed
@@ -21,37 +21,19 @@ _REASONS = 3
 
 
 @click.command("replay")
-@click.argument("recording", metavar="RUN|BAG")
-@output("DIR", "Write the tables to this folder.")
-@click.option("--rig", metavar="RIG.json", help="Another rig: needs images or tags in the recording.")
-@click.option("--target", metavar="SPEC|BODY", help="Another body: needs images or tags in the recording.")
-@click.option("--arm", metavar="ARM", help="Another arm model.")
-@click.option("--estimator", type=click.Choice(["kalman", "latest"]), default="kalman", show_default=True)
-@references_option()
-@click.option(
-    "--rate", type=click.FloatRange(min=0), default=0.0, help="1 is real time; by default as fast as possible."
-)
-@stream_option()
-@click.option(
-    "--compare",
-    "other",
-    metavar="DIR",
-    type=PATH,
-    help="Show what differs from the tables in this folder.",
-)
-@click.option("--json", "as_json", is_flag=True, help="Print the result as one JSON object.")
+@declared
 def command(
-    recording: str,
-    output: Path | None,
-    rig: str | None,
-    target: str | None,
-    arm: str | None,
-    estimator: str,
-    references: Path | None,
-    rate: float,
-    stream: tuple[str, ...],
-    other: Path | None,
-    as_json: bool,
+    recording: str = argument("RUN|BAG"),
+    output: Path | None = out("DIR", "Write the tables to this folder."),
+    rig: str | None = option("Another rig: needs images or tags in the recording.", metavar="RIG.json"),
+    target: str | None = option("Another body: needs images or tags in the recording.", metavar="SPEC|BODY"),
+    arm: str | None = option("Another arm model.", metavar="ARM"),
+    estimator: str = ESTIMATOR,
+    references: Path | None = REFERENCES,
+    rate: float = option("1 is real time; by default as fast as possible.", min=0, default=0.0, show_default=False),
+    stream: tuple[str, ...] = STREAM,
+    other: Path | None = option("Show what differs from the tables in this folder.", "--compare", metavar="DIR"),
+    as_json: bool = JSON,
 ) -> None:
     """Measure and estimate again what was recorded, also with another rig, body, arm or estimator.
 

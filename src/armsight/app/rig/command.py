@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from armsight.app.options import PATH
+from armsight.app.options import JSON, argument, declared, option
 from armsight.errors import InputError
 from armsight.files import check_outputs, check_writable
 from armsight.vision.rigfiles import ASSUMED_SIGMA_PX, EXPORTED, FORMATS, export_rig, import_rig, open_format
@@ -31,9 +31,8 @@ def command() -> None:
 
 
 @command.command()
-@click.argument("path", metavar="RIG.json")
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
-def show(path: str, as_json: bool) -> None:
+@declared
+def show(path: str = argument("RIG.json"), as_json: bool = JSON) -> None:
     """Print the contents of a rig file, with standard deviations where they are known."""
     from armsight.vision.rig import StereoRig
 
@@ -42,29 +41,18 @@ def show(path: str, as_json: bool) -> None:
 
 
 @command.command("import")
-@click.argument("files", nargs=-1, required=True)
-@click.option("-o", "--output", required=True, metavar="RIG.json", help="The rig file to write.")
-@click.option(
-    "--format", "name", type=click.Choice(list(FORMATS)), help="The other program; by default found by content."
-)
-@click.option("--unit-m", type=float, help="Length of the file's unit of translation, m; OpenCV files need it.")
-@click.option(
-    "--pair", metavar="LEFT,RIGHT", help="Names of the two cameras in a file of more; by default the first two."
-)
-@click.option("--image-size", metavar="WxH", help="Image size, px; OpenCV files without one need it.")
-@click.option(
-    "--sigma-px", type=float, default=ASSUMED_SIGMA_PX, show_default=True, help="Standard deviation of a detection, px."
-)
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
+@declared
 def import_(
-    files: tuple[str, ...],
-    output: str,
-    name: str | None,
-    unit_m: float | None,
-    pair: str | None,
-    image_size: str | None,
-    sigma_px: float,
-    as_json: bool,
+    files: tuple[str, ...] = argument(required=True),
+    output: str = option("The rig file to write.", "-o", "--output", metavar="RIG.json"),
+    name: str | None = option("The other program; by default found by content.", "--format", choices=FORMATS),
+    unit_m: float | None = option("Length of the file's unit of translation, m; OpenCV files need it."),
+    pair: str | None = option(
+        "Names of the two cameras in a file of more; by default the first two.", metavar="LEFT,RIGHT"
+    ),
+    image_size: str | None = option("Image size, px; OpenCV files without one need it.", metavar="WxH"),
+    sigma_px: float = option("Standard deviation of a detection, px.", default=ASSUMED_SIGMA_PX),
+    as_json: bool = JSON,
 ) -> None:
     """Convert another program's calibration to a rig file. Its uncertainty is unknown, which the rig file records."""
     size = None if image_size is None else _image_size(image_size)
@@ -83,12 +71,14 @@ def import_(
 
 
 @command.command()
-@click.argument("path", metavar="RIG.json")
-@click.argument("more", nargs=-1, metavar="[OUT]...")
-@click.option("-o", "--output", multiple=True, required=True, metavar="OUT", help="File to write; may be repeated.")
-@click.option("--format", "name", required=True, type=click.Choice(list(EXPORTED)), help="The other program.")
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
-def export(path: str, more: tuple[str, ...], output: tuple[str, ...], name: str, as_json: bool) -> None:
+@declared
+def export(
+    path: str = argument("RIG.json"),
+    more: tuple[str, ...] = argument("[OUT]..."),
+    output: tuple[str, ...] = option("File to write; may be repeated.", "-o", "--output", metavar="OUT", required=True),
+    name: str = option("The other program.", "--format", choices=EXPORTED),
+    as_json: bool = JSON,
+) -> None:
     """Write a rig for another program, and print what its format cannot hold.
 
     OUT are the format's files in the order of armsight rig -h, such as -o left.yaml -o right.yaml; after the first -o the
@@ -113,17 +103,17 @@ def export(path: str, more: tuple[str, ...], output: tuple[str, ...], name: str,
 
 
 @command.command("update")
-@click.argument("run", type=PATH)
-@click.option("-o", "--output", required=True, metavar="RIG.json", help="The rig file to write.")
-@click.option(
-    "--since",
-    type=float,
-    metavar="S",
-    help="Use shots from this time on, board's clock, s; by default from when the run found that the cameras had moved.",
-)
-@click.option("--report", type=PATH, metavar="DIR", help="Folder for a page: old rig beside new.")
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
-def update_(run: Path, output: str, since: float | None, report: Path | None, as_json: bool) -> None:
+@declared
+def update_(
+    run: Path = argument(),
+    output: str = option("The rig file to write.", "-o", "--output", metavar="RIG.json"),
+    since: float | None = option(
+        "Use shots from this time on, board's clock, s; by default from when the run found that the cameras had moved.",
+        metavar="S",
+    ),
+    report: Path | None = option("Folder for a page: old rig beside new.", metavar="DIR"),
+    as_json: bool = JSON,
+) -> None:
     """Estimate the relative pose of a run's cameras again, from the body that the run saw: without a board.
 
     RUN is the folder of armsight run or armsight demo. The body's file gives the scale; the calibration stays the prior of

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from armsight.app.options import LOGGED, PATH, SIM, output, references_option, stream_option
+from armsight.app.options import ARM, FIXED, FOLLOW_RIG, JSON, LOGGED, REFERENCES, SIM, STREAM, declared, option, out
 from armsight.app.show.messages import UNTRUSTED, require
 from armsight.errors import InputError
 from armsight.files import read_text, write_text
@@ -24,79 +24,39 @@ _CYCLES, _SPEED_M_S = 3, 0.1
 
 
 @click.command("run")
-@click.option(
-    "--source",
-    "source_spec",
-    required=True,
-    help="Where shots come from, such as usb:0,1 (docs/howto/sources.md); sim: is the simulated workcell.",
-)
-@click.option(
-    "--board",
-    "board_spec",
-    required=True,
-    help="The controller: serial:PORT, feetech:PORT,LEROBOT.json, ar4:PORT (docs/howto/board.md); emulated: with sim:;"
-    " poses:FILE where another program moves the arm and logs its angles.",
-)
-@click.option("--rig", "rig_path", required=True, type=PATH, help="The calibrated rig, rig.json.")
-@click.option("--target", "target_spec", required=True, help="The body on the tool: a body file of discs.")
-@click.option(
-    "--fixed",
-    multiple=True,
-    metavar="BODY",
-    help="A body in view that does not move; may be repeated. It shows cameras that move.",
-)
-@click.option(
-    "--arm",
-    "arm_spec",
-    default="six_r",
-    show_default=True,
-    help="The arm: a name (armsight arm list), a .toml or a .urdf file.",
-    metavar="ARM",
-)
-@click.option(
-    "--motion",
-    type=PATH,
-    help="The motions (TOML, docs/howto/run.md). Without: of six_r five poses, a line and a circle, of others five poses "
-    "three times in the largest cube within reach (armsight check plan).",
-)
-@click.option(
-    "--sync-ms",
-    type=click.FloatRange(min=0.0, max=1_000.0),
-    default=0.1,
-    show_default=True,
-    help="Sigma of the time between the exposures of a shot before a sweep of the arm finds it, ms; sim: knows its own.",
-)
-@stream_option()
-@click.option(
-    "--sync-led",
-    is_flag=True,
-    help="The board's sync LED (docs/howto/board.md) is in view of both cameras: it gives delay and skew.",
-)
-@references_option()
-@click.option("--open-loop", is_flag=True, help="Control by the joint sensors alone; do not close the loop on vision.")
-@click.option(
-    "--follow-rig",
-    is_flag=True,
-    help="Put the rig right during the run where its cameras, or both, moved (docs/concepts/health.md).",
-)
-@output("DIR", "Folder of the run.", default="run")
-@click.option("--json", "as_json", is_flag=True, help="Print the summary as one JSON object.")
+@declared
 def command(
-    source_spec: str,
-    board_spec: str,
-    rig_path: Path,
-    target_spec: str,
-    fixed: tuple[str, ...],
-    arm_spec: str,
-    motion: Path | None,
-    sync_ms: float,
-    stream: tuple[str, ...],
-    sync_led: bool,
-    references: Path | None,
-    open_loop: bool,
-    follow_rig: bool,
-    output: Path,
-    as_json: bool,
+    source_spec: str = option(
+        "Where shots come from, such as usb:0,1 (docs/howto/sources.md); sim: is the simulated workcell.", "--source"
+    ),
+    board_spec: str = option(
+        "The controller: serial:PORT, feetech:PORT,LEROBOT.json, ar4:PORT (docs/howto/board.md); emulated: with sim:;"
+        " poses:FILE where another program moves the arm and logs its angles.",
+        "--board",
+    ),
+    rig_path: Path = option("The calibrated rig, rig.json.", "--rig"),
+    target_spec: str = option("The body on the tool: a body file of discs.", "--target"),
+    fixed: tuple[str, ...] = FIXED,
+    arm_spec: str = ARM,
+    motion: Path | None = option(
+        "The motions (TOML, docs/howto/run.md). Without: of six_r five poses, a line and a circle, of others five poses "
+        "three times in the largest cube within reach (armsight check plan)."
+    ),
+    sync_ms: float = option(
+        "Sigma of the time between the exposures of a shot before a sweep of the arm finds it, ms; sim: knows its own.",
+        min=0.0,
+        max=1_000.0,
+        default=0.1,
+    ),
+    stream: tuple[str, ...] = STREAM,
+    sync_led: bool = option(
+        "The board's sync LED (docs/howto/board.md) is in view of both cameras: it gives delay and skew."
+    ),
+    references: Path | None = REFERENCES,
+    open_loop: bool = option("Control by the joint sensors alone; do not close the loop on vision."),
+    follow_rig: bool = FOLLOW_RIG,
+    output: Path = out("DIR", "Folder of the run.", default="run"),
+    as_json: bool = JSON,
 ) -> None:
     """Run the experiment on a real arm: hand-eye calibration, the motions, the loop closed on vision.
 

@@ -8,13 +8,14 @@ from typing import Any
 
 import click
 
-from armsight.app.options import PATH
+from armsight.app.options import argument, declared, option
 
 
 @click.command("serve")
-@click.argument("config", metavar="CONFIG.toml", type=PATH)
-@click.option("--json", "as_json", is_flag=True, help="Print each event as one JSON object.")
-def command(config: Path, as_json: bool) -> None:
+@declared
+def command(
+    config: Path = argument("CONFIG.toml"), as_json: bool = option("Print each event as one JSON object.", "--json")
+) -> None:
     """Keep `armsight measure` going for days.
 
     CONFIG.toml has the options of `armsight measure` by their long names, and how it is served (docs/howto/serve.md). A

@@ -10,20 +10,22 @@ from typing import Any
 
 import click
 
-from armsight.app.options import SIM
+from armsight.app.options import JSON, SIM, argument, declared, option
 from armsight.app.show.messages import UNANSWERED
 from armsight.errors import InputError
 
 
 @click.command("setup")
-@click.argument("arm")
-@click.option(
-    "--source", metavar="SOURCE", help="The cameras, such as usb:0,1, without looking for them; sim: for a try."
-)
-@click.option("--board", metavar="PORT", help="The arm's port, such as /dev/ttyACM0; emulated: with sim:.")
-@click.option("--from", "begin", type=click.IntRange(1), metavar="N", help="Do it again from this step on.")
-@click.option("--json", "as_json", is_flag=True, help="Print how far it came as one JSON object.")
-def command(arm: str, source: str | None, board: str | None, begin: int | None, as_json: bool) -> None:
+@declared
+def command(
+    arm: str = argument(),
+    source: str | None = option(
+        "The cameras, such as usb:0,1, without looking for them; sim: for a try.", metavar="SOURCE"
+    ),
+    board: str | None = option("The arm's port, such as /dev/ttyACM0; emulated: with sim:.", metavar="PORT"),
+    begin: int | None = option("Do it again from this step on.", "--from", min=1, metavar="N"),
+    as_json: bool = JSON,
+) -> None:
     """Walk through ARM's page, from the cameras to the corrected arm; setup.json remembers how far it came.
 
     Each command is shown before it runs; they are those of docs/arms/. The port is found by unplugging, the cameras by
