@@ -23,6 +23,17 @@ class Said:
     out: str
     err: str
 
+    def done(self):
+        """Return the same, of a command that must have succeeded."""
+        assert self.code == 0, self.err
+        return self
+
+    @property
+    def one(self):
+        """The one JSON object of a command that must have succeeded."""
+        (found,) = self.done().lines
+        return found
+
     @property
     def lines(self):
         """The JSON objects on stdout, one a line; NaN and infinity are no JSON."""
@@ -79,6 +90,11 @@ def said_of(capsys, *arguments, kind=""):
     return said
 
 
+def assert_has(text, *words):
+    """Hold a text to words that stand in it."""
+    assert [word for word in words if word not in text] == [], text
+
+
 def assert_rejected(said, *words):
     """Hold a run to the manners of a mistake: code 2, one line on stderr that has the words, nothing on stdout."""
     assert said.code == 2, said
@@ -87,8 +103,7 @@ def assert_rejected(said, *words):
     assert lines[0].startswith("armsight: error: ")
     assert "Traceback" not in said.err
     assert said.out == ""
-    for word in words:
-        assert str(word) in said.err, said.err
+    assert_has(said.err, *map(str, words))
 
 
 def listening():

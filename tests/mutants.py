@@ -41,44 +41,27 @@ ESTIMATORS, CORE = "src/armsight/loop/estimators", "firmware/core"
 
 
 class Mutant(NamedTuple):
-    """One change of one file.
+    """One change of one file."""
 
-    Attributes:
-        name: what it is called here.
-        kind: "sign", "transposed", "off by one" or "unit".
-        file: path from the root of the checkout.
-        text: what stands in the file, once.
-        becomes: what the mutant has instead.
-        test: name of the test file that must fail, looked up under tests/.
-        choose: pytest's ``-k`` expression; empty for all tests of the file.
-        compiled: whether kernels are compiled, for tests that simulate. Elsewhere they run as plain Python: a kernel's
-            compiled code would have to be made anew for every mutant, and takes longer than most tests.
-    """
-
-    name: str
-    kind: str
-    file: str
-    text: str
-    becomes: str
-    test: str
-    choose: str = ""
+    name: str  #: what it is called here
+    kind: str  #: "sign", "transposed", "off by one" or "unit"
+    file: str  #: path from the root of the checkout
+    text: str  #: what stands in the file, once
+    becomes: str  #: what the mutant has instead
+    test: str  #: name of the test file that must fail, looked up under tests/
+    choose: str = ""  #: pytest's ``-k`` expression; empty for all tests of the file
+    #: whether kernels are compiled, for tests that simulate. Elsewhere they run as plain Python: a kernel's compiled
+    #: code would have to be made anew for every mutant, and takes longer than most tests
     compiled: bool = False
 
 
 class Outcome(NamedTuple):
-    """What became of a mutant.
+    """What became of a mutant."""
 
-    Attributes:
-        name: of the mutant.
-        state: "killed", "survived" or "invalid".
-        by: the first test that failed or could not be set up, or why it is invalid.
-        seconds: how long its tests ran.
-    """
-
-    name: str
-    state: str
-    by: str
-    seconds: float
+    name: str  #: of the mutant
+    state: str  #: "killed", "survived" or "invalid"
+    by: str  #: the first test that failed or could not be set up, or why it is invalid
+    seconds: float  #: how long its tests ran
 
 
 class Invalid(Exception):

@@ -13,7 +13,7 @@ import pytest
 
 import armsight as package
 from armsight.app.main import COMMANDS, SECTIONS, group
-from cli_runs import assert_rejected
+from cli_runs import assert_has, assert_rejected
 from strategies import ordinary_rig
 
 
@@ -171,8 +171,7 @@ def test_no_help_and_no_mistake_in_options_imports_what_is_slow():
 
 def test_help_says_what_identify_needs_and_lists_measure_first(armsight):
     text = " ".join(armsight("identify", "--help").out.split())
-    assert "--arm ARM Required: the nominal arm" in text
-    assert "--data POSES.csv Required: joint angles" in text
+    assert_has(text, "--arm ARM Required: the nominal arm", "--data POSES.csv Required: joint angles")
     text = armsight("-h").out
     assert text.index("\n  measure ") < text.index("\n  body ") < text.index("\n  dense ")
     # --help: click keeps a command's help option as it was made first, and other tests make it without -h.

@@ -30,30 +30,19 @@ _EDGE = re.compile(r'edge: \{ sourcename: "([^"]+)" targetname: "([^"]+)"')
 
 @dataclass(frozen=True)
 class Chain:
-    """The deepest chain of calls from a function on.
+    """The deepest chain of calls from a function on."""
 
-    Attributes:
-        functions: the first calls the second, and so on.
-        stack_bytes: of all their frames.
-    """
-
-    functions: tuple[str, ...]
-    stack_bytes: int
+    functions: tuple[str, ...]  #: the first calls the second, and so on
+    stack_bytes: int  #: of all their frames
 
 
 @dataclass(frozen=True)
 class StackUse:
-    """The stack a board needs.
+    """The stack a board needs."""
 
-    Attributes:
-        main: of the main loop.
-        tick: of the tick's interrupt, from its handler on, which comes on top of it.
-        nested: of each interrupt that may come on top of that.
-    """
-
-    main: Chain
-    tick: Chain
-    nested: tuple[Chain, ...]
+    main: Chain  #: of the main loop
+    tick: Chain  #: of the tick's interrupt, from its handler on, which comes on top of it
+    nested: tuple[Chain, ...]  #: of each interrupt that may come on top of that
 
     @property
     def total_bytes(self) -> int:

@@ -27,31 +27,18 @@ SQUARE_RAD = 1e-9
 
 @dataclass(frozen=True)
 class VergingRig:
-    """Two distortion-free cameras rotated about Y, as in 18.1 to 18.8.
+    """Two distortion-free cameras rotated about Y, as in 18.1 to 18.8."""
 
-    Attributes:
-        F1: focal length of camera 1 (left), m.
-        F2: focal length of camera 2 (right), m.
-        beta1: inward rotation of camera 1's axis, about Y, rad.
-        beta2: inward rotation of camera 2's axis, about Y, rad.
-        X01: camera 1 stands at X = -X01, m.
-        X02: camera 2 stands at X = +X02, m.
-        Y01: camera 1 stands at Y = -Y01, m.
-        Y02: camera 2 stands at Y = -Y02, m; a closed form that uses no v2 does not need it.
-        Z01: camera 1 stands at Z = +Z01, m.
-        Z02: camera 2 stands at Z = +Z02, m.
-    """
-
-    F1: float
-    F2: float
-    beta1: float
-    beta2: float
-    X01: float
-    X02: float
-    Y01: float = 0.0
-    Y02: float = 0.0
-    Z01: float = 0.0
-    Z02: float = 0.0
+    F1: float  #: focal length of camera 1 (left), m
+    F2: float  #: focal length of camera 2 (right), m
+    beta1: float  #: inward rotation of camera 1's axis, about Y, rad
+    beta2: float  #: inward rotation of camera 2's axis, about Y, rad
+    X01: float  #: camera 1 stands at X = -X01, m
+    X02: float  #: camera 2 stands at X = +X02, m
+    Y01: float = 0.0  #: camera 1 stands at Y = -Y01, m
+    Y02: float = 0.0  #: camera 2 stands at Y = -Y02, m; a closed form that uses no v2 does not need it
+    Z01: float = 0.0  #: camera 1 stands at Z = +Z01, m
+    Z02: float = 0.0  #: camera 2 stands at Z = +Z02, m
 
     @staticmethod
     def symmetric(F: float, B: float, beta: float = 0.0) -> VergingRig:
@@ -130,20 +117,14 @@ def _middle(image_size_px: tuple[int, int]) -> tuple[float, float]:
 
 @dataclass(frozen=True, eq=False)
 class Orientation(Record):
-    """The orientation of a body, from three of its points.
+    """The orientation of a body, from three of its points."""
 
-    Attributes:
-        R: (3, 3) rotation with columns x_b y_b z_b, from the body's axes to those the points were given in.
-        euler_zyx: (3,) phi, theta, psi, rad.
-        singular_pitch: whether the pitch is +-90 degrees: yaw is then set to zero, and roll holds roll - yaw at +90
-            degrees, roll + yaw at -90.
-        off_square_rad: by how much the angle between the printed x_b and z_b differs from 90 degrees.
-    """
-
-    R: Array
-    euler_zyx: Array
+    R: Array  #: (3, 3) rotation with columns x_b y_b z_b, from the body's axes to those the points were given in
+    euler_zyx: Array  #: (3,) phi, theta, psi, rad
+    #: whether the pitch is +-90 degrees: yaw is then set to zero, and roll holds roll - yaw at +90 degrees, roll + yaw
+    #: at -90
     singular_pitch: bool
-    off_square_rad: float
+    off_square_rad: float  #: by how much the angle between the printed x_b and z_b differs from 90 degrees
 
     @property
     def orthonormalised(self) -> bool:

@@ -13,7 +13,7 @@ from armsight.robot.arm_file import split_arm
 from armsight.robot.kinematics.reach import reach
 from armsight.robot.models import MODELS
 from armsight.robot.urdf.write import write_urdf
-from cli_runs import assert_rejected
+from cli_runs import assert_has, assert_rejected
 
 SIX_R = MODELS["six_r"]
 Q_DEG = (10, -20, 30, 0, -90, 5)
@@ -25,8 +25,7 @@ def on_one_line(text):
 
 
 def test_forward_kinematics_with_negative_angles_as_plain_arguments(armsight):
-    said = armsight("arm", "fk", "six_r", *Q_DEG)
-    assert said.code == 0
+    said = armsight("arm", "fk", "six_r", *Q_DEG).done()
     assert (
         said.out.splitlines()[0] == "tool at (627.337, 110.616, 459.803) mm, euler zyx (-80.870, 4.924, -100.037) deg"
     )
@@ -64,9 +63,7 @@ def test_the_jacobian(armsight):
 
 def test_inverse_kinematics_gives_every_solution_with_its_configuration(armsight):
     pose_of = (300, 120, 550, -30, 40, 20)
-    said = armsight("arm", "ik", "ur5", *pose_of, "--json")
-    assert said.code == 0
-    (found,) = said.lines
+    found = armsight("arm", "ik", "ur5", *pose_of, "--json").one
     T = pose(from_euler_zyx(*np.radians(pose_of[3:])), np.array(pose_of[:3]) / 1e3)
     np.testing.assert_allclose(found["T_base_tool"], T, atol=1e-15)
     assert found["reachable"]
@@ -97,8 +94,7 @@ def test_a_pose_out_of_reach_is_an_answer_with_exit_code_1(armsight):
     said = armsight("arm", "ik", "six_r", 900, 0, 500, 0, 90, 0)
     assert said.code == 1
     assert said.err == ""
-    assert "unreachable: upper arm and forearm are too short" in said.out
-    assert "nearest pose within limits: (65" in said.out
+    assert_has(said.out, "unreachable: upper arm and forearm are too short", "nearest pose within limits: (65")
     (found,) = armsight("arm", "ik", "six_r", 900, 0, 500, 0, 90, 0, "--json").lines
     assert not found["reachable"]
     assert found["solutions"] == []
@@ -127,8 +123,7 @@ def _behind():
 
 
 def test_angles_beyond_the_limits_are_noted(armsight):
-    said = armsight("arm", "fk", "six_r", 0, 60, 0, 0, 0, 0)
-    assert said.code == 0
+    said = armsight("arm", "fk", "six_r", 0, 60, 0, 0, 0, 0).done()
     assert said.err == "note: joint2 at 60.000 deg is outside its limits -180.000 to 45.000 deg\n"
 
 
@@ -194,8 +189,7 @@ def test_a_toml_file_is_an_arm_as_well(tmp_path, armsight):
         for i in range(6)
     ]
     path.write_text(f'name = "mine"\nconvention = "{SIX_R.convention}"\n' + "".join(rows))
-    said = armsight("arm", "show", path)
-    assert said.code == 0
+    said = armsight("arm", "show", path).done()
     assert said.out.startswith("mine: ")
     (here,) = armsight("arm", "fk", path, *Q_DEG, "--json").lines
     np.testing.assert_allclose(here["T_base_tool"], SIX_R.forward(np.radians(Q_DEG)), atol=1e-12)
@@ -271,8 +265,7 @@ def test_a_link_that_is_named_counts_everywhere(armsight):
     said = armsight("identify", "plan", "--arm", f"{path}#nothing", "-n", "1")
     assert said.code == 2
     assert "link 'nothing' is not behind 4 to 7 rotary joints alone; these are: tool0, camera_link" in said.err
-    said = armsight("arm", "fk", f"{path}#camera_link", "0", "0", "0", "0", "0")
-    assert said.code == 0
+    said = armsight("arm", "fk", f"{path}#camera_link", "0", "0", "0", "0", "0").done()
     assert "note: " in said.err
     assert split_arm("a.urdf#b") == ("a.urdf", "b")
     assert split_arm("a.urdf") == ("a.urdf", None)

@@ -15,7 +15,7 @@ from armsight.app.batch.report import _of_result
 from armsight.app.batch.run import Batch, _keys, _load, found_recordings, run_batch
 from armsight.app.batch.work import BatchOptions, Done, work
 from armsight.errors import InputError
-from cli_runs import assert_rejected
+from cli_runs import assert_has, assert_rejected
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore::DeprecationWarning"),
@@ -130,8 +130,7 @@ def test_what_failed_is_tried_again_and_makes_the_exit_code_1(armsight, tmp_path
     for _ in range(2):
         done = armsight(*arguments)
         assert done.code == 1, done.err
-        assert "2 recordings: 0 done, 0 of them before, 2 failed" in done.out
-        assert "  failed 2 times: " in done.out
+        assert_has(done.out, "2 recordings: 0 done, 0 of them before, 2 failed", "  failed 2 times: ")
         assert list((tmp_path / "out" / "parts").iterdir()) == []
     assert (tmp_path / "out" / "recordings.parquet").is_file()
 

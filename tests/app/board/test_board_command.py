@@ -13,15 +13,13 @@ from armsight.app.board.selftest import DRIVEN
 from armsight.firmware import build, host_library
 from armsight.robot.boards.codes import BoardState, Fault
 from armsight.robot.boards.emulators import EMULATORS, HostEmulator
-from cli_runs import assert_rejected
+from cli_runs import assert_has, assert_rejected
 
 HOST = ("--board", "emulated:host")
 
 
 def test_the_self_test_prints_exactly_its_record(armsight):
-    said = armsight("board", "selftest", *HOST, "--json")
-    assert said.code == 0, said.err
-    (record,) = said.lines
+    record = armsight("board", "selftest", *HOST, "--json").one
     assert list(record) == ["board", "scenarios", "ticks_per_s", "elf"]
     assert record["board"] == "emulated:host"
     assert list(record["scenarios"]) == list(DRIVEN)
@@ -66,20 +64,17 @@ def test_a_board_that_fails_is_reported_with_what_is_wrong(armsight, monkeypatch
 def test_the_self_test_reads_well(armsight):
     said = armsight("board", "selftest", *HOST)
     assert [line.split()[:2] for line in said.out.splitlines()[:6]] == [[name, "passed"] for name in DRIVEN]
-    assert "times real time" in said.out
-    assert "hardware floating point" in said.out
+    assert_has(said.out, "times real time", "hardware floating point")
 
 
 def test_monitor_prints_a_line_at_a_time(armsight):
-    said = armsight("board", "monitor", *HOST, "--seconds", "1", "--every", "0.25", "--json")
-    assert said.code == 0
+    said = armsight("board", "monitor", *HOST, "--seconds", "1", "--every", "0.25", "--json").done()
     assert len(said.lines) == 4
     assert all(line["state"] == BoardState.DISABLED.name and line["faults"] == [] for line in said.lines)
     assert [line["readings"] for line in said.lines[1:]] == [250] * 3
     assert "board pil, firmware" in said.err
     text = armsight("board", "monitor", *HOST, "--seconds", "0.5")
-    assert "disabled" in text.out
-    assert "deg" in text.out
+    assert_has(text.out, "disabled", "deg")
 
 
 def test_monitor_shows_faults(armsight, monkeypatch):
@@ -186,9 +181,7 @@ def test_without_a_programmer_the_message_says_what_to_install_and_where_the_ima
 @pytest.mark.parametrize("name", PROGRAMMERS)
 def test_a_programmer_writes_every_piece_to_its_address(armsight, programmers, tmp_path, name):
     programmers(name)
-    said = armsight("board", "flash", "-o", tmp_path / "out", "--json")
-    assert said.code == 0, said.err
-    found = said.lines[0]
+    found = armsight("board", "flash", "-o", tmp_path / "out", "--json").one
     assert found["programmer"] == name
     arguments = (tmp_path / "arguments").read_text()
     if name == "openocd":
@@ -209,8 +202,7 @@ def test_a_programmer_that_fails_is_reported_by_its_own_message(armsight, progra
 
 def test_what_was_built_reads_well(armsight, programmers, tmp_path):
     said = armsight("board", "build", "--board", "stm32f4", "-o", tmp_path)
-    assert "hardware floating point" in said.out
-    assert f"{tmp_path}/stm32f4-08000000.bin: to 0x08000000" in said.out
+    assert_has(said.out, "hardware floating point", f"{tmp_path}/stm32f4-08000000.bin: to 0x08000000")
 
 
 def test_only_a_real_board_is_flashed(armsight, programmers, tmp_path):

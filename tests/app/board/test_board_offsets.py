@@ -58,9 +58,7 @@ FURTHER = ",".join(map(str, ZERO_DEG[:5]))
 
 def test_offsets_are_printed_and_nothing_is_written(armsight, arm, tmp_path):
     device, name = arm
-    said = armsight("board", "offsets", "--board", name, "--json")
-    assert said.code == 0, said.err
-    (found,) = said.lines
+    found = armsight("board", "offsets", "--board", name, "--json").one
     assert not found["written"]
     assert [each["id"] for each in found["joints"]] == [1, 2, 3, 4, 5]
     assert registers(device) == [0] * 6
@@ -71,8 +69,7 @@ def test_a_correction_makes_joints_report_where_they_are_and_is_taken_back(armsi
     device, name = arm
     file, keep = lerobot(tmp_path / "follower.json"), tmp_path / "old.json"
     options = ("--board", f"{name},{file}", "--yes", "--json")
-    said = armsight("board", "offsets", *options, "--further", FURTHER, "--keep", keep)
-    assert said.code == 0, said.err
+    said = armsight("board", "offsets", *options, "--further", FURTHER, "--keep", keep).done()
     assert "the old offsets are in" in said.err
     counts = [-round(np.radians(each) / RAD_PER_COUNT) for each in ZERO_DEG]
     assert registers(device) == counts
@@ -82,8 +79,7 @@ def test_a_correction_makes_joints_report_where_they_are_and_is_taken_back(armsi
     said = armsight("board", "monitor", "--board", f"{name},{file}", "--seconds", 0.05, "--json")
     assert said.lines[-1]["q_rad"] == pytest.approx(device.servos.true_q[:5], abs=1.1 * RAD_PER_COUNT)
     for name in ("old_offsets.json", "old_offsets-2.json"):  # without --keep nothing is in the way
-        said = armsight("board", "offsets", *options, "--restore", keep)
-        assert said.code == 0, said.err
+        said = armsight("board", "offsets", *options, "--restore", keep).done()
         assert (tmp_path / name).exists()
     assert registers(device) == [0] * 6
 
@@ -124,8 +120,7 @@ def test_mistakes_are_one_line_and_nothing_is_written(armsight, arm, tmp_path, m
     device.servos.switch(1, True)
     questions = []
     monkeypatch.setattr("click.confirm", lambda text, abort, err: questions.append(text))
-    said = armsight("board", "offsets", "--board", name, "--further", FURTHER, "--keep", tmp_path / "new.json")
-    assert said.code == 0, said.err
+    said = armsight("board", "offsets", "--board", name, "--further", FURTHER, "--keep", tmp_path / "new.json").done()
     assert ["the drives are on" in text for text in questions] == [True, False]
     assert registers(device) != [0] * 6
     device.servos.switch(1, True)
@@ -145,8 +140,7 @@ def test_a_correction_that_looks_like_a_mistake_is_asked_about_and_never_written
     assert not (tmp_path / "old.json").exists()
     asked = []
     monkeypatch.setattr("click.confirm", lambda text, abort, err: asked.append(text))
-    said = armsight("board", "offsets", *options)
-    assert said.code == 0, said.err
+    said = armsight("board", "offsets", *options).done()
     assert asked
     assert f"note: {tooth}" in said.err
     assert registers(device) == [0, -2047, 0, 0, 0, 0]
@@ -235,8 +229,7 @@ def test_the_ar4_drivers_offsets_are_corrected_in_their_file_and_the_old_file_is
         "new_deg": 170.0,
     }
     assert not keep.exists()
-    said = armsight(*options, "--further", "1,0.5,-0.25,0,0,2")
-    assert said.code == 0, said.err
+    armsight(*options, "--further", "1,0.5,-0.25,0,0,2").done()
     assert keep.read_text() == AR4
     assert "joint_1: 169.0\n" in file.read_text()  # its sense is the opposite of the maker's table
     assert "joint_3: -89.25  # new switch\n" in file.read_text()

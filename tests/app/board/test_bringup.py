@@ -25,6 +25,7 @@ from armsight.robot.boards.emulators import open_emulator
 from armsight.robot.boards.identification import dead_spots, fit_swing
 from armsight.sim.boards.workshop import Wiring, WorkshopPerson, drawn_encoders, drawn_workshop, swapped
 from armsight.sim.encoders import EncodedPlant, EncoderFault
+from cli_runs import assert_has
 
 
 class Evening:
@@ -65,8 +66,7 @@ def test_one_joint_is_identified_verified_and_stored(tmp_path):
     assert config["silence_reaction"] == 1
     assert not evening.board.status.drives_on
     page = (tmp_path / "report.html").read_text()
-    assert "data:image/png" in page
-    assert f"{found.constant_v_s:.3f}" in page
+    assert_has(page, "data:image/png", f"{found.constant_v_s:.3f}")
     # What is kept is taken up again: nothing is asked, nothing moves.
     evening.plant.drives_s = 0.0
     Bringup(evening.board, evening.person, tmp_path, [0]).run(["potentiometers", "motors", "swing"])

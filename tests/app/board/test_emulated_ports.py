@@ -38,8 +38,9 @@ def teensy():
 
 
 def test_monitor_watches_a_servo_bus(armsight, so101):
-    said = armsight("board", "monitor", "--board", f"feetech:{so101.name}", "--seconds", 0.1, "--every", 0.05, "--json")
-    assert said.code == 0, said.err
+    said = armsight(
+        "board", "monitor", "--board", f"feetech:{so101.name}", "--seconds", 0.1, "--every", 0.05, "--json"
+    ).done()
     assert "takes no duty: gravity is not compensated; keeps its own controller" in said.err
     assert len(said.lines) == 2
     for line in said.lines:
@@ -53,11 +54,9 @@ def test_an_ar4_is_homed_watched_and_cleared(armsight, teensy):
     name = f"ar4:{teensy.name}"
     assert_rejected(armsight("board", "home", "--board", "emulated:host"), "emulated:host has no limit switches")
     assert "not homed since switched on" in armsight("board", "monitor", "--board", name, "--seconds", 0.05).err
-    said = armsight("board", "home", "--board", name, "--yes", "--json")
-    assert said.code == 0, said.err
+    said = armsight("board", "home", "--board", name, "--yes", "--json").done()
     assert said.lines[0]["q_rad"] == pytest.approx([0.0] * 6, abs=1e-3)
-    said = armsight("board", "monitor", "--board", name, "--seconds", 0.05, "--json")
-    assert said.code == 0, said.err
+    said = armsight("board", "monitor", "--board", name, "--seconds", 0.05, "--json").done()
     assert "not homed" not in said.err
     assert said.lines[-1]["supply_v"] is None
     assert said.lines[-1]["q_rad"] == pytest.approx([0.0] * 6, abs=1e-3)
@@ -100,6 +99,5 @@ def test_a_pulled_cable_is_one_line(so101, teensy):
 
 @pytest.mark.parametrize(("arm", "kind"), [("so101", "feetech"), ("ar4", "ar4")])
 def test_emulate_serves_an_arm_and_names_its_port(armsight, arm, kind):
-    said = armsight("board", "emulate", arm, "--seconds", 0.01, "--json")
-    assert said.code == 0, said.err
+    said = armsight("board", "emulate", arm, "--seconds", 0.01, "--json").done()
     assert said.lines[0]["board"].startswith(f"{kind}:/dev/")

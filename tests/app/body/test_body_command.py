@@ -20,7 +20,7 @@ from armsight.vision.discs.identify import identify
 from armsight.vision.markers.board import open_board
 from armsight.vision.markers.targets import open_target, read_layout
 from armsight.vision.pose.predict import plain_rig, view
-from cli_runs import assert_rejected
+from cli_runs import assert_has, assert_rejected
 
 PLATE = Path(__file__).resolve().parents[3] / "examples" / "plate.toml"
 TRIANGLE = ((-55, 0, 0), (55, 0, 0), (0, 85, 0))
@@ -72,8 +72,7 @@ def kinds(assessment, grade):
 
 
 def test_the_example_plate_is_usable_and_its_twin_is_settled_by_the_normals(armsight):
-    said = armsight("body", "check", PLATE, "--json")
-    assert said.code == 0
+    said = armsight("body", "check", PLATE, "--json").done()
     got = answer(said)
     assert got["assessment"] == "usable"
     side = np.hypot(55, 85)
@@ -84,8 +83,7 @@ def test_the_example_plate_is_usable_and_its_twin_is_settled_by_the_normals(arms
     assert ambiguity["settled_by_normals"]
     assert [e["disc_px"] for e in got["expected"]] == [pytest.approx([16 * 0.9 / d] * 2) for d in (0.6, 0.8, 1.2)]
     text = armsight("body", "check", PLATE).out
-    assert "assessment: usable" in text
-    assert "P1 and P2 exchanged would fit, but seen from behind: the normals settle it" in text
+    assert_has(text, "assessment: usable", "P1 and P2 exchanged would fit, but seen from behind: the normals settle it")
 
 
 def test_without_normals_the_same_plate_is_ambiguous_and_normals_are_asked_for(armsight, body):
@@ -121,8 +119,7 @@ def test_the_side_of_a_body_with_a_tag_is_identified_by_the_tag(armsight, body):
 
 
 def test_a_mirror_image_is_harmless_and_said(armsight, body):
-    said = armsight("body", "check", body([*TRIANGLE, (0, 30, -40)], normal=""))
-    assert said.code == 0
+    said = armsight("body", "check", body([*TRIANGLE, (0, 30, -40)], normal="")).done()
     assert "note  P1 and P2 exchanged is its mirror image: harmless to two cameras, not to one alone" in said.out
 
 
@@ -169,8 +166,7 @@ def test_what_makes_a_body_unusable_is_said(armsight, body, positions, looks, mo
 
 
 def test_what_could_be_better_is_said_and_the_body_is_usable(armsight, body):
-    close = armsight("body", "check", body(((-30, 0, 0), (-11, 0, 0), (0, 85, 0))))
-    assert close.code == 0
+    close = armsight("body", "check", body(((-30, 0, 0), (-11, 0, 0), (0, 85, 0)))).done()
     assert "weak  P1 and P2 leave only 3.0 mm of plain surround" in close.out
     slim = armsight("body", "check", body(((-55, 0, 0), (65, 0, 0), (10, 20, 0))))
     assert "known least: the rotation about the body's x axis" in slim.out
@@ -268,8 +264,7 @@ PX_PER_MM = DPI / 25.4
 
 def pages_of(armsight, path, folder, *more):
     """Draw as PNG and return the pages, grey."""
-    said = armsight("body", "draw", path, "-o", folder / "pages.png", "--dpi", DPI, "--json", *more)
-    assert said.code == 0, said.err
+    said = armsight("body", "draw", path, "-o", folder / "pages.png", "--dpi", DPI, "--json", *more).done()
     return [cv2.imread(name, cv2.IMREAD_GRAYSCALE) for name in answer(said)["files"]]
 
 
@@ -466,8 +461,7 @@ def test_sheets_cut_at_their_marks_make_the_whole_board(armsight, tmp_path):
 def test_split_is_offered_where_a_drawing_is_too_large_and_changes_none_that_fits(armsight, tmp_path):
     said = armsight("body", "draw", "chessboard:9x6:50mm", "-o", tmp_path / "a.pdf")
     assert_rejected(said, "chessboard:9x6:50mm: the board needs", "--split", "--paper a2")
-    said = armsight("body", "draw", "chessboard:9x6:50mm", "-o", tmp_path / "a.pdf", "--split")
-    assert said.code == 0
+    said = armsight("body", "draw", "chessboard:9x6:50mm", "-o", tmp_path / "a.pdf", "--split").done()
     assert "page 1 is split over 6 sheets that overlap by 10 mm" in said.err
     assert (tmp_path / "a.pdf").read_bytes().count(b"/MediaBox") == 6
     assert armsight("body", "draw", PLATE, "-o", tmp_path / "b.pdf").code == 0
@@ -477,8 +471,7 @@ def test_split_is_offered_where_a_drawing_is_too_large_and_changes_none_that_fit
 
 
 def test_a_board_and_a_body_are_one_print(armsight, tmp_path):
-    said = armsight("body", "draw", "chessboard:9x6:20mm", PLATE, "-o", tmp_path / "print.svg", "--json")
-    assert said.code == 0, said.err
+    said = armsight("body", "draw", "chessboard:9x6:20mm", PLATE, "-o", tmp_path / "print.svg", "--json").done()
     assert [page["markers"][0] for page in answer(said)["pages"]] == ["chessboard:9x6:20mm", "P1"]
     assert len(answer(said)["files"]) == 2
 

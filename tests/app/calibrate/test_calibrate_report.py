@@ -36,6 +36,7 @@ from armsight.vision.calibrate.result import RejectedPair
 from armsight.vision.camera import Camera
 from armsight.vision.markers.board import open_board
 from armsight.vision.rig import StereoRig
+from cli_runs import assert_has
 
 matplotlib = pytest.importorskip("matplotlib", reason="the report needs matplotlib: pip install armsight[report]")
 
@@ -180,9 +181,7 @@ def test_the_parameters_are_shown_with_their_sigmas(written, calibration):
     found = re.search(r"fx, px(\d+\.\d+) ± (\d+\.\d+)(\d{3}\.\d+) ± ", text)
     assert float(found[1]) == pytest.approx(rig.left.intrinsics[0], abs=0.06)
     assert float(found[2]) == pytest.approx(sigma[0], rel=0.06)
-    assert f"baseline, mm{1e3 * rig.baseline_m:.1f}" in text
-    assert "brown4" in text
-    assert "chosen" in text
+    assert_has(text, f"baseline, mm{1e3 * rig.baseline_m:.1f}", "brown4", "chosen")
 
 
 def test_the_pose_tables_sigmas_are_along_the_left_cameras_axes():
@@ -192,9 +191,7 @@ def test_the_pose_tables_sigmas_are_along_the_left_cameras_axes():
     cov[12, 12] = np.radians(0.25) ** 2  # about y, which both share
     T = pose(exp_so3(np.array([0, np.pi / 2, 0])), np.array([0.1, 0.0, 0.2]))
     text = Page(pose_table(StereoRig(camera, camera, T, cov, 0.1))).text[""]
-    assert "X, mm100 given" in text
-    assert "Z, mm200.0 ± 2.0" in text
-    assert "rotation vector Y, degrees90.00 ± 0.25" in text
+    assert_has(text, "X, mm100 given", "Z, mm200.0 ± 2.0", "rotation vector Y, degrees90.00 ± 0.25")
     along = 0.2 / np.hypot(0.1, 0.2)
     assert f"baseline, mm{1e3 * np.hypot(0.1, 0.2):.1f} ± {2 * along:.1f}" in text
 

@@ -14,7 +14,7 @@ from armsight.geometry.pose import pose
 from armsight.loop.iso9283.statistic import Metric
 from armsight.robot.arm_file import open_arm
 from armsight.sim.workcell.workcell import Workcell
-from cli_runs import assert_rejected, said_of
+from cli_runs import assert_has, assert_rejected, said_of
 
 COLUMNS = ["test", "pose", "cycle", "approach", "t_s", "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz"]
 COMMAND = ["command_x_m", "command_y_m", "command_z_m", "command_qw", "command_qx", "command_qy", "command_qz"]
@@ -84,8 +84,7 @@ def test_what_is_below_the_noise_is_said(tmp_path, capsys):
     rows = rows_of(sigma_arm=0.0, noise=1e-4)
     answer = said(capsys, file_of(tmp_path / "c.csv", rows), "-o", tmp_path / "report")
     assert answer.code == 0
-    assert "not resolvable: below" in answer.out
-    assert "could have been resolved" in answer.out
+    assert_has(answer.out, "not resolvable: below", "could have been resolved")
     assert re.search(r"^backlash +along x +0\.2\d\d mm", answer.out, re.MULTILINE)
     assert "not resolvable" in (tmp_path / "report" / "report.html").read_text()
 
@@ -348,9 +347,7 @@ def test_limits_pass_and_fail(tmp_path, capsys):
     near = [one["clean"] for one in (p["AP_m"] for p in plain["poses"].values())]
     answer = said(capsys, data, "--limit", f"AP={1e3 * np.median(near) + 1e-4:.6f}mm")
     assert answer.code == 1
-    assert "PASS" in answer.out
-    assert "FAIL (limit " in answer.out
-    assert ", within the interval)" in answer.out
+    assert_has(answer.out, "PASS", "FAIL (limit ", ", within the interval)")
 
 
 def test_a_metric_below_the_noise_passes_by_its_upper_bound():

@@ -17,7 +17,7 @@ from armsight.geometry.rotation import from_quaternion_wxyz, log_so3
 from armsight.loop.identify.read import read_poses
 from armsight.sim.workcell.cameras import open_cameras
 from armsight.sim.workcell.workcell import Workcell
-from cli_runs import assert_rejected
+from cli_runs import assert_has, assert_rejected
 
 
 @pytest.fixture(scope="module")
@@ -144,8 +144,7 @@ def broken(tmp_path, monkeypatch, mend):
 
 def test_a_body_out_of_view_at_the_start(tmp_path, monkeypatch):
     said = broken(tmp_path, monkeypatch, lambda workcell: workcell.cover(0.0, 100.0))
-    assert "is not seen where the arm stands" in said
-    assert "bring it into the view" in said
+    assert_has(said, "is not seen where the arm stands", "bring it into the view")
 
 
 def test_a_camera_that_is_gone(tmp_path, monkeypatch):
@@ -171,8 +170,7 @@ def test_a_board_that_faults(tmp_path, monkeypatch):
         monkeypatch.setattr(workcell.plant, "step", stepped)
 
     said = broken(tmp_path, monkeypatch, fails)
-    assert "the board changed to FAULTED" in said
-    assert "supply too low" in said
+    assert_has(said, "the board changed to FAULTED", "supply too low")
 
 
 @pytest.mark.parametrize(
@@ -210,8 +208,7 @@ def test_people_read_millimetres(quick):
     folder, summary, printed = quick
     vision = next(line for line in printed.splitlines() if line.startswith("vision"))
     assert vision.split()[1] == f"{1e3 * summary['vision']['position_rms_m']:.3f}"
-    assert "RMS, mm" in printed
-    assert "times smaller" in printed
+    assert_has(printed, "RMS, mm", "times smaller")
     page = (folder / "report.html").read_text()  # the same numbers as in the terminal
     assert all(f">{cell}</td>" in page for cell in vision.split()[1:])
 

@@ -14,7 +14,7 @@ from armsight.sim.example_rig import example_rig
 from armsight.vision.dense import METHODS
 from armsight.vision.dense.middlebury import read_pfm
 from armsight.vision.rig import StereoRig
-from cli_runs import assert_rejected, said_of
+from cli_runs import assert_has, assert_rejected, said_of
 
 
 @pytest.fixture
@@ -232,6 +232,5 @@ def test_evaluation_has_every_method_and_metric(dense, flat, tmp_path):
     assert len((out / "table.csv").read_text().splitlines()) == 1 + len(METHODS)
     assert (out / "Wall_semiglobal_errors.png").is_file()
     text = dense("evaluate", scene, "--method", "block").out
-    assert "bad-0.5" in text
-    assert "block" in text
+    assert_has(text, "bad-0.5", "block")
     assert_rejected(dense("evaluate", tmp_path / "nothing"), "no such folder")

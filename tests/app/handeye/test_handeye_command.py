@@ -18,7 +18,7 @@ from armsight.loop.handeye.recording import matched_rows, paired, seen_in_table,
 from armsight.loop.identify.misread import _nearer_models
 from armsight.robot.arm_file import open_arm
 from armsight.tables.poses import read_pose_table
-from cli_runs import assert_rejected
+from cli_runs import assert_has, assert_rejected
 
 X = exp_se3(np.array([0.03, -0.02, 0.08, 0.2, -0.1, 1.2]))
 Z = exp_se3(np.array([0.5, 0.1, 0.4, 2.0, 0.3, -0.4]))
@@ -56,8 +56,7 @@ def seen(tmp_path):
 
 def found(armsight, robot, seen, *more, eye="in-hand"):
     """The JSON of a run that must succeed."""
-    said = armsight("handeye", "--robot", robot, "--seen", seen, "--eye", eye, "--json", *more)
-    assert said.code == 0, said.err
+    said = armsight("handeye", "--robot", robot, "--seen", seen, "--eye", eye, "--json", *more).done()
     return said.lines[0], said.err
 
 
@@ -165,8 +164,7 @@ def test_people_read_sigma_whose_error_blunders_and_a_plan_and_get_a_page(armsig
     robot, seen = matrices(tmp_path / "robot.txt", A), matrices(tmp_path / "seen.txt", B)
     said = armsight(
         "handeye", "--robot", robot, "--seen", seen, "--eye", "in_hand", "--plan", 2, "-o", tmp_path / "out"
-    )
-    assert said.code == 0, said.err
+    ).done()
     assert "T_flange_rig" in said.out
     assert " ± " in said.out
     assert "poses left out:" in said.out
@@ -501,9 +499,7 @@ def test_rows_without_an_image_and_rows_twice_are_noted(armsight, tmp_path, seen
     by = named(tmp_path / "b.csv", head, rows(B, names))
     robot = named(tmp_path / "a.csv", head, rows(A[[*range(12), 0]], [*("C:\\a\\" + name for name in names[:12]), "x"]))
     _, notes = found(armsight, robot, by)
-    assert "1 rows of" in notes
-    assert "2 images without a row" in notes
-    assert "p12, p13" in notes
+    assert_has(notes, "1 rows of", "2 images without a row", "p12, p13")
     again = [*range(14), 3]
     twice = matrices(tmp_path / "t.txt", A[again])
     one, notes = found(armsight, twice, matrices(tmp_path / "u.txt", B[again]))
@@ -600,8 +596,7 @@ def test_images_of_one_camera(armsight, tmp_path):
     camera = tmp_path / "camera.json"
     camera.write_text(json.dumps({"image_size_px": [640, 480], "K": K.tolist(), "distortion": []}))
     given = ("handeye", "--robot", robot, "--eye", "in-hand", "--source", tmp_path / "im*.png", "--json")
-    said = armsight(*given, "--camera", camera, "--target", "chessboard:8x6:25mm")
-    assert said.code == 0, said.err
+    said = armsight(*given, "--camera", camera, "--target", "chessboard:8x6:25mm").done()
     assert np.abs(log_se3(inverse(X) @ np.array(said.lines[0]["T_flange_rig"]))).max() < 3e-3
     assert said.lines[0]["reprojection_rms_px"] < 0.2
     camera.write_text(json.dumps({"image_size_px": [1280, 480], "K": K.tolist(), "distortion": []}))

@@ -19,7 +19,7 @@ from armsight.app.hub.store import Store
 from armsight.app.stream.cell_file import Cell, read_cell
 from armsight.app.stream.outbox import Outbox
 from armsight.errors import InputError
-from cli_runs import assert_rejected
+from cli_runs import assert_has, assert_rejected
 
 
 def test_who_a_cell_is(tmp_path):
@@ -389,8 +389,7 @@ def test_clocks_of_two_tables(tmp_path, armsight):
     found = json.loads(armsight("hub", "clocks", tmp_path / "one.csv", tmp_path / "two.csv", "--json").out)
     assert found["delay_s"] == pytest.approx(100.25, abs=1e-5)
     said = armsight("hub", "clocks", tmp_path / "one.csv", tmp_path / "two.csv").out
-    assert "two.csv less those of " in said
-    assert "one.csv: +100250.0" in said
+    assert_has(said, "two.csv less those of ", "one.csv: +100250.0")
     assert_rejected(armsight("hub", "clocks", tmp_path / "one.csv", tmp_path / "none.csv"), "none.csv", "no such file")
 
 

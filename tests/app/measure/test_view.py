@@ -30,7 +30,7 @@ from armsight.vision.markers.targets import open_body
 from armsight.vision.pose.measure import locate_composite
 from armsight.vision.pose.shot_pose import ShotPose, shot_pose
 from armsight.vision.rig import StereoRig
-from cli_runs import assert_rejected
+from cli_runs import assert_has, assert_rejected
 from disc_views import PLATE, SIZE, discs_of, hd_rig, someplace, views
 
 matplotlib = pytest.importorskip("matplotlib", reason="the chart needs matplotlib: pip install armsight[report]")
@@ -352,10 +352,8 @@ def test_every_shot_has_its_picture_and_foreign_files_stay(start, arm, armsight,
     (out / "view-left000.png").write_bytes(b"old")
     (arm / "left005.png").unlink()
     (arm / "left005.png").write_bytes(b"garbage")
-    said = armsight(*start, *images(arm), "--view", out, "-o", out / "poses.csv")
-    assert said.code == 0, said.err
-    assert "pictures of 2 of 2 shots" in said.err
-    assert "of an earlier run there are left: 1" in said.err
+    said = armsight(*start, *images(arm), "--view", out, "-o", out / "poses.csv").done()
+    assert_has(said.err, "pictures of 2 of 2 shots", "of an earlier run there are left: 1")
     names = {"notes.txt", "view-left999.png", "poses.csv", CHART, "view-left000.png", "view-left005.png"}
     assert set(os.listdir(out)) == names
     assert (out / "notes.txt").read_text() == "mine"
@@ -380,8 +378,7 @@ def test_detections_are_shown_on_empty_images(rendered, start, armsight, tmp_pat
             lines += [f"3,{side},{name},{u:.6f},{v:.6f}"]
     lines += ["9" + line[1:] for line in lines[1:3]]  # too few points
     (tmp_path / "d.csv").write_text("\n".join(lines) + "\n")
-    said = armsight(*start, "--source", f"detections:{tmp_path}/d.csv", "--view", tmp_path / "v")
-    assert said.code == 0, said.err
+    armsight(*start, "--source", f"detections:{tmp_path}/d.csv", "--view", tmp_path / "v").done()
     assert set(os.listdir(tmp_path / "v")) == {CHART, "view-3.png", "view-9.png"}
 
 

@@ -81,8 +81,7 @@ def test_json_lines_are_read_as_csv_is_and_oddities_are_said(sweep, capsys, tmp_
     lines = (json.dumps(dict(zip(HEAD, map(float, row), strict=True))) for row in odd)
     (tmp_path / "imu.jsonl").write_text("\n".join(lines))
     (tmp_path / "r.toml").write_text('[a]\nkind = "inertial"\nsource = "imu.jsonl"\nrate_hz = 100.0\n')
-    said = said_of(capsys, "references", "check", tmp_path / "r.toml")
-    assert said.code == 0
+    said = said_of(capsys, "references", "check", tmp_path / "r.toml").done()
     assert "weak: a: the rate is 25 Hz, not 100 as the file says" in said.out
     assert "a: 50 % of the readings repeat the one before: it is read too often" in said.out
 
@@ -91,8 +90,7 @@ def test_calibrate_finds_the_sensor_and_writes_what_check_reads(sweep, capsys, t
     folder, true, _ = sweep
     out = tmp_path / "calibrated.toml"
     given = "references", "calibrate", folder / "references.toml", "--poses", folder / "poses.csv", "-o", out, "--json"
-    said = said_of(capsys, *given, kind="inertial")
-    assert said.code == 0, said.err
+    said = said_of(capsys, *given, kind="inertial").done()
     (found,) = said.lines[0]["references"]
     assert found["delay_s"] == pytest.approx(0.015, abs=5e-4)
     at, sigma = (np.array(list(found[key].values())) for key in ("parameters", "sigma"))
@@ -167,8 +165,7 @@ def test_gravity_shows_a_tilted_base_and_says_what_is_open(capsys, tmp_path):
     np.savetxt(tmp_path / "joints.csv", rests, "%.6f", ",", header=head, comments="")
     (tmp_path / "r.toml").write_text('[imu]\nkind = "inertial"\nsource = "imu.csv"\n')
     given = "references", "gravity", tmp_path / "r.toml", "--model", "six_r", "--joints", tmp_path / "joints.csv"
-    said = said_of(capsys, *given, "--json")
-    assert said.code == 0, said.err
+    said = said_of(capsys, *given, "--json").done()
     hold_keys(given, said.out)
     np.savetxt(tmp_path / "few.csv", rests[:7], "%.6f", ",", header=head, comments="")
     (tmp_path / "imu.csv").unlink()  # which is not read before
@@ -213,8 +210,7 @@ def test_a_magnetometer_is_checked_and_calibrated_and_other_units_are_named(caps
     ]
     assert (found["readings"], found["rate_hz"]) == (1500, pytest.approx(50.0))
     given = "--poses", tmp_path / "poses.csv", "-o", tmp_path / "out.toml", "--json"
-    said = said_of(capsys, "references", "calibrate", tmp_path / "field.toml", *given, kind="magnetometer")
-    assert said.code == 0, said.err
+    said = said_of(capsys, "references", "calibrate", tmp_path / "field.toml", *given, kind="magnetometer").done()
     (found,) = said.lines[0]["references"]
     assert found["left_out_rms"]["field_t"] < 5e-6
     assert found["left_out_over_sigma"] == pytest.approx(1.0, abs=0.3)

@@ -10,6 +10,7 @@ from armsight.geometry.rotation import euler_zyx
 from armsight.robot.arm_file import open_arm
 from armsight.robot.models import MODELS
 from armsight.sim.workcell.controlled import standing
+from cli_runs import assert_has
 
 ARM = open_arm("six_r")
 
@@ -18,8 +19,7 @@ def test_the_default_motion_goes_from_home_to_five_poses_and_back_and_along_a_li
     plan = read_motions(ARM)
     kinds = [motion.kind for motion in plan.motions]
     assert kinds[:6] == ["joints"] * 6
-    assert "line" in kinds
-    assert "circle" in kinds
+    assert_has(kinds, "line", "circle")
     q = plan.start
     assert q == pytest.approx(ARM.home)
     for motion in plan.motions:

@@ -17,7 +17,7 @@ from armsight.app.serve.config import ServeConfig, read_config
 from armsight.app.serve.service import METRICS, Service, state_pages
 from armsight.app.show.http import metrics_text
 from armsight.errors import InputError
-from cli_runs import assert_rejected
+from cli_runs import assert_has, assert_rejected
 
 ROOT = Path(__file__).parents[3]
 SHOT = {"kind": "shot", "status": "ok", "age_s": 0.02, "covariance": [[9e-10, 0, 0], [0, 4e-10, 0], [0, 0, 3.6e-9]]}
@@ -184,8 +184,7 @@ def test_a_recording_is_measured_once(armsight, rendered, tmp_path):
         f'[measure]\nrig = "{rendered.rig}"\ntarget = "{rendered.plate}"\nsource = "{rendered.folder / "arm"}"\n'
         '[serve]\nhttp = ""\nlog = "serve.log"\n',
     )
-    said = armsight("serve", file, "--json")
-    assert said.code == 0
+    said = armsight("serve", file, "--json").done()
     assert [json.loads(line)["event"] for line in said.out.splitlines()] == ["measuring", "ended"]
     assert "measured 16 of 16 shots" in (tmp_path / "serve.log").read_text()
 
@@ -286,5 +285,4 @@ def test_the_examples_are_what_is_served(rendered, tmp_path):
     assert unit["Service"]["KillMode"] == "mixed"  # the child is interrupted once, by the service
     assert float(unit["Service"]["TimeoutStopSec"]) > service._END_S
     container = (here / "Containerfile").read_text()
-    assert 'ENTRYPOINT ["armsight", "serve", "/cell/serve.toml"]' in container
-    assert "STOPSIGNAL SIGTERM" in container
+    assert_has(container, 'ENTRYPOINT ["armsight", "serve", "/cell/serve.toml"]', "STOPSIGNAL SIGTERM")

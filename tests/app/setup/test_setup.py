@@ -81,9 +81,7 @@ def test_every_arm_has_steps_that_the_command_line_takes(armsight, typed, person
     for arm, steps in ARMS.items():
         (walk.FILE).unlink(missing_ok=True)
         came.clear()
-        said = armsight("setup", arm, "--source", "usb:3,1", "--board", "/dev/ttyUSB9", "--json")
-        assert said.code == 0, said.err
-        (found,) = said.lines
+        found = armsight("setup", arm, "--source", "usb:3,1", "--board", "/dev/ttyUSB9", "--json").one
         assert len(found["steps"]) == len(steps)
         assert [row["command"] for row in found["steps"] if row["state"] == "done"] == [f"armsight {c}" for c in came]
         assert not [c for c in came if "usb:0,1" in c or "ttyACM0" in c]
@@ -119,8 +117,7 @@ def test_it_goes_on_where_it_was(armsight, typed, person):
     assert [row["state"] for row in said.lines[0]["steps"]] == ["done"] * 3 + ["failed"]
     codes.clear()
     came.clear()
-    said = armsight("setup", "six_r", "--json")  # cameras and port are remembered
-    assert said.code == 0
+    said = armsight("setup", "six_r", "--json").done()  # cameras and port are remembered
     assert [c.split()[0] for c in came] == ["run", "check", "identify", "board"]
     assert "--source usb:3,1 --board serial:/dev/ttyUSB9" in came[0]
     came.clear()
@@ -131,8 +128,7 @@ def test_it_goes_on_where_it_was(armsight, typed, person):
 def test_a_recording_that_ctrl_c_ends_is_done_and_the_plate_is_at_hand(armsight, typed, person, folder):
     _, codes = typed
     codes["record"] = 130
-    said = armsight("setup", "ur5e", "--source", "usb:3,1", "--json")
-    assert said.code == 0
+    said = armsight("setup", "ur5e", "--source", "usb:3,1", "--json").done()
     assert [row["state"] for row in said.lines[0]["steps"]].count("failed") == 0
     assert not (folder / "examples").exists()  # nothing of these steps needs the plate
     walk.FILE.unlink()
@@ -143,8 +139,7 @@ def test_a_recording_that_ctrl_c_ends_is_done_and_the_plate_is_at_hand(armsight,
 def test_a_check_that_says_no_holds_nothing_up(armsight, typed, person):
     came, codes = typed
     codes["check"] = 2
-    said = armsight("setup", "six_r", "--source", "usb:3,1", "--board", "/dev/ttyUSB9", "--json")
-    assert said.code == 0
+    said = armsight("setup", "six_r", "--source", "usb:3,1", "--board", "/dev/ttyUSB9", "--json").done()
     assert [row["state"] for row in said.lines[0]["steps"]] == ["done"] * 4 + ["failed", "done", "done"]
     came.clear()
     codes["check"] = 130  # Ctrl-C does
@@ -168,8 +163,7 @@ def test_q_ends_and_s_leaves_out(armsight, typed, person):
 def test_on_the_simulated_arm_nobody_is_asked(armsight, typed, arm, monkeypatch):
     came, _ = typed
     monkeypatch.setattr(walk, "_asked", None)
-    said = armsight("setup", arm, "--source", "sim:", "--board", "emulated:", "--json")
-    assert said.code == 0, said.err
+    armsight("setup", arm, "--source", "sim:", "--board", "emulated:", "--json").done()
     assert len(came) == len(ARMS[arm]) - (arm == "ar4")  # the driver's file is not there
     assert "--source sim: --board emulated:" in next(c for c in came if c.startswith("run"))
     assert json.loads(walk.FILE.read_text())["words"] == {}
@@ -188,8 +182,7 @@ def test_the_simulated_arm_is_calibrated_and_corrected(armsight, typed, monkeypa
 
     monkeypatch.setattr(walk, "run", carried_out)
     monkeypatch.setattr("armsight.app.calibrate.run._SIM_SHOTS", 8)
-    said = armsight("setup", "six_r", "--source", "sim:640x360@60", "--board", "emulated:", "--json")
-    assert said.code == 0, said.err
+    said = armsight("setup", "six_r", "--source", "sim:640x360@60", "--board", "emulated:", "--json").done()
     assert {row["state"] for row in said.lines[0]["steps"]} == {"done"}
     assert Path("print.pdf").exists()
     assert json.loads(Path("rig.json").read_text())["provenance"]["pairs_used"] == 8

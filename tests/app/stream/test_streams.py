@@ -12,9 +12,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from armsight.app.stream.datum import Published
-from armsight.app.stream.igtl import crc64, message, open_igtl, position_body, status_body, transform_body
-from armsight.app.stream.network import open_json_tcp, open_json_udp
-from armsight.app.stream.streams import open_streams
+from armsight.app.stream.igtl import crc64, message, position_body, status_body, transform_body
+from armsight.app.stream.streams import open_stream, open_streams
 from armsight.data import Missed, Shot
 from armsight.errors import InputError
 from armsight.geometry.pose import pose
@@ -36,7 +35,7 @@ def publish_until(sink, condition, datum=SHOT):
 
 
 def test_json_over_tcp_is_one_object_a_line():
-    sink = open_json_tcp("0", Published())
+    sink = open_stream("json+tcp:0", Published())
     sink.start()
     with socket.create_connection(("127.0.0.1", sink.port)) as connection:
         connection.settimeout(0.01)
@@ -66,7 +65,7 @@ def test_json_over_tcp_is_one_object_a_line():
 
 
 def test_a_tcp_reader_that_does_not_read_is_not_waited_for():
-    sink = open_json_tcp("0", Published())
+    sink = open_stream("json+tcp:0", Published())
     sink.start()
     with socket.create_connection(("127.0.0.1", sink.port)):
         big = NoteDatum(0.0, "x" * 200_000)
@@ -75,9 +74,9 @@ def test_a_tcp_reader_that_does_not_read_is_not_waited_for():
     assert sink.problem is None
 
 
-@pytest.mark.parametrize("opens", [open_json_tcp, open_igtl, lambda rest, of: open_json_udp(f"127.0.0.1:{rest}", of)])
-def test_images_do_not_wait_for_a_stream_that_writes_none(opens):
-    sink, kept = opens("0", Published()), []  # not started: everything waits
+@pytest.mark.parametrize("kind", ["json+tcp", "igtl", "json+udp"])
+def test_images_do_not_wait_for_a_stream_that_writes_none(kind):
+    sink, kept = open_stream(f"{kind}:0", Published()), []  # not started: everything waits
     for _ in range(50):
         images = [np.zeros((36, 64), np.uint8) for _ in "lr"]
         kept += map(weakref.ref, images)
@@ -139,10 +138,8 @@ def test_a_client_of_openigtlink_receives_the_pose():
     pyigtl = pytest.importorskip("pyigtl")
     from test_run_mcap import BODY, RIG, measured
 
-    from armsight.app.stream.igtl import open_igtl
-
     result = measured()
-    sink = open_igtl("0", Published(RIG, BODY))
+    sink = open_stream("igtl:0", Published(RIG, BODY))
     sink.start()
     client = pyigtl.OpenIGTLinkClient("127.0.0.1", sink.port)
     got = []
@@ -164,9 +161,7 @@ def test_foxglove_s_server_listens_and_takes_everything():
     pytest.importorskip("mcap_protobuf")
     from test_run_mcap import BODY, RIG, measured
 
-    from armsight.app.stream.websocket import open_foxglove
-
-    sink = open_foxglove("0", Published(RIG, BODY))
+    sink = open_stream("foxglove:0", Published(RIG, BODY))
     sink.start()
     with socket.create_connection(("127.0.0.1", sink.port)) as connection:
         connection.settimeout(60.0)
@@ -219,8 +214,6 @@ def test_ros2_messages_over_zenoh_are_decoded_by_the_definitions_of_ros(monkeypa
     from rosbags.typesys import Stores, get_typestore
     from test_run_mcap import BODY, measured, published
 
-    from armsight.app.stream.zenoh import open_ros2
-
     monkeypatch.setenv("ROS_DOMAIN_ID", "7")
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
@@ -236,7 +229,7 @@ def test_ros2_messages_over_zenoh_are_decoded_by_the_definitions_of_ros(monkeypa
         got, tokens = {}, []
         router.declare_subscriber("7/**", lambda s: got.setdefault(str(s.key_expr), s))
         router.liveliness().declare_subscriber("@ros2_lv/7/**", lambda s: tokens.append(str(s.key_expr)))
-        sink = open_ros2(str(port), published())
+        sink = open_stream(f"ros2:{port}", published())
         sink.start()
         topics = {"armsight/shot", "odometry", "right/image_raw/compressed", "right/camera_info"}
         publish_until(sink, lambda: topics <= {"/".join(key.split("/")[1:-2]) for key in list(got)}, shot)
@@ -263,4 +256,4 @@ def test_ros2_messages_over_zenoh_are_decoded_by_the_definitions_of_ros(monkeypa
     assert decoded["right/camera_info"].header.stamp == decoded["right/image_raw/compressed"].header.stamp
     assert any("/NN/%/%/armsight" in each for each in tokens)
     with pytest.raises(InputError, match="no zenoh router answers there; start it: ros2 run"):
-        open_ros2(str(port), published())
+        open_stream(f"ros2:{port}", published())

@@ -115,29 +115,17 @@ NAMED = {name: address for address, name in ADDRESS.items()}
 
 @dataclass(frozen=True)
 class Part:
-    """What distinguishes a chip, on its board.
+    """What distinguishes a chip, on its board."""
 
-    Attributes:
-        hse_hz: its external clock.
-        crystal: whether that is a crystal, not a clock.
-        over_drive: whether it has one, for more than 168 MHz.
-        most_hz: processor, slow and fast bus.
-        flash_hz: up to which clock the flash memory needs 0, 1, ... wait states, at 2.7 V or more.
-        breaks: timers with a break input, and the pin of it in use.
-        trigger: the converter's choice of trigger.
-        uart: the wire, and its streams in and out.
-        absent: peripherals of the table above that it does not have.
-    """
-
-    hse_hz: float
-    crystal: bool
-    over_drive: bool
-    most_hz: tuple[float, float, float]
-    flash_hz: tuple[float, ...]
-    breaks: tuple[tuple[str, str], ...]
-    trigger: int
-    uart: tuple[str, str, str]
-    absent: tuple[str, ...]
+    hse_hz: float  #: its external clock
+    crystal: bool  #: whether that is a crystal, not a clock
+    over_drive: bool  #: whether it has one, for more than 168 MHz
+    most_hz: tuple[float, float, float]  #: processor, slow and fast bus
+    flash_hz: tuple[float, ...]  #: up to which clock the flash memory needs 0, 1, ... wait states, at 2.7 V or more.
+    breaks: tuple[tuple[str, str], ...]  #: timers with a break input, and the pin of it in use
+    trigger: int  #: the converter's choice of trigger
+    uart: tuple[str, str, str]  #: the wire, and its streams in and out
+    absent: tuple[str, ...]  #: peripherals of the table above that it does not have
 
 
 #: The Nucleo-F446RE and the Black Pill: RM0390 and RM0383, table of wait states and chapter 6.
