@@ -86,12 +86,14 @@ def _too_large(path: str | Path, size: int, most_mb: float) -> str:
 
 
 @contextlib.contextmanager
-def as_input_error(problem: str) -> Iterator[None]:
-    """Raise an InputError instead of an OSError of the block: ``problem``, and why."""
+def as_input_error(problem: str, *kinds: type[Exception], why: bool = False) -> Iterator[None]:
+    """Raise an InputError instead of an OSError of the block: ``problem``, and why; of other kinds only with ``why``."""
+    caught = kinds or (OSError,)
     try:
         yield
-    except OSError as error:
-        raise InputError(f"{problem}: {error.strerror}") from None
+    except caught as error:
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(problem if kinds and not why else f"{problem}: {reason}") from None
 
 
 def check_readable(path: str | Path, most_mb: float | None = None) -> str:
@@ -203,10 +205,10 @@ def _encoding(path: str | Path, data: bytes) -> str:
             return wide
     declared = re.match(rb"<\?xml[^>]*?encoding\s*=\s*[\"']([\w.:-]+)", data)
     name = "utf-8" if declared is None else declared[1].decode()
-    try:
+    with as_input_error(
+        f"{path}: line 1: declares encoding {name!r}, which is not known; save it as UTF-8", LookupError, UnicodeError
+    ):
         "".encode(name)  # zlib and its like are codecs, too, and none of text
-    except (LookupError, UnicodeError):
-        raise InputError(f"{path}: line 1: declares encoding {name!r}, which is not known; save it as UTF-8") from None
     return "utf-8" if name.lower().startswith("utf-16") else name  # its declaration could not be read if it were
 
 
@@ -231,14 +233,12 @@ def read_table(path: str | Path) -> list[list[str]]:
     mark = next((mark for mark in (";", "\t") if mark in first and "," not in first), ",")
     rows: list[list[str]] = []
     cells = 0
-    try:
+    with as_input_error(f"{path}: not a table", csv.Error, why=True):
         for row in csv.reader(itertools.chain([first] if first else [], lines), delimiter=mark):
             rows.append(row)
             cells += len(row) + 1
             if cells > _TABLE_CELLS:
                 raise InputError(f"{path}: more than {_TABLE_CELLS} cells up to line {len(rows)}: split the table")
-    except csv.Error as error:
-        raise InputError(f"{path}: not a table: {error}") from None
     if mark != ",":
         rows = _with_points(path, rows)
     return rows
@@ -253,11 +253,9 @@ def is_long(path: str | Path) -> bool:
 
 def long_rows(path: str | Path) -> Generator[list[str]]:
     """Yield the rows of cells of such a table, its header first; errors as :func:`read_table`."""
-    with opened(path, LONG_TABLE_MB) as raw, io.TextIOWrapper(raw, "utf-8") as text:
-        try:
-            yield from csv.reader(_bounded(path, text))
-        except csv.Error as error:
-            raise InputError(f"{path}: not a table: {error}") from None
+    wrong = as_input_error(f"{path}: not a table", csv.Error, why=True)
+    with opened(path, LONG_TABLE_MB) as raw, io.TextIOWrapper(raw, "utf-8") as text, wrong:
+        yield from csv.reader(_bounded(path, text))
 
 
 def _lines(path: str | Path) -> Iterator[str]:

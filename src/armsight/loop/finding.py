@@ -46,32 +46,20 @@ class Trust(Enum):
 
 @dataclass(frozen=True)
 class HealthFinding:
-    """Something that no longer holds, and because of which results must not be trusted.
+    """Something that no longer holds, and because of which results must not be trusted."""
 
-    Attributes:
-        cause: what is wrong: rig, body, fixed, time, lens, joint, estimator, host.
-        what: what was found, one sentence.
-        since_s: since when, s on the clock of the shots; None where the shots have no times.
-        size: by how much, in ``unit``.
-        sigma: standard deviation of the size.
-        unit: deg, mm, px, %, ms, or measurements.
-        advice: what to do.
-        alternatives: other causes that explain it nearly as well.
-        corrected_s: when it was put right, s; None where it was not.
-        cost_mm: by how much it displaces the tool, or what is measured, at most so far, mm; None where that is not known.
-        pose_sigma_mm: sigma of measured positions, as without what was found, the least since, mm; None without a pose.
-    """
-
-    cause: Cause
-    what: str
-    since_s: float | None
-    size: float
-    sigma: float
-    unit: str
-    advice: str
-    alternatives: tuple[Cause, ...] = ()
-    corrected_s: float | None = None
+    cause: Cause  #: what is wrong: rig, body, fixed, time, lens, joint, estimator, host
+    what: str  #: what was found, one sentence
+    since_s: float | None  #: since when, s on the clock of the shots; None where the shots have no times
+    size: float  #: by how much, in ``unit``
+    sigma: float  #: standard deviation of the size
+    unit: str  #: deg, mm, px, %, ms, or measurements
+    advice: str  #: what to do
+    alternatives: tuple[Cause, ...] = ()  #: other causes that explain it nearly as well
+    corrected_s: float | None = None  #: when it was put right, s; None where it was not
+    #: by how much it displaces the tool, or what is measured, at most so far, mm; None where that is not known
     cost_mm: float | None = None
+    #: sigma of measured positions, as without what was found, the least since, mm; None without a pose
     pose_sigma_mm: float | None = None
 
     @property
@@ -164,23 +152,15 @@ _POINTS = "look at these points; clean or fasten them, and measure the body agai
 
 
 class CauseRow(NamedTuple):
-    """A cause.
-
-    Attributes:
-        unit: of its size.
-        what: one sentence: {size}, in the unit and without its sign, {way}, and words of the evidence.
-        ways: what {way} says of a size above zero, and of another.
-        name: what others cannot exclude.
-        alternatives: other causes that explain it nearly as well.
-    """
+    """A cause."""
 
     cause: Cause
-    unit: str
-    what: str
+    unit: str  #: of its size
+    what: str  #: one sentence: {size}, in the unit and without its sign, {way}, and words of the evidence
     advice: str
-    ways: tuple[str, str] = ("", "")
-    name: str = ""
-    alternatives: tuple[Cause, ...] = ()
+    ways: tuple[str, str] = ("", "")  #: what {way} says of a size above zero, and of another
+    name: str = ""  #: what others cannot exclude
+    alternatives: tuple[Cause, ...] = ()  #: other causes that explain it nearly as well
 
 
 # fmt: off

@@ -47,13 +47,12 @@ class FrameClock:
     Attributes:
         period_s: time between two frames, s; 0 before it is known.
         jitter_s: standard deviation of the stamps about their prediction, s; 0 before it is known.
-        stepped: when stamps were first shifted, s, and by how much in all, s; None while they are right.
-        rate: by which share the clock runs fast.
     """
 
     def __init__(self) -> None:
+        #: when stamps were first shifted, s, and by how much in all, s; None while they are right
         self.stepped: tuple[float, float] | None = None
-        self.rate = 0.0
+        self.rate = 0.0  #: by which share the clock runs fast
         self._shift_s = self._origin_s = 0.0
         self._broken = False
         self._late: deque[float] = deque(maxlen=_OTHERS)

@@ -70,17 +70,12 @@ class Mode(Enum):
 
 @dataclass(frozen=True)
 class LoopTiming:
-    """How long everything in the loop takes.
-
-    Attributes:
-        latency_s: from the middle of an exposure to the command that knows of it, s, as measured.
-        response_s: from a command to the joints being there, s: the time constant of their own loop.
-    """
+    """How long everything in the loop takes."""
 
     period_s: float
     vision_period_s: float
-    latency_s: float
-    response_s: float = 0.05
+    latency_s: float  #: from the middle of an exposure to the command that knows of it, s, as measured
+    response_s: float = 0.05  #: from a command to the joints being there, s: the time constant of their own loop
 
     def __post_init__(self) -> None:
         """Check the numbers."""
@@ -112,65 +107,40 @@ class LoopTiming:
 
 @dataclass(frozen=True)
 class JointLoops:
-    """Controllers of the joints that armsight cannot tune, and which do not reach what they are commanded.
+    """Controllers of the joints that armsight cannot tune, and which do not reach what they are commanded."""
 
-    Attributes:
-        steps_rad: (n,) the smallest step that each joint makes.
-        rest_rad_s: a joint at rest is measured slower than this.
-    """
-
-    steps_rad: tuple[float, ...]
-    rest_rad_s: float
+    steps_rad: tuple[float, ...]  #: (n,) the smallest step that each joint makes
+    rest_rad_s: float  #: a joint at rest is measured slower than this
 
 
 @dataclass(frozen=True, eq=False)
 class Aim(Record):
-    """The reference of the next command, as far as no measurement changes it: computed while an image is on its way.
+    """The reference of the next command, as far as no measurement changes it: computed while an image is on its way."""
 
-    Attributes:
-        ahead: the joints a period from now, as the motion has them.
-        q: (2, n) angles now and ahead, rad.
-        qd: (2, n) their speeds, rad/s.
-        Ts_base_tool: (2, 4, 4) where they put the tool.
-        most: (n,) by how much the correction of each joint may change in the period, rad.
-        duty: (n,) that holds the arm against gravity ahead.
-        jacobian: (6, n) at the goal.
-        U: (6, k) of its k = min(6, n) singular values, linear rows over the arm's size, and so are ``s`` and ``Vt``.
-        s: (k,).
-        passed_s: since the last command, s; the period where that is not known.
-        left_s: until the arm moves on, s.
-    """
-
-    ahead: Joints
-    q: Array
-    qd: Array
-    Ts_base_tool: Array
-    most: Array
-    duty: Array
-    jacobian: Array
+    ahead: Joints  #: the joints a period from now, as the motion has them
+    q: Array  #: (2, n) angles now and ahead, rad
+    qd: Array  #: (2, n) their speeds, rad/s
+    Ts_base_tool: Array  #: (2, 4, 4) where they put the tool
+    most: Array  #: (n,) by how much the correction of each joint may change in the period, rad
+    duty: Array  #: (n,) that holds the arm against gravity ahead
+    jacobian: Array  #: (6, n) at the goal
+    #: (6, k) of its k = min(6, n) singular values, linear rows over the arm's size, and so are ``s`` and ``Vt``
     U: Array
-    s: Array
+    s: Array  #: (k,)
     Vt: Array
-    passed_s: float
-    left_s: float
+    passed_s: float  #: since the last command, s; the period where that is not known
+    left_s: float  #: until the arm moves on, s
 
 
 @dataclass(frozen=True, eq=False)
 class ServoStep(Record):
-    """One command and how it came about.
-
-    Attributes:
-        mode: what the loop is closed on.
-        correction: (n,) what is added to the motion's joints, rad.
-        error: (6,) from the estimated tool to its reference now, [m; rad] in base axes.
-        limited: what kept a joint from being corrected further, one text each.
-    """
+    """One command and how it came about."""
 
     command: JointCommand
-    mode: Mode
-    correction: Array
-    error: Array
-    limited: tuple[str, ...] = ()
+    mode: Mode  #: what the loop is closed on
+    correction: Array  #: (n,) what is added to the motion's joints, rad
+    error: Array  #: (6,) from the estimated tool to its reference now, [m; rad] in base axes
+    limited: tuple[str, ...] = ()  #: what kept a joint from being corrected further, one text each
 
 
 class PoseServo:

@@ -95,17 +95,11 @@ def light(t_s: Array, exposure_s: float | Array, bit_s: float) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Brightness(Record):
-    """An LED in the images of one camera.
+    """An LED in the images of one camera."""
 
-    Attributes:
-        stamp_s: (N,) stamps of the images, board's clock, s, rising.
-        led: (N,) brightness of the LED, grey levels.
-        around: (N,) brightness around it.
-    """
-
-    stamp_s: Array
-    led: Array
-    around: Array
+    stamp_s: Array  #: (N,) stamps of the images, board's clock, s, rising
+    led: Array  #: (N,) brightness of the LED, grey levels
+    around: Array  #: (N,) brightness around it
 
     def __post_init__(self) -> None:
         """Check that the stamps rise."""
@@ -116,26 +110,16 @@ class Brightness(Record):
 
 @dataclass(frozen=True, eq=False)
 class Exposures(Record):
-    """When one camera exposed the row in which the LED is.
+    """When one camera exposed the row in which the LED is."""
 
-    Attributes:
-        n: (N,) numbers of the images, counted by the period, 0 in the middle.
-        t_s: middle of exposure 0, board's clock, s.
-        period_s: from one exposure to the next, s.
-        cov: (3, 3) covariance of the three, s^2.
-        jitter_s: standard deviation of the exposures about their period, s.
-        contrast: sigma of the brightness that the code does not explain, over the LED's.
-        hidden: share of the images in which the LED was hidden.
-    """
-
-    n: Array
-    t_s: float
-    period_s: float
+    n: Array  #: (N,) numbers of the images, counted by the period, 0 in the middle
+    t_s: float  #: middle of exposure 0, board's clock, s
+    period_s: float  #: from one exposure to the next, s
     exposure_s: float
-    cov: Array
-    jitter_s: float
-    contrast: float
-    hidden: float
+    cov: Array  #: (3, 3) covariance of the three, s^2
+    jitter_s: float  #: standard deviation of the exposures about their period, s
+    contrast: float  #: sigma of the brightness that the code does not explain, over the LED's
+    hidden: float  #: share of the images in which the LED was hidden
 
 
 class _CodeFit(NamedTuple):
@@ -310,23 +294,14 @@ def _noises(residual: Array, slope: Array) -> tuple[float, float]:
 
 @dataclass(frozen=True, eq=False)
 class SyncEstimate(Record):
-    """What the LED says of two cameras.
+    """What the LED says of two cameras."""
 
-    Attributes:
-        t_s: middle of the images it is of, board's clock, s.
-        delay_s: by how much stamps are later than the left exposure's middle, in the LED's row, s.
-        sigma_delay_s: its standard deviation.
-        skew_s: by how much the right camera exposes its LED's row later than the left one its own, s.
-        sigma_skew_s: its standard deviation.
-        jitter_s: standard deviation of the skew from shot to shot, s.
-    """
-
-    t_s: float
-    delay_s: float
-    sigma_delay_s: float
-    skew_s: float
-    sigma_skew_s: float
-    jitter_s: float
+    t_s: float  #: middle of the images it is of, board's clock, s
+    delay_s: float  #: by how much stamps are later than the left exposure's middle, in the LED's row, s
+    sigma_delay_s: float  #: its standard deviation
+    skew_s: float  #: by how much the right camera exposes its LED's row later than the left one its own, s
+    sigma_skew_s: float  #: its standard deviation
+    jitter_s: float  #: standard deviation of the skew from shot to shot, s
     left: Exposures
     right: Exposures
 
@@ -395,21 +370,20 @@ class SyncLedWatch:
         bit_s: how long each bit of the LED's code lasts, s.
 
     Attributes:
-        estimates: what it said, window by window.
-        reason: why there is no estimate of the newest window; None where there is one, or nothing was tried yet.
         tried: how many windows and searches there were.
-        row_shares: (2,) the LED's row in both images, -1/2 at the top to 1/2 at the bottom; None before it was found.
         reading: by how much a reading of a joint is older than its stamp, and its sigma, s.
-        apart: the delay that a sweep of the arm found less that of the LED, its sigma, and when it was found, s; None
-            before.
     """
 
     def __init__(self, bit_s: float, reading: tuple[float, float] = (0.0, 0.0)) -> None:
         self._bit_s, self.reading = bit_s, reading
+        #: the delay that a sweep of the arm found less that of the LED, its sigma, and when it was found, s; None
+        #: before
         self.apart: tuple[float, float, float] | None = None
-        self.estimates: list[SyncEstimate] = []
+        self.estimates: list[SyncEstimate] = []  #: what it said, window by window
+        #: why there is no estimate of the newest window; None where there is one, or nothing was tried yet
         self.reason: str | None = None
         self.tried = self._lost = 0
+        #: (2,) the LED's row in both images, -1/2 at the top to 1/2 at the bottom; None before it was found
         self.row_shares: Array | None = None
         self._height = 1
         self._busy = False

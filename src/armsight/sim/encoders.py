@@ -38,17 +38,11 @@ class EncoderFault(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class Encoders(Record):
-    """What reads six joints.
+    """What reads six joints."""
 
-    Attributes:
-        kind: (6,) of :class:`~armsight.robot.boards.codes.SensorKind`.
-        counts_per_rev: (6,) of a revolution of the joint, negative where counts fall with the angle.
-        zero_counts: (6,) reading of an absolute one at 0 rad.
-    """
-
-    kind: NDArray[np.int64]
-    counts_per_rev: Array
-    zero_counts: NDArray[np.int64]
+    kind: NDArray[np.int64]  #: (6,) of :class:`~armsight.robot.boards.codes.SensorKind`.
+    counts_per_rev: Array  #: (6,) of a revolution of the joint, negative where counts fall with the angle
+    zero_counts: NDArray[np.int64]  #: (6,) reading of an absolute one at 0 rad
 
 
 def as5047_frame(data: int, *, error: bool = False) -> int:

@@ -65,35 +65,20 @@ _USUAL_SIZE = {PotFault.JUMP: 0.35, PotFault.SLIP: 0.3, PotFault.DRIFT: 0.36, Po
 
 @dataclass(frozen=True, eq=False)
 class JointModel(Record):
-    """What six joints are made of.
+    """What six joints are made of."""
 
-    Attributes:
-        resistance_ohm: (6,) of the windings.
-        constant_v_s: (6,) motor constants at the joint, V s/rad and N m/A.
-        inertia_kg_m2: (6,) at the joint.
-        viscous_n_m_s: (6,) friction that grows with speed, N m s/rad.
-        dry_n_m: (6,) dry friction, N m.
-        gravity_n_m: (6,) gravity's torque at 0 rad, N m; it falls with the angle's cosine.
-        backlash_rad: (6,) between the motor and the joint with its potentiometer, from stop to stop.
-        coupling: (6,) share of a joint's inertia that the acceleration of the joint before it acts on.
-        noise_counts: (6,) standard deviation of a reading.
-        current_noise_ma: (6,) standard deviation of a current's reading.
-        current_gain: (6,) a current's reading over the current.
-        brake_n_m: (6,) what a closed brake holds, N m; 0 where there is none.
-    """
-
-    resistance_ohm: Array
-    constant_v_s: Array
-    inertia_kg_m2: Array
-    viscous_n_m_s: Array
-    dry_n_m: Array
-    gravity_n_m: Array
-    backlash_rad: Array
-    coupling: Array
-    noise_counts: Array
-    current_noise_ma: Array
-    current_gain: Array
-    brake_n_m: Array
+    resistance_ohm: Array  #: (6,) of the windings
+    constant_v_s: Array  #: (6,) motor constants at the joint, V s/rad and N m/A
+    inertia_kg_m2: Array  #: (6,) at the joint
+    viscous_n_m_s: Array  #: (6,) friction that grows with speed, N m s/rad
+    dry_n_m: Array  #: (6,) dry friction, N m
+    gravity_n_m: Array  #: (6,) gravity's torque at 0 rad, N m; it falls with the angle's cosine
+    backlash_rad: Array  #: (6,) between the motor and the joint with its potentiometer, from stop to stop
+    coupling: Array  #: (6,) share of a joint's inertia that the acceleration of the joint before it acts on
+    noise_counts: Array  #: (6,) standard deviation of a reading
+    current_noise_ma: Array  #: (6,) standard deviation of a current's reading
+    current_gain: Array  #: (6,) a current's reading over the current
+    brake_n_m: Array  #: (6,) what a closed brake holds, N m; 0 where there is none
 
     def packed(self) -> Array:
         """Return all attributes as rows (12, 6)."""
@@ -135,27 +120,16 @@ def drawn_model(seed: int, *, load: float = 0.6, inertia: float = 6.0, spread: f
 
 @dataclass(frozen=True, eq=False)
 class Transmission(Record):
-    """What lies between the motors of six joints and what they drive.
+    """What lies between the motors of six joints and what they drive."""
 
-    Attributes:
-        stiffness_n_m: (6,) of the spring between them, N m/rad, where the joint is at 0 rad; 0: rigid.
-        damping_n_m_s: (6,) of the spring, N m s/rad.
-        link_share: (6,) share of the joint's inertia behind the spring.
-        pose_share: (6,) by which share the stiffness is greater at 1 rad; it changes linearly with the angle.
-        back_share: (6,) stiffness while the joint is ahead of the motor, over that while it is behind.
-        drum_rad: (6,) amplitude by which an eccentric drum leads the joint before and behind the motor.
-        drum_per_rev: (6,) how often it does so in a revolution of the motor, gear included.
-        drum_phase: (6,) its phase at 0 rad, of a cycle.
-    """
-
-    stiffness_n_m: Array
-    damping_n_m_s: Array
-    link_share: Array
-    pose_share: Array
-    back_share: Array
-    drum_rad: Array
-    drum_per_rev: Array
-    drum_phase: Array
+    stiffness_n_m: Array  #: (6,) of the spring between them, N m/rad, where the joint is at 0 rad; 0: rigid
+    damping_n_m_s: Array  #: (6,) of the spring, N m s/rad
+    link_share: Array  #: (6,) share of the joint's inertia behind the spring
+    pose_share: Array  #: (6,) by which share the stiffness is greater at 1 rad; it changes linearly with the angle
+    back_share: Array  #: (6,) stiffness while the joint is ahead of the motor, over that while it is behind
+    drum_rad: Array  #: (6,) amplitude by which an eccentric drum leads the joint before and behind the motor
+    drum_per_rev: Array  #: (6,) how often it does so in a revolution of the motor, gear included
+    drum_phase: Array  #: (6,) its phase at 0 rad, of a cycle
 
     def packed(self) -> Array:
         """Return all attributes as rows (8, 6)."""
@@ -340,10 +314,6 @@ class JointPlant:
         q: (6,) true angles of the motors, rad, at the joint.
         qd: (6,) their speeds, rad/s.
         link: (6,) true angles of the joints, rad: the motors' but for backlash, twist and drum.
-        hand_n_m: (6,) torque with which a hand pushes, N m.
-        supply_mv: motor supply, mV.
-        stop_pressed: whether the emergency stop is pressed.
-        blocked: (6,) joints that something holds fast.
         stuck: (6,) share of the supply, -1 to 1, that a broken bridge puts out while it is awake, whatever its duty; 0
             where it is sound.
         offset_a: (6,) offset of the current's sensor, A.
@@ -366,10 +336,10 @@ class JointPlant:
         self.transmission = plain_transmission() if transmission is None else transmission
         self._between, self._linkd = self.transmission.packed(), np.zeros(JOINTS)
         self.meet()
-        self.hand_n_m = np.zeros(JOINTS)
-        self.supply_mv = round(1e3 * SUPPLY_V)
-        self.stop_pressed = False
-        self.blocked = np.zeros(JOINTS, dtype=bool)
+        self.hand_n_m = np.zeros(JOINTS)  #: (6,) torque with which a hand pushes, N m
+        self.supply_mv = round(1e3 * SUPPLY_V)  #: motor supply, mV
+        self.stop_pressed = False  #: whether the emergency stop is pressed
+        self.blocked = np.zeros(JOINTS, dtype=bool)  #: (6,) joints that something holds fast
         self.stuck, self.offset_a = np.zeros(JOINTS), np.zeros(JOINTS)
         self._qdd, self._current_a = np.zeros(JOINTS), np.zeros(JOINTS)
         self._noise = np.random.default_rng(seed).integers(1, 1 << 63, JOINTS, dtype=np.uint64)

@@ -19,7 +19,7 @@ import numpy as np
 
 from armsight.data import SIDES, Array, Image, Record
 from armsight.errors import InputError
-from armsight.files import made_folder, read_json, replacing, write_text
+from armsight.files import as_input_error, made_folder, read_json, replacing, write_text
 from armsight.geometry.check import checked
 from armsight.sim.render.background import BACKGROUNDS
 from armsight.sim.render.optics import Optics, Sensor
@@ -59,7 +59,7 @@ class Truth(Record):
     def load(folder: str | Path) -> Truth:
         """Read the truth of a recording; InputError names a file that is missing or is none."""
         path = Path(folder) / TRUTH
-        try:
+        with as_input_error(f"{path}: not the truth of a recording", KeyError, TypeError, why=True):
             document = read_json(path)
             if document["format"] != FORMAT or document["version"] > VERSION:
                 raise InputError(f"{path}: expected format {FORMAT}, version up to {VERSION}")
@@ -71,8 +71,6 @@ class Truth(Record):
                 checked([entry["t_s"] for entry in entries], (None,), "t_s"),
                 checked([entry["T_left_body_m"] for entry in entries], (None, 4, 4), "T_left_body_m"),
             )
-        except (KeyError, TypeError) as error:
-            raise InputError(f"{path}: not the truth of a recording: {error}") from None
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ import numpy as np
 import yaml
 
 from armsight.errors import InputError
-from armsight.files import DOCUMENT_MB, parsed_json, read_bytes, read_text
+from armsight.files import DOCUMENT_MB, as_input_error, parsed_json, read_bytes, read_text
 from armsight.tables.lengths import number
 
 #: A value of a file of another program: a number, a text, a list or a mapping, unknown until checked.
@@ -71,10 +71,8 @@ def read_document(path: str | Path) -> dict[str, Foreign]:
     if not isinstance(document, Mapping):
         kind = "nothing" if document is None else f"a {'list' if isinstance(document, list) else 'single value'}"
         raise InputError(f"{path}: holds {kind}; expected names and values, as YAML, JSON, TOML or INI")
-    try:
+    with as_input_error(str(path), InputError, why=True):
         return {str(key): _with_matrices(str(key), value) for key, value in document.items()}
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
 
 
 def _only(documents: list[Foreign], path: str | Path) -> Foreign:
@@ -111,11 +109,11 @@ def matrix_of(name: str, value: Mapping[str, Foreign]) -> np.ndarray[Any, np.dty
     sized = {"sizes", "data", "dt"} <= set(value)  # OpenCV 5's vectors, and matrices of three dimensions
     if not sized and not {"rows", "cols", "data"} <= set(value):
         return None
-    try:
+    with as_input_error(
+        f"{name} must be numbers: rows, cols and data of a matrix", TypeError, ValueError, OverflowError
+    ):
         rows, cols = (int(np.prod(np.asarray(value["sizes"], float))), 1) if sized else (value["rows"], value["cols"])
         rows, cols, data = int(rows), int(cols), np.asarray(value["data"], float).ravel()
-    except (TypeError, ValueError, OverflowError):
-        raise InputError(f"{name} must be numbers: rows, cols and data of a matrix") from None
     channels = re.match(r"\d*", str(value.get("dt", "")))
     depth = int(channels[0]) if channels and channels[0] else 1
     if min(rows, cols) < 0 or rows * cols * depth != data.size:
@@ -137,11 +135,9 @@ def _with_matrices(name: str, value: Foreign) -> Foreign:
 
 def _unpacked(data: bytes, path: str | Path) -> bytes:
     most = int(DOCUMENT_MB * 1e6)
-    try:
+    with as_input_error(f"{path}: compressed by gzip and damaged", zlib.error, why=True):
         packed = zlib.decompressobj(31)
         out = packed.decompress(data, most + 1)
-    except zlib.error as error:
-        raise InputError(f"{path}: compressed by gzip and damaged: {error}") from None
     if len(out) > most:
         raise InputError(f"{path}: holds more than {DOCUMENT_MB} MB: is it the right file?")
     if not packed.eof:
@@ -361,18 +357,14 @@ def _toml_or_ini(text: str, path: str | Path) -> dict[str, Foreign]:
         raise InputError(f"{path}: not TOML: {problem}") from None
     parser = configparser.ConfigParser(interpolation=None, strict=False)
     parser.optionxform = str  # type: ignore[assignment,method-assign] # names keep their capitals
-    try:
+    with as_input_error(f"{path}: neither TOML nor INI: {problem}", configparser.Error):
         parser.read_string(text)
-    except configparser.Error:
-        raise InputError(f"{path}: neither TOML nor INI: {problem}") from None
     return {name: {key: _or_number(value) for key, value in parser[name].items()} for name in parser.sections()}
 
 
 def _xml(data: bytes, path: str | Path) -> Foreign:
-    try:
+    with as_input_error(f"{path}: not XML", ElementTree.ParseError, why=True):
         root = ElementTree.fromstring(data)
-    except ElementTree.ParseError as error:
-        raise InputError(f"{path}: not XML: {error}") from None
     if root.tag != "opencv_storage":
         raise InputError(f"{path}: XML of <{root.tag}>; expected OpenCV's <opencv_storage>")
     return _node(root)

@@ -27,21 +27,14 @@ NAMED = 3
 
 @dataclass(frozen=True, eq=False)
 class SeenShot(Record):
-    """What both cameras saw in one shot, as it stands in the file.
+    """What both cameras saw in one shot, as it stands in the file."""
 
-    Attributes:
-        name: the shot.
-        ids: per camera (N,) rows of the body's points, in the file's order; one may stand more than once.
-        uv: per camera (N, 2) raw pixels.
-        t_s: its time, s; None where it has none.
-        problem: why the shot cannot be used; None when it can.
-    """
-
-    name: str
+    name: str  #: the shot
+    #: per camera (N,) rows of the body's points, in the file's order; one may stand more than once
     ids: tuple[Ids, Ids]
-    uv: tuple[Array, Array]
-    t_s: float | None = None
-    problem: str | None = None
+    uv: tuple[Array, Array]  #: per camera (N, 2) raw pixels
+    t_s: float | None = None  #: its time, s; None where it has none
+    problem: str | None = None  #: why the shot cannot be used; None when it can
 
 
 def read_detections(path: str | Path, body: Body) -> list[SeenShot]:

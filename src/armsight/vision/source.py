@@ -30,7 +30,6 @@ class Source(Protocol):
     @property
     def count(self) -> int | None:
         """How many shots there are in all; None where that is not known, as of live cameras."""
-        ...
 
     def read(self) -> Shot | None:
         """Return the next shot, or None at the end.
@@ -38,11 +37,9 @@ class Source(Protocol):
         A shot that was taken and cannot be used (a truncated file, a frame that did not decode) is a Shot with a
         ``problem``; a device that is gone raises :class:`~armsight.errors.DeviceError`.
         """
-        ...
 
     def close(self) -> None:
         """Release files and devices; a second call has no effect."""
-        ...
 
     def __iter__(self) -> Iterator[Shot]:
         """Read the shots that are left, one after another; a folder of images begins anew each time."""

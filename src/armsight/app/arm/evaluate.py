@@ -31,7 +31,7 @@ from armsight.app.show.encode import json_of
 from armsight.data import Array, Record
 from armsight.errors import InputError
 from armsight.estimate.solve import regression
-from armsight.files import read_json, read_toml
+from armsight.files import as_input_error, read_json, read_toml
 from armsight.geometry.pose import mean_pose
 from armsight.geometry.rotation import log_so3
 from armsight.loop.identify.backlash import joint_backlashes
@@ -511,8 +511,6 @@ def seen_angles(folder: Path, arm: Arm) -> Array:
     if not set(names) <= set(table.at) or f"q{arm.joints + 1}_rad" in table.at:
         raise InputError(f"{path}: is not of an arm of {arm.joints} joints")
     seen = table.numbers(names)
-    try:
+    with as_input_error(f"{folder / 'motion.toml'}: is not of an arm of {arm.joints} joints", ValueError):
         start = read_toml(folder / "motion.toml").get("start_deg", np.degrees(arm.home).tolist())
         return np.vstack([np.radians(np.array(start, float)), seen])
-    except ValueError:
-        raise InputError(f"{folder / 'motion.toml'}: is not of an arm of {arm.joints} joints") from None

@@ -24,6 +24,7 @@ from armsight.app.batch.run import RECORDINGS, SHOTS
 from armsight.data import Array
 from armsight.errors import InputError
 from armsight.estimate.chance import chance_among
+from armsight.files import as_input_error
 
 #: Chance that a report names any cell of a site in which none differs; half: a difference must be larger, double: one
 #: report in ten names one.
@@ -122,11 +123,9 @@ def _runs(folder: Path) -> Iterator[_PushedRun]:
     """Read the runs of a batch, in its order."""
     from pyarrow import parquet
 
-    try:
+    with as_input_error(f"{folder}: no results of armsight batch are here", OSError, ValueError, why=True):
         recordings = parquet.read_table(folder / RECORDINGS).to_pylist()
         shots = parquet.read_table(folder / SHOTS)
-    except (OSError, ValueError) as error:
-        raise InputError(f"{folder}: no results of armsight batch are here: {error}") from None
     rows: dict[str, list[int]] = defaultdict(list)
     for number, name in enumerate(shots["recording"].to_pylist() if "recording" in shots.column_names else ()):
         rows[name].append(number)

@@ -22,9 +22,11 @@ from typing import Any, TypeAlias
 from armsight import __version__
 from armsight.app.batch.work import BatchOptions, Done, work
 from armsight.app.progress import bar
+from armsight.app.show.messages import require
 from armsight.errors import InputError
 from armsight.files import (
     alone_in,
+    as_input_error,
     check_folder,
     made_folder,
     parsed_json,
@@ -47,40 +49,24 @@ _Client: TypeAlias = Any
 
 @dataclass(frozen=True)
 class Batch:
-    """What is to be done.
+    """What is to be done."""
 
-    Attributes:
-        recordings: paths with wildcards.
-        output: folder of the results.
-        options: what is done with each.
-        workers: how many processes, or the address of a cluster; None is one process a core.
-    """
-
-    recordings: Sequence[str]
-    output: Path
-    options: BatchOptions
-    workers: str | None = None
+    recordings: Sequence[str]  #: paths with wildcards
+    output: Path  #: folder of the results
+    options: BatchOptions  #: what is done with each
+    workers: str | None = None  #: how many processes, or the address of a cluster; None is one process a core
 
 
 @dataclass(frozen=True)
 class BatchDone:
-    """What came out.
+    """What came out."""
 
-    Attributes:
-        recordings: how many there are.
-        ok: how many were done.
-        failed: how many failed.
-        before: how many were done before the batch was started again.
-        shots: how many shots they have.
-        reasons: why recordings failed, and how many each, the most frequent first.
-    """
-
-    recordings: int
-    ok: int
-    failed: int
-    before: int
-    shots: int
-    reasons: dict[str, int]
+    recordings: int  #: how many there are
+    ok: int  #: how many were done
+    failed: int  #: how many failed
+    before: int  #: how many were done before the batch was started again
+    shots: int  #: how many shots they have
+    reasons: dict[str, int]  #: why recordings failed, and how many each, the most frequent first
 
     def to_json(self) -> dict[str, Any]:
         """Return it as JSON."""
@@ -88,14 +74,8 @@ class BatchDone:
 
 
 def require_dask() -> None:
-    """Raise an InputError with what to install unless Dask, fsspec and pyarrow can be imported."""
-    try:
-        import distributed
-        import fsspec
-        import pyarrow  # noqa: F401 - only whether they are there
-    except ImportError as error:
-        raise InputError(f'batch needs {error.name}, which is not installed: pip install "armsight[batch]"') from None
-    del distributed, fsspec
+    """Raise an InputError with what to install unless Dask, fsspec and pyarrow are."""
+    require("batch", "batch", "distributed", "fsspec", "pyarrow")
 
 
 def found_recordings(patterns: Sequence[str]) -> dict[str, str]:
@@ -198,10 +178,10 @@ def _client(batch: Batch, count: int, say: Callable[[str], None]) -> Iterator[tu
     logging.getLogger("distributed").setLevel(logging.ERROR)
     with contextlib.ExitStack() as stack:
         if "://" in (batch.workers or ""):
-            try:
+            with as_input_error(
+                f"--workers {batch.workers}: no cluster answers there", OSError, ValueError, TimeoutError, why=True
+            ):
                 client = stack.enter_context(Client(batch.workers, timeout=10))
-            except (OSError, ValueError, TimeoutError) as error:
-                raise InputError(f"--workers {batch.workers}: no cluster answers there: {error}") from None
         else:
             workers = min(int(batch.workers or len(os.sched_getaffinity(0))), count)
             cluster = LocalCluster(
@@ -272,7 +252,5 @@ def _load(part: Path | Done) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     if isinstance(part, Done):
         return part.recording, part.shots
     stored = parsed_json(read_text(part, _PART_MB), part, "a result of armsight batch; remove it")
-    try:
+    with as_input_error(f"{part}: not a result of armsight batch: remove it", KeyError, TypeError, ValueError):
         return dict(stored["recording"]), list(stored["shots"])
-    except (KeyError, TypeError, ValueError):
-        raise InputError(f"{part}: not a result of armsight batch: remove it") from None

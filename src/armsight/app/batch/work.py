@@ -29,21 +29,13 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True)
 class BatchOptions:
-    """What is done with every recording.
+    """What is done with every recording."""
 
-    Attributes:
-        operation: measure, replay, identify or check.
-        rig: rig file.
-        target: board or body.
-        arm: arm model.
-        estimator: a name of ESTIMATORS.
-    """
-
-    operation: str
-    rig: str | None = None
-    target: str | None = None
-    arm: str | None = None
-    estimator: str = "kalman"
+    operation: str  #: measure, replay, identify or check
+    rig: str | None = None  #: rig file
+    target: str | None = None  #: board or body
+    arm: str | None = None  #: arm model
+    estimator: str = "kalman"  #: a name of ESTIMATORS
 
     def to_json(self) -> dict[str, Any]:
         """Return them as JSON."""
@@ -52,15 +44,10 @@ class BatchOptions:
 
 @dataclass(frozen=True)
 class Done:
-    """What came out of one recording.
+    """What came out of one recording."""
 
-    Attributes:
-        recording: its row.
-        shots: its shots' rows; none where it failed, or has no shots.
-    """
-
-    recording: Row
-    shots: list[Row]
+    recording: Row  #: its row
+    shots: list[Row]  #: its shots' rows; none where it failed, or has no shots
 
 
 def work(path: str, options: BatchOptions) -> Done:

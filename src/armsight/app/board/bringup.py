@@ -76,15 +76,12 @@ class Operator(Protocol):
 
     def say(self, line: str) -> None:
         """Hear a line."""
-        ...
 
     def ask(self, kind: str, joint: int | None, text: str) -> None:
         """Hear a question: ``yes``, ``mark`` (an angle in degrees, or nothing at the end), ``problem`` (r or s)."""
-        ...
 
     def answer(self) -> str | None:
         """Return the answer, None while there is none; q, to any question, ends the bring-up."""
-        ...
 
 
 class _Mistake(Exception):

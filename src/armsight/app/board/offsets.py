@@ -21,7 +21,7 @@ import numpy as np
 
 from armsight.data import Array
 from armsight.errors import InputError
-from armsight.files import check_outputs, check_writable, read_json, read_text, read_toml, write_text
+from armsight.files import as_input_error, check_outputs, check_writable, read_json, read_text, read_toml, write_text
 from armsight.loop.identify.corrected import open_corrected
 from armsight.robot.arm_file import open_arm
 from armsight.robot.boards.ar4.models import SENSE
@@ -70,10 +70,10 @@ def further_of(identified: str, nominal: Arm) -> Array:
 
 def parsed_degrees(text: str) -> Array:
     """Return angles, rad, of a text such as 0.5,-1.2,0,0,0 in degrees."""
-    try:
+    with as_input_error(
+        f"--further {text}: numbers of degrees with commas between are needed, one a joint", ValueError
+    ):
         return np.radians([float(each) for each in text.split(",")])
-    except ValueError:
-        raise InputError(f"--further {text}: numbers of degrees with commas between are needed, one a joint") from None
 
 
 @dataclass(frozen=True)
@@ -182,10 +182,14 @@ def servo_zeros(
 
 
 def _kept_offsets(board: FeetechBoard, path: Path) -> dict[int, int]:
-    try:
+    with as_input_error(
+        f"{path}: not a file of old offsets that `armsight board offsets` kept",
+        KeyError,
+        TypeError,
+        ValueError,
+        AttributeError,
+    ):
         wished = {int(id): int(value) for id, value in read_json(path)["homing_offsets"].items()}
-    except (KeyError, TypeError, ValueError, AttributeError):
-        raise InputError(f"{path}: not a file of old offsets that `armsight board offsets` kept") from None
     for id, value in wished.items():
         if abs(value) > MOST_OFFSET:
             holds = f"the register holds -{MOST_OFFSET} to {MOST_OFFSET}"

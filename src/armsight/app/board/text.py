@@ -13,6 +13,7 @@ from armsight.app.board.flash import Built
 from armsight.app.board.selftest import SelftestResult
 from armsight.data import Array, JointStates
 from armsight.errors import InputError
+from armsight.files import as_input_error
 from armsight.robot.boards.codes import STATE_TEXTS, ConfigSource
 from armsight.robot.boards.configuration import JOINTS, Configuration
 from armsight.robot.boards.contract import MotionBoard
@@ -104,10 +105,8 @@ def changed_gains(values: Array, changes: Sequence[str]) -> Array:
         name, _, text = rest.partition("=")
         if joint not in rows or name not in names:
             raise InputError(f"{change!r}: JOINT:NAME=VALUE is needed, JOINT 1 to 6 or all, NAME {', '.join(names)}")
-        try:
+        with as_input_error(f"{change!r}: {text!r} is no number", ValueError):
             changed[rows[joint], names.index(name)] = float(text)
-        except ValueError:
-            raise InputError(f"{change!r}: {text!r} is no number") from None
     return changed
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from armsight.app.show.messages import Note
 from armsight.app.show.page import PAGE
-from armsight.app.show.plotting import new_figure
+from armsight.app.show.plotting import subplots
 from armsight.app.show.report import Fact, Grade, Plot, Report, Section, figure_files
 from armsight.app.show.table import TextTable
 from armsight.sim.budget.plan import PRICES, RigPlan
@@ -153,8 +153,7 @@ def _chosen(plan: RigPlan) -> str:
 
 def _map(found: Budget) -> Figure:
     """Draw the error at 95 % over the volume, seen from above: near below, the worst height of each column."""
-    figure = new_figure(3.2)
-    ax = figure.subplots()
+    figure, ax = subplots(3.2)
     level = 1e3 * found.at_level(found.cov())[0]
     order = np.argsort(-level)
     seen = np.round(1e4 * np.column_stack([found.p_left[:, 0], found.p_left @ found.forward]))[order]

@@ -21,7 +21,7 @@ from armsight.app.check.result import (
 from armsight.app.check.rows import Row
 from armsight.app.show.messages import Note
 from armsight.app.show.page import PAGE, bullets
-from armsight.app.show.plotting import BLUE, INK, MUTED, ORANGE, RED, new_figure, nice
+from armsight.app.show.plotting import BLUE, INK, MUTED, ORANGE, RED, new_figure, nice, subplots
 from armsight.app.show.report import Block, Grade, Html, Report, Text, figure_files, figures
 from armsight.app.show.table import TextTable, html_table
 from armsight.data import Array
@@ -81,8 +81,10 @@ def scatter_figure(result: CheckResult, rows: Sequence[Row]) -> Figure | None:
             ax.axvline(0, **_GRID)
             ax.plot(radius * np.cos(a), radius * np.sin(a), color=ORANGE, lw=1.2, ls=":" if RP is None else "-")
             ax.set(aspect="equal", xlabel="x, mm" if row else "")
-            ax.set_title("" if row else f"{name}: command is\n{1e3 * metrics.AP_m.raw:.2f} mm off")
-            ax.set_ylabel("" if column else f"{'xyz'[j]}, mm ({view})")
+            ax.set(
+                title="" if row else f"{name}: command is\n{1e3 * metrics.AP_m.raw:.2f} mm off",
+                ylabel="" if column else f"{'xyz'[j]}, mm ({view})",
+            )
     panels[0, 0].set(xlim=(-reach, reach), ylim=(-reach, reach))
     bar = figure.colorbar(dots, ax=panels, label="cycle", shrink=0.7)
     bar.locator = MaxNLocator(integer=True)
@@ -128,8 +130,7 @@ def paths_figure(result: CheckResult, rows: Sequence[Row]) -> Figure | None:
     """Plot the distance of each path from the commanded one, along it."""
     if not result.paths:
         return None
-    figure = new_figure(3.2)
-    ax = figure.subplots()
+    figure, ax = subplots(3.2)
     for (name, path), colour in zip(result.paths.items(), (BLUE, ORANGE, MUTED, RED) * len(result.paths), strict=False):
         share = 100 * (np.arange(len(path.off_m)) + 1) / (len(path.off_m) + 1)
         ax.plot(share, 1e3 * path.off_m, color=colour, label=name)

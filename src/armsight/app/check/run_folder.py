@@ -26,7 +26,7 @@ from armsight.app.run.report import VERSION
 from armsight.app.run.tracks import ToolTrack, read_track
 from armsight.data import Array, Record
 from armsight.errors import InputError
-from armsight.files import natural_key, read_json, read_toml, require_version
+from armsight.files import as_input_error, natural_key, read_json, read_toml, require_version
 from armsight.geometry.pose import mean_pose, pose
 from armsight.loop.iso9283.paths import plane_axes
 from armsight.loop.iso9283.poses import MIN_POSES
@@ -178,11 +178,9 @@ def segments_of(folder: Path, closed: bool) -> list[PathSegment]:
             raise InputError(f"{folder}: is no run, {name} is missing: give a folder of armsight run or demo, or a CSV")
     reference, _ = read_track(file, ())
     seen, sigma = read_track(folder / "vision.csv", ("sigma_x_m", "sigma_y_m", "sigma_z_m"))
-    try:
+    with as_input_error(f"{motions}: not a motion file (docs/howto/motions.md)", AttributeError, KeyError, TypeError):
         entries: Any = read_toml(motions).get("motion", [])
         kinds = {str(e.get("name", f"{e['kind']} {n}")): str(e["kind"]) for n, e in enumerate(entries, start=1)}
-    except (AttributeError, KeyError, TypeError):
-        raise InputError(f"{motions}: not a motion file (docs/howto/motions.md)") from None
     named = np.char.add(np.char.add(reference.phase, "/"), reference.motion)
     ends = [0, *(np.flatnonzero(named[1:] != named[:-1]) + 1).tolist(), len(named)]
     found, now = [], "calibration"

@@ -22,27 +22,18 @@ from armsight.vision.dense.rectified import plain_grey
 
 @dataclass(frozen=True)
 class SceneResult:
-    """The errors and the speed of a method on a scene.
-
-    Attributes:
-        all_pixels: errors over all pixels with a truth.
-        nonocc: over those that both cameras see.
-        measured: over those that the method measured, of the ones both cameras see.
-        density_percent: share of the pixels with a truth that was measured, not filled.
-        within_percent: share of the measured ones both cameras see whose error is below 1.96 sigma.
-        rate: millions of pixels times disparities a second.
-    """
+    """The errors and the speed of a method on a scene."""
 
     scene: str
     method: str
     weight: float
-    all_pixels: DisparityErrors
-    nonocc: DisparityErrors
-    measured: DisparityErrors
-    density_percent: float
-    within_percent: float
+    all_pixels: DisparityErrors  #: errors over all pixels with a truth
+    nonocc: DisparityErrors  #: over those that both cameras see
+    measured: DisparityErrors  #: over those that the method measured, of the ones both cameras see
+    density_percent: float  #: share of the pixels with a truth that was measured, not filled
+    within_percent: float  #: share of the measured ones both cameras see whose error is below 1.96 sigma.
     seconds: float
-    rate: float
+    rate: float  #: millions of pixels times disparities a second
 
     def to_json(self) -> dict[str, Any]:
         """Return the line by names."""

@@ -137,30 +137,18 @@ _ROWS_AT_ONCE = 64
 
 @dataclass(frozen=True)
 class DenseSummary:
-    """A dense result in numbers; the fields are the keys of its JSON object.
+    """A dense result in numbers; the fields are the keys of its JSON object."""
 
-    Attributes:
-        measured_percent: share of the pixels that were measured.
-        hidden_percent: share that the right camera does not see.
-        filled_percent: share that was filled from its neighbours.
-        not_in_view_percent: share that the left camera does not see.
-        median_sigma_px: of the measured disparities; None where there are none.
-        disparities_px: first and last disparity that was tried.
-        problem: why nothing was measured; None where something was.
-        median_depth_mm: of the measured pixels; None where there is no depth.
-        median_depth_sigma_mm: the same of the depth's standard deviation.
-    """
-
-    measured_percent: float
-    hidden_percent: float
-    filled_percent: float
-    not_in_view_percent: float
-    median_sigma_px: float | None
-    disparities_px: tuple[int, int]
-    problem: str | None
+    measured_percent: float  #: share of the pixels that were measured
+    hidden_percent: float  #: share that the right camera does not see
+    filled_percent: float  #: share that was filled from its neighbours
+    not_in_view_percent: float  #: share that the left camera does not see
+    median_sigma_px: float | None  #: of the measured disparities; None where there are none
+    disparities_px: tuple[int, int]  #: first and last disparity that was tried
+    problem: str | None  #: why nothing was measured; None where something was
     points: int | None = None
-    median_depth_mm: float | None = None
-    median_depth_sigma_mm: float | None = None
+    median_depth_mm: float | None = None  #: of the measured pixels; None where there is no depth
+    median_depth_sigma_mm: float | None = None  #: the same of the depth's standard deviation
 
     def to_json(self) -> dict[str, Any]:
         """Return the summary as JSON has it; without a depth its keys are absent."""

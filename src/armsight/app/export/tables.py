@@ -7,7 +7,8 @@ from typing import Any
 
 from armsight.app.replay.recorded import RecordedRun
 from armsight.app.replay.tables import Cell, Table, live_table
-from armsight.app.run.tracks import NAMES, require_pyarrow
+from armsight.app.run.tracks import NAMES
+from armsight.app.show.messages import require
 from armsight.errors import InputError
 from armsight.files import made_folder, replacing, table_text, write_text
 from armsight.loop.running.data import JointsDatum, ShotDatum
@@ -84,7 +85,7 @@ def write_csv(run: RecordedRun, folder: Path) -> list[Path]:
 
 def write_parquet(run: RecordedRun, folder: Path) -> list[Path]:
     """Write a Parquet file a table, and one of each track whose CSV lies beside run.mcap; return the files."""
-    require_pyarrow()
+    require("an export", "run", "pyarrow")
     import pyarrow as pa
     from pyarrow import parquet
     from pyarrow.csv import read_csv

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from armsight.app.show.messages import Note
-from armsight.app.show.plotting import BLUE, INK, MUTED, ORANGE, RED, new_figure
+from armsight.app.show.plotting import BLUE, INK, MUTED, ORANGE, RED, subplots
 from armsight.app.show.report import Block, Fact, Grade, Lines, Report, Section, figures
 from armsight.app.show.table import TextTable
 from armsight.data import Array, Record
@@ -308,8 +308,7 @@ def plan_csv(plan: MountingPlan) -> str:
 
 def errors_figure(run: HandEyeAnswer) -> Figure:
     """Plot the error of each pose left out, and how far each is from the others."""
-    figure = new_figure(6.6)
-    axes = figure.subplots(3, 1, sharex=True)
+    figure, axes = subplots(6.6, 3, 1, sharex=True)
     found, n = run.found, len(run.found.used)
     lines = run.recording.robot.lines[run.recording.rows]
     by_line = run.offset_s is None and len(np.unique(lines)) == n
@@ -320,17 +319,18 @@ def errors_figure(run: HandEyeAnswer) -> Figure:
     axes[1].bar(at, np.degrees(np.nan_to_num(found.held_out.angle_rad)), color=BLUE, width=width)
     axes[1].set_title("left out: angle, deg")
     axes[2].bar(at, np.sqrt(found.distance), color=np.where(found.used, MUTED, RED), width=width)
-    axes[2].set_yscale("log")
-    axes[2].set_title("residual over its sigma; red: a blunder, left out of the fit")
-    axes[2].set_xlabel("line of the robot's table" if by_line else "pose")
+    axes[2].set(
+        yscale="log",
+        title="residual over its sigma; red: a blunder, left out of the fit",
+        xlabel="line of the robot's table" if by_line else "pose",
+    )
     axes[2].xaxis.get_major_locator().set_params(integer=True)
     return figure
 
 
 def sigma_figure(run: HandEyeAnswer) -> Figure:
     """Plot the sigmas of both transforms."""
-    figure = new_figure(3.0)
-    axes = figure.subplots(1, 2)
+    figure, axes = subplots(3.0, 1, 2)
     sigma = np.sqrt(np.diag(run.found.cov))
     held, still = names(run)
     at = np.arange(3)
@@ -347,8 +347,7 @@ def sigma_figure(run: HandEyeAnswer) -> Figure:
 def structure_figure(run: HandEyeAnswer) -> Figure:
     """Plot how probable the poses left out are under each choice of sources."""
     ranked = sorted(run.found.likelihoods.items(), key=lambda one: one[1])
-    figure = new_figure(0.34 * len(ranked) + 1.2)
-    ax = figure.subplots()
+    figure, ax = subplots(0.34 * len(ranked) + 1.2)
     best = ranked[-1][1]
     ax.barh([name for name, _ in ranked], [value - best for _, value in ranked], color=BLUE, height=0.6)
     for row, (_, value) in enumerate(ranked):
@@ -360,8 +359,7 @@ def structure_figure(run: HandEyeAnswer) -> Figure:
 
 def coverage_figure(run: HandEyeAnswer) -> Figure:
     """Plot which rotations the flange made, and where the target was seen."""
-    figure = new_figure(3.6)
-    left, right = figure.subplots(1, 2)
+    figure, (left, right) = subplots(3.6, 1, 2)
     p, used = run.recording.poses, run.found.used
     rotated = np.degrees(log_se3(inverse(mean_pose(p.A)) @ p.A)[:, 3:])
     for other, colour, label in ((1, BLUE, "x and y"), (2, ORANGE, "x and z")):

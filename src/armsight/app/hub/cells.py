@@ -74,15 +74,9 @@ def number(value: object) -> float | None:
 
 @dataclass(frozen=True)
 class Drift:
-    """A slope against what slopes are by chance.
+    """A slope against what slopes are by chance."""
 
-    Attributes:
-        per_h: the slope an hour, in the number's unit.
-        sigma_per_h: one sigma of slopes by chance; NaN while that is unknown.
-        chance: how probable a slope as steep is where nothing drifts; 1 while that is unknown.
-    """
-
-    per_h: float  #: in the number's unit
+    per_h: float  #: the slope an hour, in the number's unit
     sigma_per_h: float  #: one sigma of slopes by chance; NaN while that is unknown
     chance: float  #: how probable a slope as steep is where nothing drifts; 1 while that is unknown
 

@@ -17,7 +17,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from armsight.app.stream.cell_file import certificate, check_name, hold_bytes
 from armsight.errors import InputError
-from armsight.files import read_bytes, read_text, replacing, write_text
+from armsight.files import as_input_error, read_bytes, read_text, replacing, write_text
 
 #: days that certificates are valid: of cells and hub, and of the authority; half: renewed twice as often, double: a
 #: stolen key works longer.
@@ -144,10 +144,8 @@ def _alternative(host: str) -> x509.GeneralName:
 
 
 def _private(path: Path) -> ec.EllipticCurvePrivateKey:
-    try:
+    with as_input_error(f"{path}: no private key is in it: make the site's keys anew", ValueError, TypeError):
         key = serialization.load_pem_private_key(read_bytes(path), None)
-    except (ValueError, TypeError):
-        raise InputError(f"{path}: no private key is in it: make the site's keys anew") from None
     assert isinstance(key, ec.EllipticCurvePrivateKey)
     return key
 

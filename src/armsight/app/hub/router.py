@@ -22,6 +22,7 @@ import zenoh
 from armsight.app.hub.keys import HUB, sign_hold, site_of
 from armsight.app.stream.cell_file import ANSWER_S, LONGEST, NAME, Cell, endpoint, require_here, zenoh_config
 from armsight.errors import InputError
+from armsight.files import as_input_error
 
 _ALLOWED = (
     "put", "delete", "declare_subscriber", "query", "reply", "declare_queryable", "liveliness_token",
@@ -148,10 +149,8 @@ def hold(keys: Path, cell: str, reason: str, address: str) -> str:
     site, cells = site_of(keys)
     if cell not in cells:
         raise InputError(f"{cell!r} is no cell of site {site}; it has {', '.join(cells) or 'none'}")
-    try:
+    with as_input_error(f"--hub {address}: no hub with the keys of {keys} answers there", zenoh.ZError):
         session = zenoh.open(zenoh_config("client", endpoint(f"tls/{address}", "--hub"), _files(keys)))
-    except zenoh.ZError:
-        raise InputError(f"--hub {address}: no hub with the keys of {keys} answers there") from None
     with closing(session):
         return _answer(session, Cell(cell, site).topic("hold"), sign_hold(keys, cell, reason)).decode()
 

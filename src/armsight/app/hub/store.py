@@ -18,7 +18,7 @@ from typing import Any
 
 from armsight.app.hub.cells import NUMBERS, CellView, number
 from armsight.errors import InputError
-from armsight.files import alone_in, replacing
+from armsight.files import alone_in, as_input_error, replacing
 
 #: s between two files of states of a cell; half: twice as many files, double: a crash loses twice as much history.
 FLUSH_S = 600.0
@@ -44,7 +44,7 @@ class Store:
         self._rows: dict[str, list[dict[str, Any]]] = defaultdict(list)
         self._problems = {"events": "", "states": ""}
         with ExitStack() as opened:
-            try:
+            with as_input_error(f"{folder}: nothing can be kept here", sqlite3.Error, OSError, why=True):
                 opened.enter_context(alone_in(folder, "hub"))
                 self._db = sqlite3.connect(folder / "events.sqlite", timeout=5.0, check_same_thread=False)
                 opened.callback(self._db.close)
@@ -52,8 +52,6 @@ class Store:
                 for table in _TABLES:
                     self._db.execute(table)
                 self._db.commit()
-            except (sqlite3.Error, OSError) as error:
-                raise InputError(f"{folder}: nothing can be kept here: {error}") from None
             self._opened = opened.pop_all()
 
     @property

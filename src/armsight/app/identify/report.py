@@ -13,7 +13,7 @@ from armsight.app.identify.run import Identification
 from armsight.app.show.messages import Note
 from armsight.app.show.page import bullets, folded, table
 from armsight.app.show.page import text as escaped
-from armsight.app.show.plotting import BLUE, INK, MUTED, ORANGE, new_figure, panels
+from armsight.app.show.plotting import BLUE, INK, MUTED, ORANGE, new_figure, panels, subplots
 from armsight.app.show.report import Block, Fact, Grade, Html, Lines, Report, Text, figures
 from armsight.app.show.table import TextTable, plain_text
 from armsight.data import Array
@@ -47,8 +47,7 @@ def _shown(run: Identification) -> tuple[Array, Array, Array, Array]:
 def map_figure(run: Identification) -> Figure:
     """Plot the held-out errors over the workspace, from above and from the side, before and after."""
     at, _, before, after = _shown(run)
-    figure = new_figure(4.6)
-    axes = figure.subplots(2, 2)
+    figure, axes = subplots(4.6, 2, 2)
     views = ((at[:, 0], at[:, 1], "x", "y"), (np.hypot(at[:, 0], at[:, 1]), at[:, 2], "distance from axis 1", "z"))
     top = max(float(np.quantile(before, 0.98)), 1e-6)
     for column, (name, error) in enumerate((("nominal", before), ("identified", after))):
@@ -80,8 +79,7 @@ def joints_figure(run: Identification) -> Figure:
             few = float(np.clip(100 / len(q), 0.25, 1.0))  # many hide each other, few must not be lost
             ax.scatter(degrees, error, s=20 * few, color=colour, alpha=0.2 + 0.6 * few, linewidths=0)
             ax.plot(middle[filled], [error[at == k].mean() for k in filled], color=colour, linewidth=2, label=name)
-        ax.set_title(run.arm.joint_names[i])
-        ax.set_xlabel("deg")
+        ax.set(title=run.arm.joint_names[i], xlabel="deg")
         ax.set_ylim(0, float(np.quantile(before, 0.995)) * 1.05)
     for ax in (axes[0], axes[(len(axes) + 1) // 2]):
         ax.set_ylabel("held-out error, mm")
@@ -110,20 +108,15 @@ def _short(sources: str) -> str:
 def selection_figure(run: Identification) -> Figure:
     """Plot the forward selection by the error on poses left out, and the convergence of the final fit."""
     shown = selection_rows(run)
-    figure = new_figure(0.24 * len(shown) + 2.2)
-    left, right = figure.subplots(1, 2, width_ratios=(2, 1))
+    figure, (left, right) = subplots(0.24 * len(shown) + 2.2, 1, 2, width_ratios=(2, 1))
     rows = np.arange(len(shown))
     left.barh(rows, [rms for _, rms, _ in shown], color=[MUTED if gone else BLUE for _, _, gone in shown], height=0.7)
     left.set_yticks(rows, [_short(text) for text, _, _ in shown])
     left.invert_yaxis()
-    left.set_xlabel("held-out RMS, in sigmas of the noise")
-    left.set_title("added, and removed again (grey)")
+    left.set(xlabel="held-out RMS, in sigmas of the noise", title="added, and removed again (grey)")
     history = run.found.solution.history
     right.plot(np.arange(1, len(history) + 1), history, color=BLUE, marker="o", markersize=3)
-    right.set_xlabel("step")
-    right.set_ylabel("RMS, weighted")
-    right.set_yscale("log")
-    right.set_title("convergence of the final fit")
+    right.set(xlabel="step", ylabel="RMS, weighted", yscale="log", title="convergence of the final fit")
     return figure
 
 
@@ -136,8 +129,7 @@ def _fitted(run: Identification) -> list[int]:
 def correlation_figure(run: Identification) -> Figure:
     """Plot the correlations of what was fitted, without base and tool."""
     rows = np.array(_fitted(run), np.int64)
-    figure = new_figure(9.0 if len(rows) else 1.5)
-    ax = figure.subplots()
+    figure, ax = subplots(9.0 if len(rows) else 1.5)
     if not len(rows):
         ax.set_axis_off()
         ax.text(0, 0.5, "nothing but base and tool was fitted", color=INK)
@@ -153,8 +145,7 @@ def correlation_figure(run: Identification) -> Figure:
 def sources_figure(run: Identification) -> Figure:
     """Plot the displacement of the tool by each error source, the largest first."""
     parts = sorted(contributions(run.found, run.measured).items(), key=lambda part: part[1])
-    figure = new_figure(0.32 * len(parts) + 1.2)
-    ax = figure.subplots()
+    figure, ax = subplots(0.32 * len(parts) + 1.2)
     ax.barh([_short(kind) for kind, _ in parts], [1e3 * size for _, size in parts], color=BLUE, height=0.65)
     for row, (_, size) in enumerate(parts):
         ax.text(1e3 * size, row, f" {1e3 * size:.3f}", va="center", color=INK).set_in_layout(False)

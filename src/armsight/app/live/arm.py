@@ -43,8 +43,8 @@ from armsight.app.run.experiment import (
 )
 from armsight.app.run.folder import finish, run_in
 from armsight.app.run.motion_file import MotionPlan, read_motions
-from armsight.app.run.tracks import require_pyarrow
 from armsight.app.setup.finding import check_arm, check_model, find_board
+from armsight.app.show.messages import require
 from armsight.app.show.plotting import require_matplotlib
 from armsight.data import Array, Missed, PoseEstimate, Shot
 from armsight.errors import ArmsightError, DeviceError, InputError
@@ -255,7 +255,7 @@ class ArmStep(PageStep[ArmState]):
         if self.handeye.state.fitting:
             raise InputError("the hand-eye calibration is being computed: a moment")
         require_matplotlib()
-        require_pyarrow()
+        require("a run", "run", "pyarrow")
         self._move(partial(self._run, closed))
 
     @asked("arm")

@@ -21,6 +21,7 @@ from armsight.app.show.encode import json_of
 from armsight.app.show.messages import Level
 from armsight.data import Array
 from armsight.errors import InputError
+from armsight.files import as_input_error
 
 F = TypeVar("F", bound=Callable[..., None])
 #: The steps in their order, by the names that commands and states use.
@@ -102,10 +103,8 @@ def command_of(text: str) -> PageCommand:
     """Read a command such as ``{"command": "UseBoard", "spec": "chessboard:9x6:25mm"}``."""
     if len(text) > LONGEST:
         raise InputError(f"a command has {LONGEST} characters at most, this one {len(text)}")
-    try:
+    with as_input_error("a command is JSON", json.JSONDecodeError, RecursionError, why=True):
         given = json.loads(text)
-    except (json.JSONDecodeError, RecursionError) as error:
-        raise InputError(f"a command is JSON: {error}") from None
     if not isinstance(given, dict) or not isinstance(given.get("command"), str):
         raise InputError('a command is an object with the key "command"')
     name = given.pop("command")

@@ -39,16 +39,14 @@ from http import HTTPStatus
 from typing import TYPE_CHECKING
 from urllib.parse import parse_qs, urlsplit
 
-import cv2
-
 from armsight.app.live.capture import LiveShot
 from armsight.app.live.records import LONGEST, command_of, json_text
 from armsight.app.live.session import LOG, LiveSession
 from armsight.app.live.step import why
+from armsight.app.show.encode import jpeg
 from armsight.errors import ArmsightError, DeviceError, InputError
-from armsight.files import read_bytes
+from armsight.files import as_input_error, read_bytes
 from armsight.loop.running.loop import SWITCH_S
-from armsight.vision.image import grey
 
 if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection
@@ -283,10 +281,8 @@ class LiveServer:
 
     def _said(self, client: _Client, message: str) -> None:
         """Take what a page says of itself: what it showed, whether it is visible, that it takes over."""
-        try:
+        with as_input_error("a command is JSON that begins with the key command", json.JSONDecodeError, RecursionError):
             said = json.loads(message)
-        except (json.JSONDecodeError, RecursionError):
-            raise InputError("a command is JSON that begins with the key command") from None
         match said:
             case {"shown": [0 | 1 as side, int(number)]} if not isinstance(side, bool):
                 if number == client.images[side][0]:
@@ -384,11 +380,7 @@ class LiveServer:
 def _jpeg(live: LiveShot, side: int) -> bytes:
     image = live.shot.left if side == 0 else live.shot.right
     assert image is not None
-    image = image if image.ndim == 3 and image.dtype == "uint8" else grey(image)
-    scale = _SIDE_PX / max(image.shape)
-    if scale < 1.0:
-        image = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG])[1].tobytes()
+    return jpeg(image, _SIDE_PX, _JPEG)
 
 
 def _answer(connection: ServerConnection, body: bytes, headers: dict[str, str]) -> Response:

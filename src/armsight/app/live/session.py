@@ -30,7 +30,7 @@ from armsight.app.options import SIM
 from armsight.app.run.motion_file import DEFAULT_MOTION, QUICK
 from armsight.app.show.messages import Level, Note
 from armsight.errors import ArmsightError, InputError
-from armsight.files import check_folder, read_json, require_version, unused, write_text
+from armsight.files import as_input_error, check_folder, read_json, require_version, unused, write_text
 from armsight.robot.arm_file import open_arm
 from armsight.robot.board_registry import EMULATED, slowed
 from armsight.sim.workcell.person import SimulatedCameras
@@ -208,10 +208,8 @@ class LiveSession:
         """Put the rig that was in the folder aside, and begin with the cameras."""
         stored = self.folder / "rig.json"
         aside = unused(stored.with_name(f"rig-{time.strftime('%Y%m%d-%H%M%S')}.json"))
-        try:
+        with as_input_error(f"{stored} cannot be put aside"):
             stored.rename(aside)
-        except OSError as error:
-            raise InputError(f"{stored} cannot be put aside: {error.strerror}") from None
         self.measuring.use_rig(None, None)
         self.arm.forget_rig()
         self._step, self._offer = "cameras", ""

@@ -82,12 +82,7 @@ class DetectedShots:
 
 
 class ImageShots:
-    """Shots of images.
-
-    Attributes:
-        noise: what gathers the noise of discs.
-        skewed: filled at the end: that the cameras do not expose at one time.
-    """
+    """Shots of images."""
 
     def __init__(
         self, options: MeasureOptions, rig: StereoRig, requested: Requested | Shutters | None, draws: bool
@@ -95,12 +90,12 @@ class ImageShots:
         """Open target and source, say what is known of them; ``draws``: whether the images are drawn afterwards."""
         self._options, self._rig, self._target = options, rig, open_target(options.target)
         self.body, self.discs, self.printed = self._target.body, self._target.discs, is_print(self._target)
-        self.noise = None if self.discs is None else DiscNoise(rig, self._target)
+        self.noise = None if self.discs is None else DiscNoise(rig, self._target)  #: what gathers the noise of discs
         if self.noise is None and options.save_rig is not None and requested is None:
             raise InputError(
                 "--save-rig writes skew, readout and the noise of discs: give --skew find, or a body of discs"
             )
-        self.skewed: list[HealthFinding] = []
+        self.skewed: list[HealthFinding] = []  #: filled at the end: that the cameras do not expose at one time
         self._missed: Shot | None = None  # the first with both images
         self._again: Source | None = None
         self._source = source = open_source(options.source)

@@ -22,7 +22,7 @@ from armsight.app.measure.picture import draw_shot, header, marks_of
 from armsight.app.show.plotting import BLUE, INK, MUTED, ORANGE, RED, drawing, new_figure, png, require_matplotlib
 from armsight.data import Array, Body, Missed, PoseEstimate, Record, Shot
 from armsight.errors import InputError
-from armsight.files import check_folder, replacing
+from armsight.files import as_input_error, check_folder, replacing
 from armsight.vision.markers.discs import DiscTarget
 from armsight.vision.pose.shot_pose import ANGLES, ShotPose
 from armsight.vision.rig import StereoRig
@@ -221,12 +221,10 @@ _LONGEST_NAME = 50  # a file system's 255 bytes hold that many letters of any sc
 
 def view_folder(directory: str | Path) -> Path:
     """Check that pictures can be written, before anything is measured."""
-    try:
+    with as_input_error(
+        '--view plots a chart with matplotlib, which is not installed: pip install "armsight[report]"', InputError
+    ):
         require_matplotlib()
-    except InputError:
-        raise InputError(
-            '--view plots a chart with matplotlib, which is not installed: pip install "armsight[report]"'
-        ) from None
     return check_folder(directory, problem="no pictures can be written here", advice="; give a folder")
 
 

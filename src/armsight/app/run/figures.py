@@ -10,7 +10,7 @@ from scipy.special import ndtri
 
 from armsight.app.run.metrics import PassErrors, Study
 from armsight.app.run.tracks import Part, ToolTrack, errors
-from armsight.app.show.plotting import BLUE, INK, MUTED, ORANGE, RED, new_figure, plain_log
+from armsight.app.show.plotting import BLUE, INK, MUTED, ORANGE, RED, new_figure, plain_log, subplots
 from armsight.data import Array, Image
 
 if TYPE_CHECKING:
@@ -64,8 +64,7 @@ def path_figure(run: Part) -> Figure:
     ):
         if track is not None and len(track):
             axes.plot(*_MM * track.Ts_base_tool[:, :3, 3].T, label=name, **style)
-    axes.set_xlabel("x, mm")
-    axes.set_ylabel("y, mm")
+    axes.set(xlabel="x, mm", ylabel="y, mm")
     axes.set_zlabel("z, mm")
     spans = np.ptp([axes.get_xlim(), axes.get_ylim(), axes.get_zlim()], axis=1)
     axes.set_box_aspect(spans, zoom=0.9)  # equal scales; labels of the axes stay on the page
@@ -79,8 +78,7 @@ def errors_figure(run: Part) -> Figure | None:
     """Plot the error of each track against the truth over time, position and orientation, with the claimed 95% bands."""
     if run.truth is None:
         return None
-    figure = new_figure(6.8)
-    plots = figure.subplots(4, 1, sharex=True)
+    figure, plots = subplots(6.8, 4, 1, sharex=True)
     alone = run.potentiometers
     off = errors(alone, run.truth)
     seen = [(name, colour, t, errors(t, run.truth)) for name, colour, t in _measured(run) if len(t)]
@@ -123,8 +121,7 @@ def loop_figure(passes: tuple[PassErrors, PassErrors] | None) -> Figure | None:
     """Plot the distance of the tool from its reference, with potentiometers alone and with the loop closed."""
     if passes is None:
         return None
-    figure = new_figure(4.6)
-    rests, paths = figure.subplots(1, 2)
+    figure, (rests, paths) = subplots(4.6, 1, 2)
     _at_rest(rests, passes, _CLOSED[0])
     for found, (name, colour) in zip(passes, (_ALONE, _CLOSED), strict=True):
         for number, (motion, (since_s, distance_m)) in enumerate(found.paths.items()):
@@ -155,16 +152,14 @@ def latency_figure(latency_s: Array) -> Figure | None:
     """Plot the histogram of the computing time from an image to its command."""
     if not len(latency_s):
         return None
-    figure = new_figure(2.8)
-    plot = figure.subplots()
+    figure, plot = subplots(2.8)
     times = 1e3 * np.asarray(latency_s)
     plot.hist(times, bins=np.linspace(0.0, max(2.2, float(np.percentile(times, 99.5))), 90).tolist(), color=BLUE)
     for share, colour, height in ((50, INK, 0.94), (99, RED, 0.8)):
         value = float(np.percentile(times, share))
         plot.axvline(value, color=colour, lw=1.0)
         _label(plot, f"p{share} {value:.2f} ms", (value, height), (4, 0), color=colour, fontsize=8)
-    plot.set_xlabel(f"ms from the image (decoded) to the command; longest {times.max():.1f} ms")
-    plot.set_ylabel("shots")
+    plot.set(xlabel=f"ms from the image (decoded) to the command; longest {times.max():.1f} ms", ylabel="shots")
     return figure
 
 
@@ -229,8 +224,7 @@ def studies_figure(studies: Sequence[Study]) -> Figure | None:
         reach = _MM * np.abs(np.array([study.low_m, study.high_m]) - study.position_rms_m)
         plot.plot(study.values, _MM * study.predicted_m, color=MUTED, lw=1.4, label="predicted")
         plot.errorbar(study.values, _MM * study.position_rms_m, reach, **style)
-        plot.set_xscale("log")
-        plot.set_yscale("log")
+        plot.set(xscale="log", yscale="log")
         plot.set_xticks(study.values, [f"{value:g}" for value in study.values])
         plot.minorticks_off()
         ticks = _decades(np.concatenate([study.low_m, study.high_m, study.predicted_m]) * _MM)

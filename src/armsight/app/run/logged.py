@@ -13,7 +13,7 @@ import numpy as np
 from armsight.app.run.angles import LoggedAngles
 from armsight.app.run.folder import write_handeye
 from armsight.app.show.page import PAGE
-from armsight.app.show.plotting import BLUE, new_figure
+from armsight.app.show.plotting import BLUE, subplots
 from armsight.app.show.report import Lines, Report, figures
 from armsight.data import Array, Missed, PoseEstimate, Record
 from armsight.errors import CalibrationError, InputError
@@ -209,14 +209,12 @@ def _rounded(value: float) -> str:
 def _report(result: LoggedRun, summary: dict[str, Any]) -> Report:
 
     def errors() -> Figure:
-        figure = new_figure(3.6)
-        top, bottom = figure.subplots(2, 1, sharex=True)
+        figure, (top, bottom) = subplots(3.6, 2, 1, sharex=True)
         at = np.arange(len(result.names))
         top.bar(at, result.error_mm, color=BLUE)
         top.set_title("distance of the body, mm")
         bottom.bar(at, result.error_deg, color=BLUE)
-        bottom.set_title("angle, deg")
-        bottom.set_xlabel("pose")
+        bottom.set(title="angle, deg", xlabel="pose")
         bottom.xaxis.get_major_locator().set_params(integer=True)
         return figure
 

@@ -125,11 +125,11 @@ class Part:
     Attributes:
         begin_s: begin, which is not included, s.
         end_s: end, s.
-        segments: motions and rests that lie within.
     """
 
     def __init__(self, tracks: Tracks, begin_s: float, end_s: float, most: int | None) -> None:
         self._of, self.begin_s, self.end_s, self._most = tracks, begin_s, end_s, most
+        #: motions and rests that lie within
         self.segments = [s for s in tracks.log.segments if s.begin_s >= begin_s - 1e-9 and s.end_s <= end_s + 1e-9]
 
     def _rows(self, t_s: Array, late_s: float = 0.0) -> NDArray[np.int_]:
@@ -271,14 +271,6 @@ def joint_columns(t_s: Array, q: Array, q_ref: Array) -> dict[str, NDArray[Any]]
         named[f"q{joint + 1}_rad"] = np.round(q[:, joint], _DIGITS)
         named[f"q{joint + 1}_ref_rad"] = np.round(q_ref[:, joint], _DIGITS)
     return named
-
-
-def require_pyarrow() -> None:
-    """Raise an InputError with what to install unless pyarrow can be imported."""
-    try:
-        import pyarrow  # noqa: F401 - only whether it is there
-    except ImportError:
-        raise InputError('a run is written with pyarrow, which is not installed: pip install "armsight[run]"') from None
 
 
 def write_columns(folder: Path, name: str, parts: Iterable[dict[str, NDArray[Any]]]) -> None:

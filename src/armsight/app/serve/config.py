@@ -12,7 +12,7 @@ from typing import Any
 import click
 
 from armsight.errors import InputError
-from armsight.files import read_toml, unused
+from armsight.files import as_input_error, read_toml, unused
 
 #: Keys of the table ``serve`` that are texts, and numbers.
 _TEXTS, _NUMBERS = ("http", "log"), ("log_mb", "log_files", "stale_s", "retry_s")
@@ -28,29 +28,17 @@ _OWN = {
 
 @dataclass(frozen=True)
 class ServeConfig:
-    """What is kept going, and how.
+    """What is kept going, and how."""
 
-    Attributes:
-        arguments: of `armsight measure`, without --output; --board is among them where one is watched.
-        folder: where relative paths begin: that of the file.
-        http: where /healthz and /metrics are, ``host:port``; empty for nowhere.
-        log: file of the log, empty for stderr.
-        log_mb: size at which it is begun anew, MB.
-        log_files: older logs that are kept.
-        stale_s: time without a shot after which the command is started again, s.
-        retry_s: longest time between two tries, s.
-        output: file of the poses, empty for none.
-    """
-
-    arguments: tuple[str, ...]
-    folder: Path
-    http: str = "127.0.0.1:9110"
-    log: str = ""
-    log_mb: float = 10.0
-    log_files: int = 5
-    stale_s: float = 10.0
-    retry_s: float = 3.0
-    output: str = ""
+    arguments: tuple[str, ...]  #: of `armsight measure`, without --output; --board is among them where one is watched
+    folder: Path  #: where relative paths begin: that of the file
+    http: str = "127.0.0.1:9110"  #: where /healthz and /metrics are, ``host:port``; empty for nowhere
+    log: str = ""  #: file of the log, empty for stderr
+    log_mb: float = 10.0  #: size at which it is begun anew, MB
+    log_files: int = 5  #: older logs that are kept
+    stale_s: float = 10.0  #: time without a shot after which the command is started again, s
+    retry_s: float = 3.0  #: longest time between two tries, s
+    output: str = ""  #: file of the poses, empty for none
 
     def started(self) -> tuple[str, ...]:
         """Return the arguments of the next start: its poses go into a file of their own, poses.csv, poses-2.csv ..."""
@@ -80,11 +68,8 @@ def read_config(path: Path) -> ServeConfig:
         command.make_context("measure", list(arguments)).close()
     except click.UsageError as error:
         raise InputError(f"{path}: [measure]: {error.format_message()}") from None
-    try:
-        with contextlib.chdir(folder):
-            _check(given, board)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
+    with as_input_error(str(path), InputError, why=True), contextlib.chdir(folder):
+        _check(given, board)
     each_start = tuple(each for each in arguments if not each.startswith("--output="))
     return ServeConfig(each_start, folder, **service, output=str(given.get("output", "")))
 

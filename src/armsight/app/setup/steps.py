@@ -10,24 +10,17 @@ CAMERAS, PORT = "usb:0,1", "/dev/ttyACM0"
 
 @dataclass(frozen=True)
 class SetupStep:
-    """A step of a page.
-
-    Attributes:
-        given: a file of the user's own that it takes; where there is none, see ``without``.
-        without: what the words of ``given`` and all that hangs on it become: old text -> new text in all commands; empty
-            where the step is left out.
-        endless: Ctrl-C ends it as it should end, and it is done.
-        needed: whether what follows needs it.
-        simulated: options that let it go through where nobody is at the terminal.
-    """
+    """A step of a page."""
 
     say: str
     command: str
-    given: str = ""
+    given: str = ""  #: a file of the user's own that it takes; where there is none, see ``without``
+    #: what the words of ``given`` and all that hangs on it become: old text -> new text in all commands; empty where
+    #: the step is left out
     without: tuple[tuple[str, str], ...] = ()
-    endless: bool = False
-    needed: bool = True
-    simulated: str = ""
+    endless: bool = False  #: Ctrl-C ends it as it should end, and it is done
+    needed: bool = True  #: whether what follows needs it
+    simulated: str = ""  #: options that let it go through where nobody is at the terminal
 
 
 PLATE, BOARD = "examples/arm_plate.toml", "chessboard:9x6:20mm"

@@ -19,7 +19,7 @@ from armsight.app.main import run
 from armsight.app.setup import finding
 from armsight.app.setup.steps import ARMS, CAMERAS, PLATE, PORT, SetupStep
 from armsight.errors import InputError
-from armsight.files import read_json, write_text
+from armsight.files import as_input_error, read_json, write_text
 
 FILE = Path("setup.json")
 INTERRUPTED = 130
@@ -27,30 +27,24 @@ INTERRUPTED = 130
 
 @dataclass
 class SetupWalk:
-    """An arm's steps on this computer.
-
-    Attributes:
-        words: what the page says -> what is so here.
-        done: commands of the page -> done, or left out.
-        simulated: how the emulated board is called; empty with an arm.
-    """
+    """An arm's steps on this computer."""
 
     arm: str
-    words: dict[str, str] = field(default_factory=dict)
-    done: dict[str, str] = field(default_factory=dict)
-    simulated: str = ""
+    words: dict[str, str] = field(default_factory=dict)  #: what the page says -> what is so here
+    done: dict[str, str] = field(default_factory=dict)  #: commands of the page -> done, or left out
+    simulated: str = ""  #: how the emulated board is called; empty with an arm
 
     @classmethod
     def open(cls, arm: str, begin: int | None, simulated: bool = False) -> SetupWalk:
         """Return the walk that the folder remembers, or a new one; ``begin``: from which step, from 1."""
         kept, was = cls(arm), simulated
         if FILE.exists():
-            try:
+            with as_input_error(
+                f"{FILE}: not written by `armsight setup`: move it away", TypeError, KeyError, ValueError
+            ):
                 found = read_json(FILE)
                 kept = cls(str(found["arm"]), dict(found["words"]), dict(found["done"]))
                 was = bool(found.get("simulated", False))
-            except (TypeError, KeyError, ValueError):
-                raise InputError(f"{FILE}: not written by `armsight setup`: move it away") from None
         if kept.arm != arm:
             raise InputError(f"{FILE}: this folder is of {kept.arm}: take another folder for {arm}")
         if was != simulated:

@@ -1,4 +1,4 @@
-"""Records, arrays and paths in, what JSON holds out."""
+"""Records, arrays and paths in, what JSON holds out; and images as JPEG to look at."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+
+from armsight.data import Image
 
 
 def json_of(value: Any) -> Any:  # noqa: ANN401 - whatever JSON holds
@@ -24,3 +26,15 @@ def json_of(value: Any) -> Any:  # noqa: ANN401 - whatever JSON holds
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return str(value) if isinstance(value, Path) else value
+
+
+def jpeg(image: Image, side_px: int, quality: int) -> bytes:
+    """Return an image as JPEG to look at, its longer side of so many pixels at most."""
+    import cv2
+
+    from armsight.vision.image import grey
+
+    shown, scale = image if image.dtype == "uint8" else grey(image), side_px / max(image.shape[:2])
+    if scale < 1.0:
+        shown = cv2.resize(shown, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    return cv2.imencode(".jpg", shown, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()

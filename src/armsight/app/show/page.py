@@ -9,8 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from armsight.app.show.plotting import plain
-from armsight.errors import InputError
-from armsight.files import replacing, try_writing
+from armsight.files import as_input_error, replacing, try_writing
 
 #: A number, with its sigma or its unit; or the dash where there is none.
 _NUMBER = re.compile(r"\u2013|[-+\u2212]?\d[\d.,]*(?: \u00b1 [\d.,]+)?(?: ?[%a-z\u00b0/]{1,5})?")
@@ -154,11 +153,9 @@ def html_page(title: str, heading: str, sub: str, sections: Mapping[str, tuple[s
 def writable_folder(directory: str | Path, contents: str) -> Path:
     """Make a folder and check that files can be written to it, before long work begins."""
     folder = Path(directory).expanduser()
-    try:
+    with as_input_error(f"{folder}: {contents} can be written here"):
         folder.mkdir(parents=True, exist_ok=True)
         try_writing(folder)
-    except OSError as error:
-        raise InputError(f"{folder}: {contents} can be written here: {error.strerror}") from None
     return folder
 
 

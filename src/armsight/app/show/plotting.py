@@ -86,6 +86,12 @@ def new_figure(height_in: float) -> Figure:
     return figure
 
 
+def subplots(height_in: float, rows: int = 1, columns: int = 1, **how: Any) -> tuple[Figure, Any]:  # noqa: ANN401 - matplotlib's
+    """Return such a figure and its axes, as matplotlib's function of this name."""
+    figure = new_figure(height_in)
+    return figure, figure.subplots(rows, columns, **how)
+
+
 def panels(figure: FigureBase, count: int, *, sharey: bool = False) -> list[Axes]:
     """Return axes for so many plots, in two rows."""
     grid = figure.subplots(2, -(-count // 2), sharey=sharey, squeeze=False).ravel()

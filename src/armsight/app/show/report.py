@@ -27,14 +27,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Fact:
-    """Something that was found.
+    """Something that was found."""
 
-    Attributes:
-        sentence: for people; empty where the values are for programs alone.
-        values: by their JSON keys, SI units, sigmas among them: whatever :func:`~armsight.app.show.encode.json_of` takes.
-    """
-
-    sentence: str = ""
+    sentence: str = ""  #: for people; empty where the values are for programs alone
+    #: by their JSON keys, SI units, sigmas among them: whatever :func:`~armsight.app.show.encode.json_of` takes.
     values: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -43,38 +39,26 @@ ON_PAGE = 6  # lines under a title that a page shows unfolded; half: a reader un
 
 @dataclass(frozen=True)
 class Lines:
-    """Lines that belong together.
-
-    Attributes:
-        title: stands above them on the terminal, where they are indented; empty: they are not.
-        most: so many are printed, and how many more there are; 0: none; the page folds those beyond ON_PAGE.
-        none: what is said instead where there are none.
-    """
+    """Lines that belong together."""
 
     lines: Sequence[str]
-    title: str = ""
+    title: str = ""  #: stands above them on the terminal, where they are indented; empty: they are not
+    #: so many are printed, and how many more there are; 0: none; the page folds those beyond ON_PAGE
     most: int | None = None
-    none: str = ""
+    none: str = ""  #: what is said instead where there are none
 
 
 @dataclass(frozen=True)
 class Plot:
-    """A figure on the page, and as PNG and SVG beside it, with its data as CSV.
-
-    Attributes:
-        draw: plots it, or returns an image (H, W, 3) BGR; None where there is nothing to plot.
-        caption: HTML; empty: it is a file alone.
-        description: for who cannot see it.
-        folded: whether it stands beneath its description until a reader asks for it.
-        zoom: on the page it stays sharp and the mouse wheel enlarges it.
-    """
+    """A figure on the page, and as PNG and SVG beside it, with its data as CSV."""
 
     name: str
+    #: plots it, or returns an image (H, W, 3) BGR; None where there is nothing to plot
     draw: Callable[[], Figure | Image | None]
-    caption: str
-    description: str
-    folded: bool = False
-    zoom: bool = False
+    caption: str  #: HTML; empty: it is a file alone
+    description: str  #: for who cannot see it
+    folded: bool = False  #: whether it stands beneath its description until a reader asks for it
+    zoom: bool = False  #: on the page it stays sharp and the mouse wheel enlarges it
 
 
 @dataclass(frozen=True)
@@ -102,23 +86,17 @@ Section = tuple[str, Sequence[Block]]
 
 @dataclass(frozen=True)
 class Report:
-    """A result.
-
-    Attributes:
-        sub: the line below it.
-        headline: the result in one line; empty: the first section says it.
-        assessed: grade and sentence: what was done, how good it is, and what to do next; None: the first section says it.
-        values: what programs read besides the facts.
-    """
+    """A result."""
 
     name: str
     heading: str
-    sub: str
-    headline: str
+    sub: str  #: the line below it
+    headline: str  #: the result in one line; empty: the first section says it
     sections: Mapping[str, Section]
     notes: Sequence[Note] = ()
-    values: Mapping[str, Any] = field(default_factory=dict)
+    values: Mapping[str, Any] = field(default_factory=dict)  #: what programs read besides the facts
     prefix: str = "report"
+    #: grade and sentence: what was done, how good it is, and what to do next; None: the first section says it
     assessed: tuple[Grade, str] | None = None
 
     @property

@@ -22,9 +22,9 @@ from pathlib import Path
 from typing import Any
 
 import click
-import cv2
 import numpy as np
 
+from armsight.app.show.encode import jpeg
 from armsight.app.stream.cell_file import (
     ANSWER_S,
     LONGEST,
@@ -40,8 +40,8 @@ from armsight.app.stream.outbox import Outbox, state_folder
 from armsight.app.stream.sink import CLOSE_S, Sink
 from armsight.data import Array, PoseEstimate, Shot
 from armsight.errors import InputError
+from armsight.files import as_input_error
 from armsight.loop.running.data import Datum, NoteDatum, ShotDatum
-from armsight.vision.image import grey
 from armsight.vision.rig import StereoRig
 
 #: s, between two looks whether events wait or a hub can be reached; half: nothing, double: events come later.
@@ -331,12 +331,7 @@ class CellSink(Sink):
     def _image(self) -> bytes:
         """Return the newest left image, small, as JPEG; nothing where there is none."""
         shot = self._newest
-        if shot is None or shot.left is None:
-            return b""
-        image = shot.left if shot.left.dtype == np.uint8 else grey(shot.left)
-        scale = _SIDE_PX / max(image.shape[:2])
-        small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1.0 else image
-        return cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _JPEG])[1].tobytes()
+        return b"" if shot is None or shot.left is None else jpeg(shot.left, _SIDE_PX, _JPEG)
 
     def _shots_kept(self) -> bytes:
         """Return the newest shots that a hub reads, as JSON, thinned; none are kept unless they are asked for."""
@@ -364,11 +359,9 @@ class CellSink(Sink):
             raise InputError("this cell does not allow it: holds = true and ca in its cell.toml would")
         if self._published.hold is None:
             raise InputError(f"armsight {self._mode} moves no arm")
-        try:
+        with as_input_error("it is no request to hold", ValueError, KeyError, TypeError):
             request = json.loads(payload)
             t, text, signature = float(request["t"]), str(request["text"]), bytes.fromhex(request["signature"])
-        except (ValueError, KeyError, TypeError):
-            raise InputError("it is no request to hold") from None
         if not signed_by(self._cell.ca, signature, hold_bytes(self._cell.site, self._cell.name, t, text)):
             raise InputError("it is not signed by the key of this site")
         if not abs(time.time() - t) < _FRESH_S or t < self._began_utc:

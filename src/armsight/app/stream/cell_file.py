@@ -13,8 +13,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from armsight.app.show.messages import require
 from armsight.errors import InputError
-from armsight.files import read_bytes, read_toml
+from armsight.files import as_input_error, read_bytes, read_toml
 
 if TYPE_CHECKING:
     from cryptography import x509
@@ -38,25 +39,15 @@ _NEW = "new folder: `armsight hub keys SITE CELL ... -o FOLDER`"
 
 @dataclass(frozen=True)
 class Cell:
-    """Who a cell is.
+    """Who a cell is."""
 
-    Attributes:
-        name: of the cell.
-        site: of the site.
-        router: zenoh endpoint of the hub, ``tls/HOST:PORT``.
-        ca: certificate of the site, PEM; None without TLS.
-        certificate: of the cell, PEM.
-        key: its private key, PEM.
-        holds: whether the hub may ask it to hold its arm.
-    """
-
-    name: str
-    site: str = "site"
-    router: str = ROUTER
-    ca: Path | None = None
-    certificate: Path | None = None
-    key: Path | None = None
-    holds: bool = False
+    name: str  #: of the cell
+    site: str = "site"  #: of the site
+    router: str = ROUTER  #: zenoh endpoint of the hub, ``tls/HOST:PORT``
+    ca: Path | None = None  #: certificate of the site, PEM; None without TLS
+    certificate: Path | None = None  #: of the cell, PEM
+    key: Path | None = None  #: its private key, PEM
+    holds: bool = False  #: whether the hub may ask it to hold its arm
 
     def topic(self, *parts: str) -> str:
         """Return a key of the cell."""
@@ -146,14 +137,11 @@ def certificate(path: Path, *, ended: bool = False) -> x509.Certificate:
     Raises:
         InputError: none is in it, it is not valid by this computer's date, or cryptography is not installed.
     """
-    try:
-        from cryptography import x509
-    except ImportError:
-        raise InputError('cryptography is not installed: pip install "armsight[cells]"') from None
-    try:
+    require("a cell with keys", "cells", "cryptography")
+    from cryptography import x509
+
+    with as_input_error(f"{path}: no certificate is in it: make the keys in a {_NEW}", ValueError):
         found = x509.load_pem_x509_certificate(read_bytes(path))
-    except ValueError:
-        raise InputError(f"{path}: no certificate is in it: make the keys in a {_NEW}") from None
     begin, end, now = found.not_valid_before_utc, found.not_valid_after_utc, datetime.now(UTC)
     if not (ended or begin <= now <= end):
         again = f"make the keys in a {_NEW}" if found.issuer == found.subject else "run `armsight hub keys` again"
@@ -178,10 +166,9 @@ def zenoh_config(mode: str, end: str, keys: Sequence[Path | None] = (None,)) -> 
     Raises:
         InputError: zenoh is not installed.
     """
-    try:
-        import zenoh
-    except ImportError:
-        raise InputError('zenoh is not installed: pip install "armsight[cells]"') from None
+    require("a cell", "cells", "zenoh")
+    import zenoh
+
     config, way = zenoh.Config(), {"client": "connect", "router": "listen"}[mode]
     settings: dict[str, Any] = {
         "mode": mode,

@@ -24,22 +24,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Published(Record):
-    """What all data of a run have in common.
+    """What all data of a run have in common."""
 
-    Attributes:
-        rig: the calibrated cameras; None where they are not known.
-        body: what is measured; without points where nothing is.
-        arm: the nominal arm; None where there is none.
-        properties: texts that are stored with a recording: files, versions, options.
-        hold: brings the arm to rest, with the reason; an InputError says why it cannot; None where nothing moves.
-        temperatures_c: returns those of the motors (n,), degrees Celsius, or None; None where there are no motors.
-    """
-
-    rig: StereoRig | None = None
+    rig: StereoRig | None = None  #: the calibrated cameras; None where they are not known
+    #: what is measured; without points where nothing is
     body: Body = field(default_factory=lambda: Body("", (), np.zeros((0, 3))))
-    arm: Arm | None = None
+    arm: Arm | None = None  #: the nominal arm; None where there is none
+    #: texts that are stored with a recording: files, versions, options
     properties: Mapping[str, str] = field(default_factory=dict)
+    #: brings the arm to rest, with the reason; an InputError says why it cannot; None where nothing moves
     hold: Callable[[str], None] | None = None
+    #: returns those of the motors (n,), degrees Celsius, or None; None where there are no motors
     temperatures_c: Callable[[], Array | None] | None = None
 
 

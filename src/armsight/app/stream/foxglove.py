@@ -265,6 +265,14 @@ def nanoseconds(t_s: float) -> int:
     return max(0, round(1e9 * t_s))
 
 
+def schema_of(message: Message) -> tuple[str, str, bytes]:
+    """Return the name, encoding and text of the schema of a message."""
+    from mcap_protobuf.schema import build_file_descriptor_set
+
+    kind = type(message)
+    return kind.DESCRIPTOR.full_name, "protobuf", build_file_descriptor_set(kind).SerializeToString()
+
+
 def _jpeg(image: Image) -> bytes:
     """Return an image to look at: 8 bits, JPEG."""
     shown = image if image.dtype == np.uint8 else (image >> 8).astype(np.uint8)

@@ -16,8 +16,7 @@ from functools import cache
 
 import numpy as np
 
-from armsight.app.stream.datum import Published
-from armsight.app.stream.network import TcpSink, host_and_port, listening
+from armsight.app.stream.network import TcpSink
 from armsight.data import Array, Missed, PoseEstimate
 from armsight.loop.running.data import Datum, JointsDatum, NoteDatum, ShotDatum, quaternion
 
@@ -76,6 +75,8 @@ def _table() -> tuple[int, ...]:
 class IgtlSink(TcpSink):
     """Sends messages of OpenIGTLink to every reader that has connected."""
 
+    kind = "igtl"
+
     def encoded(self, datum: Datum) -> list[bytes]:
         """Return a datum as messages."""
         t_s = datum.time_s
@@ -95,9 +96,3 @@ class IgtlSink(TcpSink):
             ]
         reason = datum.result.reason if isinstance(datum.result, Missed) else "not measured"
         return [message("STATUS", "armsight_status", t_s, status_body(_NOT_FOUND, "missed", reason))]
-
-
-def open_igtl(rest: str, published: Published) -> IgtlSink:
-    """Open ``[HOST:]PORT``."""
-    host, port = host_and_port(rest, "igtl", host="127.0.0.1")
-    return IgtlSink(published, listening(host, port, "igtl"))

@@ -13,8 +13,9 @@ import struct
 import time
 import zlib
 from collections import defaultdict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import fields, replace
+from functools import partial
 from pathlib import Path
 from typing import IO, Any, TypeAlias
 
@@ -22,7 +23,7 @@ import numpy as np
 
 from armsight import __version__
 from armsight.app.stream.datum import Published, json_text
-from armsight.app.stream.foxglove import LookedAt, Messages, nanoseconds, require_foxglove
+from armsight.app.stream.foxglove import LookedAt, Messages, nanoseconds, require_foxglove, schema_of
 from armsight.app.stream.ros import READINGS, reading_messages
 from armsight.app.stream.sink import Sink
 from armsight.data import Shot
@@ -81,40 +82,26 @@ class McapSink(Sink):
             log_ns = nanoseconds(datum.arrival_s)
         stamp_ns = nanoseconds(datum.time_s)
         for topic, message in self._messages.of(datum):
-            self._writer.add_message(self._channel(topic, message), log_ns, stamp_ns, message.SerializeToString())
+            channel = self._channel(topic, "protobuf", partial(schema_of, message))
+            self._writer.add_message(channel, log_ns, stamp_ns, message.SerializeToString())
         if isinstance(datum, JointsDatum) and datum.felt is not None:
-            channel = self._readings_channel(*READINGS[datum.felt[1].z.shape[1]])
+            topic, kind, text = READINGS[datum.felt[1].z.shape[1]]
+            channel = self._channel(topic, "cdr", lambda: (kind, "ros2msg", text.encode()))
             for read_ns, data in reading_messages(*datum.felt):
                 self._writer.add_message(channel, log_ns, read_ns, data)
         if not isinstance(datum, NoteDatum):
-            content: Mapping[str, Any] = (
-                datum.content if isinstance(datum, EventDatum) else datum.to_json(self._published.body)
-            )
-            channel = self._json_channel(TOPICS[type(datum)])
-            self._writer.add_message(channel, log_ns, stamp_ns, json_text(content))
+            topic = TOPICS[type(datum)]
+            channel = self._channel(topic, "json", lambda: (topic[1:].replace("/", "."), "jsonschema", _SCHEMA))
+            self._writer.add_message(channel, log_ns, stamp_ns, json_text(datum.to_json(self._published.body)))
 
-    def _channel(self, topic: str, message: Any) -> int:  # noqa: ANN401 - a protobuf message
+    def _channel(self, topic: str, encoding: str, schema: Callable[[], tuple[str, str, bytes]]) -> int:
+        """Return the number of a topic's channel; a new one's schema is its name, encoding and text."""
         if topic not in self._channels:
-            from mcap_protobuf.schema import build_file_descriptor_set
-
-            name = type(message).DESCRIPTOR.full_name
+            name, form, text = schema()
             if name not in self._schemas:
-                text = build_file_descriptor_set(type(message)).SerializeToString()
-                self._schemas[name] = self._writer.register_schema(name, "protobuf", text)
+                self._schemas[name] = self._writer.register_schema(name, form, text)
             images = name == "foxglove.CompressedImage"
-            self._channels[topic] = self._writer.register_channel(topic, "protobuf", self._schemas[name], images=images)
-        return self._channels[topic]
-
-    def _readings_channel(self, topic: str, kind: str, text: str) -> int:
-        if topic not in self._channels:
-            schema = self._writer.register_schema(kind, "ros2msg", text.encode())
-            self._channels[topic] = self._writer.register_channel(topic, "cdr", schema)
-        return self._channels[topic]
-
-    def _json_channel(self, topic: str) -> int:
-        if topic not in self._channels:
-            schema = self._writer.register_schema(topic.strip("/").replace("/", "."), "jsonschema", _SCHEMA)
-            self._channels[topic] = self._writer.register_channel(topic, "json", schema)
+            self._channels[topic] = self._writer.register_channel(topic, encoding, self._schemas[name], images=images)
         return self._channels[topic]
 
     def tick(self) -> None:

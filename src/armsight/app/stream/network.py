@@ -10,8 +10,6 @@ import json
 import re
 import socket
 from collections import deque
-from collections.abc import Mapping
-from typing import Any
 
 from armsight.app.stream.datum import Published, json_text
 from armsight.app.stream.sink import Sink
@@ -28,27 +26,16 @@ _KINDS = {ShotDatum: "shot", JointsDatum: "joints", EventDatum: "event", NoteDat
 
 def json_line(datum: Datum, published: Published) -> bytes:
     """Return a datum as one line of JSON."""
-    if isinstance(datum, NoteDatum):
-        content: Mapping[str, Any] = {"t_s": datum.time_s, "level": datum.level, "text": datum.text}
-    elif isinstance(datum, EventDatum):
-        content = {"t_s": datum.time_s, **datum.content}
-    else:
-        content = datum.to_json(published.body)
-    return json_text({"kind": _KINDS[type(datum)], **content}) + b"\n"
+    found = {"kind": _KINDS[type(datum)]} | ({"t_s": datum.time_s} if isinstance(datum, EventDatum) else {})
+    return json_text(found | datum.to_json(published.body)) + b"\n"
 
 
-def host_and_port(spec: str, what: str, *, host: str) -> tuple[str, int]:
+def host_and_port(spec: str, what: str) -> tuple[str, int]:
     """Read ``[HOST:]PORT``; port 0 is any that is free."""
     match = re.fullmatch(r"(?:(.+):)?(\d{1,5})", spec)
     if match is None or int(match[2]) > 65535:
         raise InputError(f"--stream {what}:{spec}: expected {what}:[HOST:]PORT, such as {what}:8766")
-    return match[1] or host, int(match[2])
-
-
-def listening(host: str, port: int, what: str) -> socket.socket:
-    """Return a socket that listens."""
-    with as_input_error(f"--stream {what}:{port}: cannot listen there"):
-        return socket.create_server((host, port))
+    return match[1] or "127.0.0.1", int(match[2])
 
 
 class _Connected:
@@ -76,10 +63,13 @@ class _Connected:
 class TcpSink(Sink):
     """Sends bytes to every reader that has connected."""
 
-    def __init__(self, published: Published, listener: socket.socket) -> None:
+    kind = "json+tcp"
+
+    def __init__(self, published: Published, host: str, port: int) -> None:
         super().__init__(images=False)
         self.published = published
-        self._listener = listener
+        with as_input_error(f"--stream {self.kind}:{port}: cannot listen there"):
+            self._listener = socket.create_server((host, port))
         self._listener.setblocking(False)
         self._readers: list[_Connected] = []
 
@@ -131,9 +121,9 @@ class TcpSink(Sink):
 class UdpSink(Sink):
     """Sends one datagram a datum; one that is too large goes without its points."""
 
-    def __init__(self, published: Published, address: tuple[str, int]) -> None:
+    def __init__(self, published: Published, host: str, port: int) -> None:
         super().__init__(images=False)
-        self._published, self._address = published, address
+        self._published, self._address = published, (host, port)
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
 
@@ -152,14 +142,3 @@ class UdpSink(Sink):
     def finish(self) -> None:
         """Close the socket."""
         self._socket.close()
-
-
-def open_json_tcp(rest: str, published: Published) -> TcpSink:
-    """Open ``[HOST:]PORT``."""
-    host, port = host_and_port(rest, "json+tcp", host="127.0.0.1")
-    return TcpSink(published, listening(host, port, "json+tcp"))
-
-
-def open_json_udp(rest: str, published: Published) -> UdpSink:
-    """Open ``[HOST:]PORT``."""
-    return UdpSink(published, host_and_port(rest, "json+udp", host="127.0.0.1"))

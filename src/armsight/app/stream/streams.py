@@ -6,23 +6,32 @@ from collections.abc import Callable, Sequence
 
 from armsight.app.stream.cell import open_cell
 from armsight.app.stream.datum import Published
-from armsight.app.stream.igtl import open_igtl
-from armsight.app.stream.network import open_json_tcp, open_json_udp
+from armsight.app.stream.igtl import IgtlSink
+from armsight.app.stream.network import TcpSink, UdpSink, host_and_port
 from armsight.app.stream.sink import Sink
-from armsight.app.stream.websocket import open_foxglove
-from armsight.app.stream.zenoh import open_ros2
+from armsight.app.stream.websocket import FoxgloveSink
+from armsight.app.stream.zenoh import Ros2Sink
 from armsight.errors import InputError
 from armsight.loop.running.data import Datum
 
-#: Kind -> what opens the rest of the text; another kind is one line here.
-STREAMS: dict[str, Callable[[str, Published], Sink]] = {
-    "foxglove": open_foxglove,
-    "json+tcp": open_json_tcp,
-    "json+udp": open_json_udp,
-    "igtl": open_igtl,
-    "ros2": open_ros2,
-    "cell": open_cell,
+#: Kind -> the sink of ``KIND:[HOST:]PORT``; another kind is one line here. ``cell:`` is opened by itself.
+STREAMS: dict[str, Callable[[Published, str, int], Sink]] = {
+    "foxglove": FoxgloveSink,
+    "json+tcp": TcpSink,
+    "json+udp": UdpSink,
+    "igtl": IgtlSink,
+    "ros2": Ros2Sink,
 }
+
+
+def open_stream(spec: str, published: Published) -> Sink:
+    """Open the stream that a text names; it is to be started."""
+    kind, _, rest = spec.partition(":")
+    if kind == "cell":
+        return open_cell(rest, published)
+    if kind not in STREAMS:
+        raise InputError(f"--stream {spec}: unknown kind {kind!r}; known are {', '.join((*STREAMS, 'cell'))}")
+    return STREAMS[kind](published, *host_and_port(rest, kind))
 
 
 class Streams:
@@ -62,10 +71,7 @@ def open_streams(specs: Sequence[str], published: Published, say: Callable[[str]
     sinks: dict[str, Sink] = {}
     try:
         for spec in specs:
-            kind, _, rest = spec.partition(":")
-            if kind not in STREAMS:
-                raise InputError(f"--stream {spec}: unknown kind {kind!r}; known are {', '.join(STREAMS)}")
-            sinks[spec] = STREAMS[kind](rest, published)
+            sinks[spec] = open_stream(spec, published)
             sinks[spec].start()
     except InputError:
         for sink in sinks.values():

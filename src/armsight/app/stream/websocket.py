@@ -9,12 +9,12 @@ from __future__ import annotations
 from typing import Any
 
 from armsight.app.stream.datum import Published, json_text
-from armsight.app.stream.foxglove import Messages, nanoseconds, require_foxglove
+from armsight.app.stream.foxglove import Messages, nanoseconds, require_foxglove, schema_of
 from armsight.app.stream.mcap_file import TOPICS
-from armsight.app.stream.network import host_and_port
 from armsight.app.stream.sink import Sink
 from armsight.errors import InputError
-from armsight.loop.running.data import Datum, EventDatum, NoteDatum
+from armsight.files import as_input_error
+from armsight.loop.running.data import Datum, NoteDatum
 
 
 class FoxgloveSink(Sink):
@@ -33,10 +33,8 @@ class FoxgloveSink(Sink):
         self._context = foxglove.Context()
         self._channels: dict[str, Any] = {}
         self._foxglove = foxglove
-        try:
+        with as_input_error(f"--stream foxglove:{port}: cannot listen there", OSError, RuntimeError, why=True):
             self._server = foxglove.start_server(name="armsight", host=host, port=port, context=self._context)
-        except (OSError, RuntimeError) as error:
-            raise InputError(f"--stream foxglove:{port}: cannot listen there: {error}") from None
 
     @property
     def port(self) -> int:
@@ -48,13 +46,8 @@ class FoxgloveSink(Sink):
         log_ns = nanoseconds(datum.time_s)
         for topic, message in self._messages.of(datum):
             if topic not in self._channels:
-                from mcap_protobuf.schema import build_file_descriptor_set
-
-                schema = self._foxglove.Schema(
-                    name=type(message).DESCRIPTOR.full_name,
-                    encoding="protobuf",
-                    data=build_file_descriptor_set(type(message)).SerializeToString(),
-                )
+                name, encoding, data = schema_of(message)
+                schema = self._foxglove.Schema(name=name, encoding=encoding, data=data)
                 self._channels[topic] = self._foxglove.Channel(
                     topic, message_encoding="protobuf", schema=schema, context=self._context
                 )
@@ -64,15 +57,8 @@ class FoxgloveSink(Sink):
         topic = TOPICS[type(datum)]
         if topic not in self._channels:
             self._channels[topic] = self._foxglove.Channel(topic, message_encoding="json", context=self._context)
-        content = datum.content if isinstance(datum, EventDatum) else datum.to_json(self._published.body)
-        self._channels[topic].log(json_text(content), log_time=log_ns)
+        self._channels[topic].log(json_text(datum.to_json(self._published.body)), log_time=log_ns)
 
     def finish(self) -> None:
         """Stop the server."""
         self._server.stop()
-
-
-def open_foxglove(rest: str, published: Published) -> FoxgloveSink:
-    """Open ``[HOST:]PORT``."""
-    host, port = host_and_port(rest, "foxglove", host="127.0.0.1")
-    return FoxgloveSink(published, host, port)

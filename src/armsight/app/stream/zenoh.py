@@ -22,11 +22,11 @@ from armsight.app.stream.cell_file import zenoh_config
 from armsight.app.stream.datum import Published, json_text
 from armsight.app.stream.foxglove import Messages, nanoseconds, require_foxglove
 from armsight.app.stream.mcap_file import TOPICS
-from armsight.app.stream.network import host_and_port
 from armsight.app.stream.ros import TO_ROS, ros_name
 from armsight.app.stream.sink import Sink
 from armsight.errors import InputError
-from armsight.loop.running.data import Datum, EventDatum, NoteDatum
+from armsight.files import as_input_error
+from armsight.loop.running.data import Datum, NoteDatum
 
 _NODE = "armsight"
 #: Reliable, volatile, keep last 10: what differs from the defaults of rmw_zenoh is written.
@@ -68,12 +68,11 @@ class Ros2Sink(Sink):
         self._store = get_typestore(Stores.ROS2_JAZZY)
         self._publishers: dict[str, _RosPublisher] = {}
         self._infos: dict[str, Any] = {}
-        try:
+        with as_input_error(
+            f"--stream ros2:{host}:{port}: no zenoh router answers there; start it: ros2 run rmw_zenoh_cpp rmw_zenohd",
+            zenoh.ZError,
+        ):
             self._session: Any = zenoh.open(zenoh_config("client", f"tcp/{host}:{port}"))
-        except zenoh.ZError:
-            raise InputError(
-                f"--stream ros2:{host}:{port}: no zenoh router answers there; start it: ros2 run rmw_zenoh_cpp rmw_zenohd"
-            ) from None
         self._domain = domain
         self._token_of_node = self._token("0", "NN")
 
@@ -109,16 +108,9 @@ class Ros2Sink(Sink):
                 self._put(ros_name(topic.removesuffix("/image") + "/calibration"), info.__msgtype__, info, stamp_ns)
             self._put(ros_name(topic), kind, made, stamp_ns)
         if not isinstance(datum, NoteDatum):
-            content = datum.content if isinstance(datum, EventDatum) else datum.to_json(self._published.body)
-            text = self._store.types["std_msgs/msg/String"](json_text(content).decode())
+            text = self._store.types["std_msgs/msg/String"](json_text(datum.to_json(self._published.body)).decode())
             self._put(TOPICS[type(datum)], "std_msgs/msg/String", text, stamp_ns)
 
     def finish(self) -> None:
         """Leave the system."""
         self._session.close()
-
-
-def open_ros2(rest: str, published: Published) -> Ros2Sink:
-    """Open ``[HOST:]PORT``."""
-    host, port = host_and_port(rest, "ros2", host="127.0.0.1")
-    return Ros2Sink(published, host, port)

@@ -40,31 +40,18 @@ _MIN_TRACE = 1.0 + 2.0 * math.cos(3.0)
 
 
 class ErrorLayout(NamedTuple):
-    """Where each part begins in the vector of an arm of n joints.
+    """Where each part begins in the vector of an arm of n joints."""
 
-    Attributes:
-        joints: n.
-        linearity: of n times BASIS; before it stand the tangents of n + 1 frames.
-        backlash: its width as far as friction decides on the side, and the next where gravity and inertia do.
-        floats: see ``backlash``.
-        compliance: of each joint, and so are the next two.
-        rest: what else a joint is off.
-        reading: noise that smoothing left in the readings.
-        pose: what no joint explains, six numbers.
-        delay: of the camera, the last.
-        size: of the vector.
-    """
-
-    joints: int
-    linearity: int
-    backlash: int
-    floats: int
-    compliance: int
-    rest: int
-    reading: int
-    pose: int
-    delay: int
-    size: int
+    joints: int  #: n
+    linearity: int  #: of n times BASIS; before it stand the tangents of n + 1 frames
+    backlash: int  #: its width as far as friction decides on the side, and the next where gravity and inertia do
+    floats: int  #: see ``backlash``
+    compliance: int  #: of each joint, and so are the next two
+    rest: int  #: what else a joint is off
+    reading: int  #: noise that smoothing left in the readings
+    pose: int  #: what no joint explains, six numbers
+    delay: int  #: of the camera, the last
+    size: int  #: of the vector
 
     @property
     def zeros(self) -> Ids:
@@ -92,49 +79,31 @@ class Prior:
 
     The defaults are of a table-top arm with plastic-film potentiometers. With priors below the truth a filter trusts the
     potentiometers too much; with priors above it the filter needs vision a little longer to learn.
-
-    Attributes:
-        link_m: translation of a link's frame along each axis, m.
-        link_rad: rotation about each, rad.
-        stand_m: translation of the base and of the tool in the hand, beyond that, m.
-        stand_rad: rotation of them, rad.
-        zero_rad: zero of a potentiometer, rad.
-        gain: its scale, relative.
-        harmonic_rad: amplitude of the first harmonic of its linearity; the k-th has it over k^1.5, rad.
-        backlash_rad: width of the backlash between potentiometer and link, rad, as far as friction decides on its side.
-        float_rad: the same as far as gravity and inertia do.
-        compliance: angle per gravity torque of a unit load, rad/m.
-        rest_rad: what else a joint is off, rad.
-        rest_travel_rad: travel in which it forgets that, rad.
-        creep_rad: how far a link creeps in its backlash in a second while its potentiometer stands, rad.
-        flip_rad: how uncertain a joint is after a change of side by friction, beyond the width, rad.
-        flip_float_rad: the same of a change by gravity and inertia, rad.
-        pose_m: what no joint explains, m.
-        pose_rad: the same of the rotation, rad.
-        pose_travel_rad: travel of all joints together in which that is forgotten, rad.
-        reading_rad: noise of one reading of a potentiometer, rad.
-        rounded_rad: what readings are rounded to where their noise does not exceed it, as counts of an encoder, rad.
     """
 
-    link_m: float = 1e-3
-    link_rad: float = float(np.deg2rad(0.3))
-    stand_m: float = 2e-3
-    stand_rad: float = float(np.deg2rad(0.3))
-    zero_rad: float = float(np.deg2rad(0.5))
-    gain: float = 2e-3
+    link_m: float = 1e-3  #: translation of a link's frame along each axis, m
+    link_rad: float = float(np.deg2rad(0.3))  #: rotation about each, rad
+    stand_m: float = 2e-3  #: translation of the base and of the tool in the hand, beyond that, m
+    stand_rad: float = float(np.deg2rad(0.3))  #: rotation of them, rad
+    zero_rad: float = float(np.deg2rad(0.5))  #: zero of a potentiometer, rad
+    gain: float = 2e-3  #: its scale, relative
+    #: amplitude of the first harmonic of its linearity; the k-th has it over k^1.5, rad.
     harmonic_rad: float = float(np.deg2rad(0.2))
+    #: width of the backlash between potentiometer and link, rad, as far as friction decides on its side
     backlash_rad: float = float(np.deg2rad(0.2))
-    float_rad: float = float(np.deg2rad(0.2))
-    compliance: float = 5e-3
-    rest_rad: float = float(np.deg2rad(0.03))
-    rest_travel_rad: float = 0.05
-    creep_rad: float = 0.0
+    float_rad: float = float(np.deg2rad(0.2))  #: the same as far as gravity and inertia do
+    compliance: float = 5e-3  #: angle per gravity torque of a unit load, rad/m
+    rest_rad: float = float(np.deg2rad(0.03))  #: what else a joint is off, rad
+    rest_travel_rad: float = 0.05  #: travel in which it forgets that, rad
+    creep_rad: float = 0.0  #: how far a link creeps in its backlash in a second while its potentiometer stands, rad
+    #: how uncertain a joint is after a change of side by friction, beyond the width, rad
     flip_rad: float = float(np.deg2rad(0.015))
-    flip_float_rad: float = float(np.deg2rad(0.05))
-    pose_m: float = 1e-4
-    pose_rad: float = float(np.deg2rad(0.01))
-    pose_travel_rad: float = 1.0
-    reading_rad: float = float(np.deg2rad(0.02))
+    flip_float_rad: float = float(np.deg2rad(0.05))  #: the same of a change by gravity and inertia, rad
+    pose_m: float = 1e-4  #: what no joint explains, m
+    pose_rad: float = float(np.deg2rad(0.01))  #: the same of the rotation, rad
+    pose_travel_rad: float = 1.0  #: travel of all joints together in which that is forgotten, rad
+    reading_rad: float = float(np.deg2rad(0.02))  #: noise of one reading of a potentiometer, rad
+    #: what readings are rounded to where their noise does not exceed it, as counts of an encoder, rad
     rounded_rad: float = 0.0
 
     def sigmas(self, sigma_delay_s: float, joints: int = 6) -> Array:

@@ -50,9 +50,6 @@ class ClockFollower:
         size: of the filter's state.
         delay: row of the delay in it.
         sigma_s: standard deviation of the delay at the beginning, s.
-
-    Attributes:
-        since_s: time of the measurement from which on stamps are corrected, s; None while they are not.
     """
 
     def __init__(self, size: int, delay: int, sigma_s: float) -> None:
@@ -63,6 +60,7 @@ class ClockFollower:
         self._score = self._information = 0.0
         self._excess, self._unrest = 1.0, 0.0
         self._certain_s = np.inf  # since when the offset is
+        #: time of the measurement from which on stamps are corrected, s; None while they are not
         self.since_s: float | None = None
 
     def remembered(self) -> Array:

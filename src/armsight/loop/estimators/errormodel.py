@@ -120,25 +120,15 @@ class Propagation(NamedTuple):
 
 
 class Predicted(NamedTuple):
-    """A state at a pose measurement, before that is used.
+    """A state at a pose measurement, before that is used."""
 
-    Attributes:
-        x: (size,) the state, propagated.
-        P: (size, size) its covariance.
-        z: (6,) innovation.
-        H: (6, size) derivative of the predicted pose by the state.
-        R: (6, 6) noise of the measurement, without what all measurements share.
-        HP: (6, size) the product of H and P.
-        S: (6, 6) covariance of z, what all measurements share included.
-    """
-
-    x: Array
-    P: Array
-    z: Array
-    H: Array
-    R: Array
-    HP: Array
-    S: Array
+    x: Array  #: (size,) the state, propagated
+    P: Array  #: (size, size) its covariance
+    z: Array  #: (6,) innovation
+    H: Array  #: (6, size) derivative of the predicted pose by the state
+    R: Array  #: (6, 6) noise of the measurement, without what all measurements share
+    HP: Array  #: (6, size) the product of H and P
+    S: Array  #: (6, 6) covariance of z, what all measurements share included
 
 
 def opened(joints: int) -> Array:
@@ -175,11 +165,11 @@ class ErrorModel:
 
     Attributes:
         layout: of the vector.
-        sigmas: (size,) standard deviations of the vector before anything is measured.
     """
 
     def __init__(self, arm: Arm, prior: Prior, sigma_delay_s: float) -> None:
         self._table, self._prior, self.layout = arm.table, prior, layout(arm.joints)
+        #: (size,) standard deviations of the vector before anything is measured
         self.sigmas = prior.sigmas(sigma_delay_s, arm.joints)
         sides = prior.flip_rad, prior.flip_float_rad
         travels = prior.rest_travel_rad, prior.pose_travel_rad

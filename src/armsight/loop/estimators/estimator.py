@@ -209,11 +209,9 @@ class Estimator(Protocol):
 
     def joints(self, states: JointStates) -> None:
         """Take readings of the potentiometers, in order of time."""
-        ...
 
     def vision(self, pose_measurement: PoseMeasurement) -> Outcome:
         """Take a pose measurement, in any order of time; return what became of it."""
-        ...
 
     def estimate(self, t_s: float | None = None) -> ArmEstimate:
         """Return the pose of the tool at a time, by default that of the newest reading.
@@ -221,11 +219,9 @@ class Estimator(Protocol):
         Raises:
             InputError: no reading has come yet, or ``t_s`` is not within those kept.
         """
-        ...
 
     def track(self, t_s: Array) -> Track:
         """Return the same at (N,) times: the fast way to an output at 1 kHz."""
-        ...
 
     def tool(self, q: Array, qd: Array, *, pressed: bool = False) -> Array:
         """Return T_base_tool (N, 4, 4) if the potentiometers read q (N, 6) moving at qd (N, 6), by what is known now.
@@ -233,4 +229,3 @@ class Estimator(Protocol):
         With ``pressed``, joints that move have moved far enough for their gears to push also links that gravity does
         not load.
         """
-        ...

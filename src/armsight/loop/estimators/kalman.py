@@ -110,11 +110,6 @@ class KalmanEstimator:
     Args:
         learns_delay: whether the delay is corrected, as far as its sigma allows. If not, its sigma is used, and what the
             model misses of the backlash cannot be taken for delay; a clock that goes wrong is followed.
-
-    Attributes:
-        clock: follows the camera's clock; None where the delay is learned.
-        on_innovation: called with what became of each pose measurement that came in order of time.
-        on_reading: the same of readings of references, with the reference's name; their innovations have m numbers.
     """
 
     def __init__(self, arm: Arm, *, prior: Prior | None = None, delay: Delay, learns_delay: bool = True) -> None:
@@ -136,8 +131,11 @@ class KalmanEstimator:
         furthest = FURTHEST * np.sqrt(self._model.sigmas**2 + self._opened)
         self._furthest = np.where(self._opened > 0.0, furthest, np.inf)
         self._states = [ErrorState(-np.inf, np.zeros(at.size), np.diag(self._model.sigmas**2), nowhere, None)]
+        #: called with what became of each pose measurement that came in order of time
         self.on_innovation: Callable[[Innovation], None] | None = None
+        #: the same of readings of references, with the reference's name; their innovations have m numbers
         self.on_reading: Callable[[str, Innovation], None] | None = None
+        #: follows the camera's clock; None where the delay is learned
         self.clock = None if learns_delay else ClockFollower(at.size, at.delay, delay.sigma_s)
         self._reference: Array | None = None
         self._waiting: list[PoseMeasurement | Taken | Until] = []

@@ -24,17 +24,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Mounting(Record):
-    """A rig that stands still and a body that the tool carries.
+    """A rig that stands still and a body that the tool carries."""
 
-    Attributes:
-        T_base_rig: (4, 4) the rig in the base, m.
-        T_tool_body: (4, 4) the body at the tool, m.
-        cov: (12, 12) covariance of the right tangents of the two, in this order.
-    """
-
-    T_base_rig: Array
-    T_tool_body: Array
-    cov: Array
+    T_base_rig: Array  #: (4, 4) the rig in the base, m
+    T_tool_body: Array  #: (4, 4) the body at the tool, m
+    cov: Array  #: (12, 12) covariance of the right tangents of the two, in this order
 
     @staticmethod
     def of(handeye: HandEye, arm: Arm) -> Mounting:

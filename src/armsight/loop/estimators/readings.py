@@ -55,27 +55,18 @@ _ROWS = 4096
 
 
 class Smoothed(NamedTuple):
-    """The joints at (N,) times.
+    """The joints at (N,) times."""
 
-    Attributes:
-        q: (N, n) angles, rad.
-        qd: (N, n) speeds, rad/s.
-        variance: (N, n) what is left of a reading's variance.
-        lasts_s: (N, n) how long what is left of the noise lasts, s: the time constant of its correlation.
-        unseen: (N, 3, n) what the links' angles beyond their shafts depend on. First the side of the backlash if friction
-            decides on it, -1 to 1: 1 when the joint came up from below; then if gravity and inertia do; then the lever of
-            what inertia does to a unit load, m.
-        travel: (N, n) how far the joint has moved in all, rad.
-        flips: (N, 2, n) how far the two sides have moved in all.
-    """
-
-    q: Array
-    qd: Array
-    variance: Array
-    lasts_s: Array
+    q: Array  #: (N, n) angles, rad
+    qd: Array  #: (N, n) speeds, rad/s
+    variance: Array  #: (N, n) what is left of a reading's variance
+    lasts_s: Array  #: (N, n) how long what is left of the noise lasts, s: the time constant of its correlation
+    #: (N, 3, n) what the links' angles beyond their shafts depend on. First the side of the backlash if friction
+    #: decides on it, -1 to 1: 1 when the joint came up from below; then if gravity and inertia do; then the lever of
+    #: what inertia does to a unit load, m
     unseen: Array
-    travel: Array
-    flips: Array
+    travel: Array  #: (N, n) how far the joint has moved in all, rad
+    flips: Array  #: (N, 2, n) how far the two sides have moved in all
 
     def rows(self, begin: int, end: int) -> Smoothed:
         """Return those at some of the times."""

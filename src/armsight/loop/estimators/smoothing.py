@@ -31,18 +31,12 @@ STILL_RAD = 1e-5
 
 
 class Interval(NamedTuple):
-    """Times between two measurements.
+    """Times between two measurements."""
 
-    Attributes:
-        t_s: (N,) the times, rising, s.
-        before: the filter after the measurement before them; its newest state where there is none after them, or none
-            before.
-        after: the filter after the measurement after them; None where there is none, or none before.
-    """
-
-    t_s: Array
+    t_s: Array  #: (N,) the times, rising, s
+    #: the filter after the measurement before them; its newest state where there is none after them, or none before
     before: ErrorState
-    after: ErrorState | None
+    after: ErrorState | None  #: the filter after the measurement after them; None where there is none, or none before
 
 
 def intervals(states: list[ErrorState], t_s: Array) -> list[Interval]:

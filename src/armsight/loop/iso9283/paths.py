@@ -35,19 +35,12 @@ _TRIALS = 200
 
 @dataclass(frozen=True, eq=False)
 class PathMetrics(Record):
-    """A path followed several times.
+    """A path followed several times."""
 
-    Attributes:
-        count: how many times.
-        AT_m: the largest distance of the mean path from the commanded one.
-        RT_m: that of the path point with the largest as measured.
-        off_m: (S,) distance of the mean path from it at every path point.
-    """
-
-    count: int
-    AT_m: Metric
-    RT_m: Metric
-    off_m: Array
+    count: int  #: how many times
+    AT_m: Metric  #: the largest distance of the mean path from the commanded one
+    RT_m: Metric  #: that of the path point with the largest as measured
+    off_m: Array  #: (S,) distance of the mean path from it at every path point
 
 
 def path_metrics(attained: Array, command: Array, cov: Array, common: Array | None = None) -> PathMetrics:
@@ -117,29 +110,19 @@ def _picked(metric: Metric, factor: float) -> Metric:
 
 
 class CircleMetrics(NamedTuple):
-    """A circle run both ways.
+    """A circle run both ways."""
 
-    Attributes:
-        centre_m: (3,) of the fitted circle.
-        radius_m: of the fitted circle.
-        circularity_m: G, the largest less the smallest radius of either way, the larger of the two.
-        hysteresis_m: H, the largest difference of the radii of the two ways at one angle.
-        steps_m: (2, 4) jump of the radius at 0, 90, 180, 270 degrees, counter-clockwise and clockwise, outwards positive.
-        backlash_m: along the circle's first and second axis: the mean of the four jumps where that axis reverses.
-        jumps_m: of the radius at each of the reversals asked for.
-        angle_deg: (B,) angles of the curves.
-        radii_m: (2, B) mean radii about each, less ``radius_m``, counter-clockwise and clockwise.
-    """
-
-    centre_m: Array
-    radius_m: float
-    circularity_m: Metric
-    hysteresis_m: Metric
+    centre_m: Array  #: (3,) of the fitted circle
+    radius_m: float  #: of the fitted circle
+    circularity_m: Metric  #: G, the largest less the smallest radius of either way, the larger of the two
+    hysteresis_m: Metric  #: H, the largest difference of the radii of the two ways at one angle
+    #: (2, 4) jump of the radius at 0, 90, 180, 270 degrees, counter-clockwise and clockwise, outwards positive
     steps_m: Array
+    #: along the circle's first and second axis: the mean of the four jumps where that axis reverses
     backlash_m: tuple[Metric, Metric]
-    jumps_m: tuple[Metric, ...]
-    angle_deg: Array
-    radii_m: Array
+    jumps_m: tuple[Metric, ...]  #: of the radius at each of the reversals asked for
+    angle_deg: Array  #: (B,) angles of the curves
+    radii_m: Array  #: (2, B) mean radii about each, less ``radius_m``, counter-clockwise and clockwise
 
 
 def circle_metrics(

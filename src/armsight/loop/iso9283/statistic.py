@@ -20,23 +20,18 @@ SAMPLES = 1000
 
 @dataclass(frozen=True)
 class Metric:
-    """One metric of the standard.
+    """One metric of the standard."""
 
-    Attributes:
-        raw: as the standard computes it, m or rad.
-        clean: without the noise; None where it cannot be resolved.
-        low: end of the 95 % interval of the true metric; where it cannot be resolved, 0, or of backlash, which has a sign,
-            still the end of its interval. None where the noise is not known.
-        high: the other end; where the metric cannot be resolved, its upper bound. None where the noise is not known.
-        resolvable: the smallest metric that this test can distinguish from noise. None where the noise is not known.
-        sigma: standard deviation that belongs to the interval; None where the metric cannot be resolved or has none.
-    """
-
-    raw: float
-    clean: float | None
+    raw: float  #: as the standard computes it, m or rad
+    clean: float | None  #: without the noise; None where it cannot be resolved
+    #: end of the 95 % interval of the true metric; where it cannot be resolved, 0, or of backlash, which has a sign,
+    #: still the end of its interval. None where the noise is not known.
     low: float | None
+    #: the other end; where the metric cannot be resolved, its upper bound. None where the noise is not known.
     high: float | None
+    #: the smallest metric that this test can distinguish from noise. None where the noise is not known.
     resolvable: float | None
+    #: standard deviation that belongs to the interval; None where the metric cannot be resolved or has none
     sigma: float | None = field(init=False)
 
     def __post_init__(self) -> None:

@@ -47,23 +47,14 @@ _SPANS = 0.05
 
 
 class InertialClass(NamedTuple):
-    """What sensors of a class are like: one sigma.
+    """What sensors of a class are like: one sigma."""
 
-    Attributes:
-        gyro_noise: rad/s/sqrt(Hz).
-        noise: of the accelerometer, m/s2/sqrt(Hz).
-        gyro_bias: at power-on, rad/s.
-        bias: of the accelerometer, m/s2.
-        scale: of both, relative; misalignments likewise, rad.
-        g_sensitivity: rad/s per m/s2.
-    """
-
-    gyro_noise: float
-    noise: float
-    gyro_bias: float
-    bias: float
-    scale: float
-    g_sensitivity: float
+    gyro_noise: float  #: rad/s/sqrt(Hz)
+    noise: float  #: of the accelerometer, m/s2/sqrt(Hz)
+    gyro_bias: float  #: at power-on, rad/s
+    bias: float  #: of the accelerometer, m/s2
+    scale: float  #: of both, relative; misalignments likewise, rad
+    g_sensitivity: float  #: rad/s per m/s2
 
 
 #: By their data sheets: noise density, initial bias at 25 degrees, sensitivity tolerance and cross-axis sensitivity.
@@ -76,15 +67,11 @@ INERTIAL_CLASSES = {
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Inertial(Reference):
-    """Gyro and accelerometer on the tool; see the module for the model.
-
-    Attributes:
-        T_tool_sensor: (4, 4) its mounting.
-        values: (35,) lever (again, m), biases (3 rad/s, 3 m/s2), M_a (6), M_g (9), G (9, rad/s per m/s2), tilt (2, rad).
-    """
+    """Gyro and accelerometer on the tool; see the module for the model."""
 
     inertial: ClassVar[bool] = True
-    T_tool_sensor: Array
+    T_tool_sensor: Array  #: (4, 4) its mounting
+    #: (35,) lever (again, m), biases (3 rad/s, 3 m/s2), M_a (6), M_g (9), G (9, rad/s per m/s2), tilt (2, rad)
     values: Array
 
     @staticmethod

@@ -80,17 +80,11 @@ def sweep_angle(p: Array, plane: NDArray[np.int64], calibration: Array) -> Array
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Lighthouse(Reference):
-    """Beacons and the tool's receivers.
+    """Beacons and the tool's receivers."""
 
-    Attributes:
-        Ts_base_beacon: (B, 4, 4) poses of the beacons, m.
-        calibration: (B, 2, 7) of each plane, by SWEEP.
-        receivers: (S, 3) their positions on the tool, m.
-    """
-
-    Ts_base_beacon: Array
-    calibration: Array
-    receivers: Array
+    Ts_base_beacon: Array  #: (B, 4, 4) poses of the beacons, m
+    calibration: Array  #: (B, 2, 7) of each plane, by SWEEP
+    receivers: Array  #: (S, 3) their positions on the tool, m
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -224,27 +218,16 @@ MOST_OPEN, FAR_M = 12, 0.02  # sweeps of a window at least, and m that receivers
 
 @dataclass(frozen=True, eq=False)
 class BodyPath(Record):
-    """A path.
+    """A path."""
 
-    Attributes:
-        t_s: (K,) even times, s.
-        p: (K, 3) positions in the base, m.
-        R: (K, 3, 3) rotations.
-        reference: with its parameters and their covariance.
-        sigma_rad: of a reading.
-        used: (N,) readings that keep half their weight and more.
-        band: lower Cholesky factor of the knots' information, (12 + 6, 6 K).
-        border: (6 K, P) what the parameters move of the knots.
-    """
-
-    t_s: Array
-    p: Array
-    R: Array
-    reference: Lighthouse
-    sigma_rad: float
-    used: NDArray[np.bool_]
-    band: Array
-    border: Array
+    t_s: Array  #: (K,) even times, s
+    p: Array  #: (K, 3) positions in the base, m
+    R: Array  #: (K, 3, 3) rotations
+    reference: Lighthouse  #: with its parameters and their covariance
+    sigma_rad: float  #: of a reading
+    used: NDArray[np.bool_]  #: (N,) readings that keep half their weight and more
+    band: Array  #: lower Cholesky factor of the knots' information, (12 + 6, 6 K)
+    border: Array  #: (6 K, P) what the parameters move of the knots
 
     def covariance(self, knots: NDArray[np.int64]) -> Array:
         """Return the covariance (M, 6, 6) of knots: position in the base, m, and right tangent of the rotation, rad."""

@@ -24,53 +24,31 @@ STANDARD_GRAVITY_M_S2 = 9.80665
 
 @dataclass(frozen=True, eq=False)
 class Reading(Record):
-    """One reading of a sensor.
+    """One reading of a sensor."""
 
-    Attributes:
-        t_s: when, s, as its clock stamps it; its delay is still in it.
-        channel: which of the reference's channels.
-        z: (m,) what was read, SI units.
-        cov: (m, m) covariance of its noise.
-    """
-
-    t_s: float
-    channel: int
-    z: Array
-    cov: Array
+    t_s: float  #: when, s, as its clock stamps it; its delay is still in it
+    channel: int  #: which of the reference's channels
+    z: Array  #: (m,) what was read, SI units
+    cov: Array  #: (m, m) covariance of its noise
 
 
 class ToolMotion(NamedTuple):
-    """Where the tool is and how it moves.
+    """Where the tool is and how it moves."""
 
-    Attributes:
-        T_base_tool: (4, 4) pose of the tool, m.
-        twist: (6,) [velocity of the tool's origin; angular velocity] in the tool's frame, [m/s; rad/s].
-        acceleration: (6,) derivative of ``twist`` by time, [m/s2; rad/s2].
-        cov: (6, 6) covariance of the pose's right tangent [m; rad]; zero where it is exact.
-    """
-
-    T_base_tool: Array
-    twist: Array = _STILL
-    acceleration: Array = _STILL
-    cov: Array = _EXACT
+    T_base_tool: Array  #: (4, 4) pose of the tool, m
+    twist: Array = _STILL  #: (6,) [velocity of the tool's origin; angular velocity] in the tool's frame, [m/s; rad/s]
+    acceleration: Array = _STILL  #: (6,) derivative of ``twist`` by time, [m/s2; rad/s2]
+    cov: Array = _EXACT  #: (6, 6) covariance of the pose's right tangent [m; rad]; zero where it is exact
 
 
 class ExpectedReading(NamedTuple):
-    """What a sensor would read, and its derivatives.
+    """What a sensor would read, and its derivatives."""
 
-    Attributes:
-        z: (m,) the reading.
-        by_tool: (m, 6) by the right tangent of the tool's pose, [1/m; 1/rad].
-        by_parameters: (m, P) by the tangent of the reference's parameters.
-        by_twist: (m, 6) by the tool's twist; None where it does not matter.
-        by_acceleration: (m, 6) by its acceleration; None where it does not matter.
-    """
-
-    z: Array
-    by_tool: Array
-    by_parameters: Array
-    by_twist: Array | None = None
-    by_acceleration: Array | None = None
+    z: Array  #: (m,) the reading
+    by_tool: Array  #: (m, 6) by the right tangent of the tool's pose, [1/m; 1/rad]
+    by_parameters: Array  #: (m, P) by the tangent of the reference's parameters
+    by_twist: Array | None = None  #: (m, 6) by the tool's twist; None where it does not matter
+    by_acceleration: Array | None = None  #: (m, 6) by its acceleration; None where it does not matter
 
     def rate(self, motion: ToolMotion) -> Array:
         """Return the derivative (m,) of the reading by time; the jerk is left out."""
@@ -80,21 +58,13 @@ class ExpectedReading(NamedTuple):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Reference(Record, ABC):
-    """A sensor beside vision.
+    """A sensor beside vision."""
 
-    Attributes:
-        name: what people call it.
-        cov: (P, P) covariance of its parameters' tangent: before a calibration, how far each may be off.
-        delay_s: how late its stamps are: the reading is of ``t_s - delay_s``.
-        sigma_delay_s: standard deviation of that, s.
-        inertial: whether it feels the tool's acceleration; of the class.
-    """
-
-    inertial: ClassVar[bool] = False
-    name: str
-    cov: Array
-    delay_s: float = 0.0
-    sigma_delay_s: float = 0.0
+    inertial: ClassVar[bool] = False  #: whether it feels the tool's acceleration; of the class
+    name: str  #: what people call it
+    cov: Array  #: (P, P) covariance of its parameters' tangent: before a calibration, how far each may be off
+    delay_s: float = 0.0  #: how late its stamps are: the reading is of ``t_s - delay_s``
+    sigma_delay_s: float = 0.0  #: standard deviation of that, s
 
     @property
     @abstractmethod

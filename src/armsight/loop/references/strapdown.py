@@ -62,59 +62,34 @@ _BIASED = _PARAMETERS + BIASES.start
 
 @dataclass(frozen=True, eq=False)
 class Samples(Record):
-    """Samples of an inertial unit, in order of time.
+    """Samples of an inertial unit, in order of time."""
 
-    Attributes:
-        t_s: (N,) when, s, as its clock stamps them; its delay is still in them.
-        z: (N, 6) angular velocity, rad/s, and specific force, m/s2, as read.
-        density: (6,) of their noise, per sqrt(Hz).
-    """
-
-    t_s: Array
-    z: Array
-    density: Array
+    t_s: Array  #: (N,) when, s, as its clock stamps them; its delay is still in them
+    z: Array  #: (N, 6) angular velocity, rad/s, and specific force, m/s2, as read
+    density: Array  #: (6,) of their noise, per sqrt(Hz)
 
 
 class Navigated(NamedTuple):
-    """What is estimated beside the arm's errors.
+    """What is estimated beside the arm's errors."""
 
-    Attributes:
-        t_s: when its velocity was, s; of another time than the state's the velocity is not known.
-        y: (B,) velocity of the sensor, base, m/s; then how much the delay and the parameters are off.
-        C: (K, B) covariance of the arm's errors with its.
-        Y: (B, B) its covariance.
-    """
-
-    t_s: float
-    y: Array
-    C: Array
-    Y: Array
+    t_s: float  #: when its velocity was, s; of another time than the state's the velocity is not known
+    y: Array  #: (B,) velocity of the sensor, base, m/s; then how much the delay and the parameters are off
+    C: Array  #: (K, B) covariance of the arm's errors with its
+    Y: Array  #: (B, B) its covariance
 
 
 class Advanced(NamedTuple):
-    """A filter's state at the end of a window, the window used.
+    """A filter's state at the end of a window, the window used."""
 
-    Attributes:
-        x: (K,) the arm's error.
-        P: (K, K) its covariance.
-        beside: velocity and parameters.
-        gain: (K + B, 6) what of the residual was added to x, and to what is beside.
-        by: (6, K) derivative of the residual by the state before.
-        z: (6,) residual: felt minus predicted.
-        S: (6, 6) its covariance.
-        by_y: (6, B) derivative of the residual by what is beside.
-        velocity: (3, K + B) derivative of the velocity at the end by the state before, and by what is beside.
-    """
-
-    x: Array
-    P: Array
-    beside: Navigated
-    gain: Array
-    by: Array
-    z: Array
-    S: Array
-    by_y: Array
-    velocity: Array
+    x: Array  #: (K,) the arm's error
+    P: Array  #: (K, K) its covariance
+    beside: Navigated  #: velocity and parameters
+    gain: Array  #: (K + B, 6) what of the residual was added to x, and to what is beside
+    by: Array  #: (6, K) derivative of the residual by the state before
+    z: Array  #: (6,) residual: felt minus predicted
+    S: Array  #: (6, 6) its covariance
+    by_y: Array  #: (6, B) derivative of the residual by what is beside
+    velocity: Array  #: (3, K + B) derivative of the velocity at the end by the state before, and by what is beside
 
 
 @kernel

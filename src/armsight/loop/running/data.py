@@ -122,6 +122,10 @@ class NoteDatum:
         None  #: of a health monitor, those that hold now; None where it says nothing of them
     )
 
+    def to_json(self, body: Body) -> dict[str, Any]:
+        """Return the object that streams hold; ``body`` is not needed."""
+        return {"t_s": self.time_s, "level": self.level, "text": self.text}
+
 
 @dataclass(frozen=True)
 class EventDatum:
@@ -129,6 +133,10 @@ class EventDatum:
 
     time_s: float  #: when, s
     content: Mapping[str, Any]  #: JSON
+
+    def to_json(self, body: Body) -> dict[str, Any]:
+        """Return the content; ``body`` is not needed."""
+        return dict(self.content)
 
 
 def quaternion(R: Array) -> tuple[float, float, float, float]:
@@ -216,19 +224,15 @@ class Publisher(Protocol):
 
     def put(self, datum: Datum) -> None:
         """Take a datum."""
-        ...
 
     def pause(self) -> None:
         """Leave the interpreter to the caller until :meth:`resume`: begin to publish no other datum. Returns at once."""
-        ...
 
     def resume(self) -> None:
         """Publish again."""
-        ...
 
     def close(self) -> None:
         """Publish what was taken, and end."""
-        ...
 
 
 class Fanout:

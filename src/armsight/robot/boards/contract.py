@@ -81,36 +81,29 @@ class MotionBoard(Closing, Protocol):
     @property
     def abilities(self) -> Abilities:
         """What it can do."""
-        ...
 
     @property
     def welcome(self) -> Welcome:
         """Who it is."""
-        ...
 
     @property
     def status(self) -> BoardStatus:
         """Its newest status; counts that it does not keep are 0."""
-        ...
 
     @property
     def joints(self) -> JointReport:
         """Its newest report of how the joints are driven."""
-        ...
 
     @property
     def broken_messages(self) -> int:
         """Number of broken or missing messages from it."""
-        ...
 
     @property
     def homed(self) -> bool:
         """False where it is known that its readings are not the arm's angles: it was not homed since it was switched on."""
-        ...
 
     def soft_limits(self) -> tuple[Array, Array]:
         """Return the lower and the upper limits (n,) that it keeps the joints within, rad."""
-        ...
 
     def send(self, command: JointCommand) -> int:
         """Send a motion command and return its number.
@@ -119,31 +112,24 @@ class MotionBoard(Closing, Protocol):
             InputError: a shape, a number that is not finite, or what the board rejects at once.
             DeviceError: the board is gone.
         """
-        ...
 
     def command(self, command: Command) -> int:
         """Send a command other than motion and return its number."""
-        ...
 
     def confirm(self, sequence: int, wait_s: float = 0.5) -> None:
         """Wait until the board acknowledged the command of this number; DeviceError where it was rejected, or is silent."""
-        ...
 
     def enable(self, *, inward: bool = False) -> None:
         """Switch the drives on, at the present position, and wait until they are."""
-        ...
 
     def stop(self) -> None:
         """Stop in an emergency."""
-        ...
 
     def receive(self, wait_s: float = 0.0) -> JointStates:
         """Let ``wait_s`` pass and return all readings since the last call, or raise DeviceError: the board is gone."""
-        ...
 
     def close(self) -> None:
         """Close the link; a driven arm then does what its board does without commands."""
-        ...
 
 
 #: A goal further from the present position than this is a mistake, not a step of a motion.

@@ -40,11 +40,9 @@ class Faults(Protocol):
 
     def to_board(self, tick: int, data: bytes) -> bytes:
         """Return what arrives at the board of what the host sent in this tick."""
-        ...
 
     def to_host(self, tick: int, data: bytes) -> bytes:
         """Return what arrives at the host of what the board sent in this tick."""
-        ...
 
 
 class EmulatedLink:

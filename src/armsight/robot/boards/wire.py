@@ -27,7 +27,6 @@ class Message(Protocol):
 
     def get_type(self) -> str:
         """Return the message's name."""
-        ...
 
     def __getattr__(self, name: str) -> Any: ...  # noqa: ANN401
 

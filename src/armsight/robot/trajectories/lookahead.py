@@ -38,19 +38,12 @@ NEWTON, REFINED = 3, 1e-10
 
 
 class Walk(NamedTuple):
-    """The joints along a path, as far as it can be travelled.
+    """The joints along a path, as far as it can be travelled."""
 
-    Attributes:
-        share: (K,) shares of the way, rising from 0.
-        q: (K, n) joint angles, rad.
-        q1: (K, 6) their derivative by the share, and ``q2`` the second.
-        q2: see ``q1``.
-    """
-
-    share: Array
-    q: Array
-    q1: Array
-    q2: Array
+    share: Array  #: (K,) shares of the way, rising from 0
+    q: Array  #: (K, n) joint angles, rad
+    q1: Array  #: (K, 6) their derivative by the share, and ``q2`` the second
+    q2: Array  #: see ``q1``
 
     def near(self, share: Array) -> Array:
         """Return joint angles (N, n) near shares (N,), to choose the right solution by."""
@@ -60,17 +53,11 @@ class Walk(NamedTuple):
 
 
 class Obstacle(NamedTuple):
-    """The first thing in the way.
+    """The first thing in the way."""
 
-    Attributes:
-        share: where on the way.
-        reason: what it is.
-        clear: how many points of the walk are not yet slowed down by a singularity before it, at least 1.
-    """
-
-    share: float
-    reason: str
-    clear: int = 1
+    share: float  #: where on the way
+    reason: str  #: what it is
+    clear: int = 1  #: how many points of the walk are not yet slowed down by a singularity before it, at least 1
 
 
 def columns(x: Array, at: Array, values: Array) -> Array:

@@ -23,17 +23,11 @@ POSE_TOLERANCE = 1e-6
 
 
 class PathPoints(NamedTuple):
-    """A path at N shares of its way.
+    """A path at N shares of its way."""
 
-    Attributes:
-        T_base_tool: (N, 4, 4) poses of the tool.
-        twist: (N, 6) their derivative by the share: [position m; rotation rad], base axes.
-        bend: (N, 6) the derivative of the twist by the share.
-    """
-
-    T_base_tool: Array
-    twist: Array
-    bend: Array
+    T_base_tool: Array  #: (N, 4, 4) poses of the tool
+    twist: Array  #: (N, 6) their derivative by the share: [position m; rotation rad], base axes
+    bend: Array  #: (N, 6) the derivative of the twist by the share
 
 
 class Path(Protocol):

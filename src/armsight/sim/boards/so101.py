@@ -56,24 +56,21 @@ class So101Servos:
         q: (6,) where the joints are, rad by the sensors.
 
     Attributes:
-        shaft: (6,) angles of the output shafts, rad.
         rate: (6,) how fast the shafts move, rad/s; ``shaft_speed`` is the same as a servo measures it, filtered.
-        on: (6,) whether the torque is on.
-        celsius: (6,) temperatures.
     """
 
     def __init__(self, mechanics: So101Mechanics, load: Callable[[Array], Array], q: Array) -> None:
         self.mechanics, self._load = mechanics, load
-        self.shaft = np.array(q, float)
+        self.shaft = np.array(q, float)  #: (6,) angles of the output shafts, rad
         self._motor = self.shaft.copy()
         self._setpoint, self._speed = self.shaft.copy(), np.zeros(SERVOS)
         self._goal, self._most = self.shaft.copy(), np.full(SERVOS, 5.0)
         self._waiting: deque[tuple[int, int, float, float]] = deque()
         self._ticks = 0
-        self.on = np.zeros(SERVOS, bool)
+        self.on = np.zeros(SERVOS, bool)  #: (6,) whether the torque is on
         self.effort = np.zeros(SERVOS)
         self.shaft_speed, self.rate = np.zeros(SERVOS), np.zeros(SERVOS)
-        self.celsius = np.full(SERVOS, 30.0)
+        self.celsius = np.full(SERVOS, 30.0)  #: (6,) temperatures
 
     @property
     def true_q(self) -> Array:

@@ -20,7 +20,7 @@ import numpy as np
 
 from armsight.data import Array, Ids
 from armsight.errors import InputError
-from armsight.files import read_toml
+from armsight.files import as_input_error, read_toml
 from armsight.geometry.pose import inverse, pose
 from armsight.geometry.rotation import exp_so3
 from armsight.sim.budget.chart import marker_noise
@@ -205,10 +205,8 @@ class RigPlan:
         for key, _, value in (pair.partition("=") for pair in pairs):
             if key in found:
                 raise InputError(f"{key}={value}: {key} is given twice; give it once")
-            try:
+            with as_input_error(f"{key}={value}: expected a number", ValueError):
                 found[key] = value if kinds.get(key, str) is str else float(value)
-            except ValueError:
-                raise InputError(f"{key}={value}: expected a number") from None
         return found
 
     @staticmethod

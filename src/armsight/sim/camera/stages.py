@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from armsight.errors import InputError
-from armsight.files import read_toml
+from armsight.files import as_input_error, read_toml
 from armsight.sim.render.optics import Optics
 from armsight.sim.render.render import Shutter
 
@@ -82,13 +82,9 @@ class ExposureTiming(Stage):
 
 @dataclass(frozen=True)
 class Lens(Stage):
-    """A lens in focus; the renderer applies its blur, exactly in area, see :attr:`CameraPipeline.psf_sigma_px`.
+    """A lens in focus; the renderer applies its blur, exactly in area, see :attr:`CameraPipeline.psf_sigma_px`."""
 
-    Attributes:
-        psf_sigma_px: standard deviation of the Gaussian blur, pixels of the output.
-    """
-
-    psf_sigma_px: float = _number(0.1, 5)
+    psf_sigma_px: float = _number(0.1, 5)  #: standard deviation of the Gaussian blur, pixels of the output
 
 
 @dataclass(frozen=True)
@@ -129,15 +125,10 @@ class Vignetting(Stage):
 
 @dataclass(frozen=True)
 class Resizing(Stage):
-    """A sensor of another size than the output; the camera interpolates.
+    """A sensor of another size than the output; the camera interpolates."""
 
-    Attributes:
-        native_scale: the sensor's width over the output's.
-        method: of the camera's own interpolation.
-    """
-
-    native_scale: float = _number(0.25, 3)
-    method: str = _one_of("nearest", "linear", "cubic", "area")
+    native_scale: float = _number(0.25, 3)  #: the sensor's width over the output's
+    method: str = _one_of("nearest", "linear", "cubic", "area")  #: of the camera's own interpolation
 
 
 @dataclass(frozen=True)
@@ -153,29 +144,17 @@ class Flicker(Stage):
 
 @dataclass(frozen=True)
 class Photosensor(Stage):
-    """From light to numbers, in electrons: photons, fixed pattern, readout, converter.
+    """From light to numbers, in electrons: photons, fixed pattern, readout, converter."""
 
-    Attributes:
-        white_e: electrons that a white reflector (radiance 1) gives in an exposure.
-        full_well_e: electrons at which a pixel, and at a gain of one the converter, is full.
-        read_noise_e: noise of the readout.
-        prnu: pixels differ in sensitivity by this share (standard deviation).
-        dsnu_e: pixels differ in the dark by so many electrons (standard deviation).
-        hot_share: share of hot pixels.
-        hot_e: mean of what a hot pixel has in the dark, exponentially distributed.
-        bits: of the converter.
-        dark_level: share of the converter's range that black is at; the camera subtracts it.
-    """
-
-    white_e: float = _number(1, 1e6)
-    full_well_e: float = _number(100, 1e6)
-    read_noise_e: float = _number(0, 500)
-    prnu: float = _number(0, 0.2)
-    dsnu_e: float = _number(0, 500)
-    hot_share: float = _number(0, 0.01)
-    hot_e: float = _number(0, 1e5)
-    bits: int = _number(8, 14, whole=True)
-    dark_level: float = _number(0, 0.2)
+    white_e: float = _number(1, 1e6)  #: electrons that a white reflector (radiance 1) gives in an exposure
+    full_well_e: float = _number(100, 1e6)  #: electrons at which a pixel, and at a gain of one the converter, is full
+    read_noise_e: float = _number(0, 500)  #: noise of the readout
+    prnu: float = _number(0, 0.2)  #: pixels differ in sensitivity by this share (standard deviation)
+    dsnu_e: float = _number(0, 500)  #: pixels differ in the dark by so many electrons (standard deviation)
+    hot_share: float = _number(0, 0.01)  #: share of hot pixels
+    hot_e: float = _number(0, 1e5)  #: mean of what a hot pixel has in the dark, exponentially distributed
+    bits: int = _number(8, 14, whole=True)  #: of the converter
+    dark_level: float = _number(0, 0.2)  #: share of the converter's range that black is at; the camera subtracts it
 
 
 @dataclass(frozen=True)
@@ -215,17 +194,11 @@ class ToneCurve(Stage):
 
 @dataclass(frozen=True)
 class SpatialDenoise(Stage):
-    """A bilateral filter of the luma.
+    """A bilateral filter of the luma."""
 
-    Attributes:
-        diameter_px: of the neighbourhood, pixels of the sensor.
-        sigma_px: weight by distance.
-        sigma_grey: weight by difference, grey levels.
-    """
-
-    diameter_px: int = _number(3, 15, whole=True)
-    sigma_px: float = _number(0.3, 10)
-    sigma_grey: float = _number(0.5, 200)
+    diameter_px: int = _number(3, 15, whole=True)  #: of the neighbourhood, pixels of the sensor
+    sigma_px: float = _number(0.3, 10)  #: weight by distance
+    sigma_grey: float = _number(0.5, 200)  #: weight by difference, grey levels
 
 
 @dataclass(frozen=True)
@@ -322,10 +295,8 @@ class CameraPipeline:
             for name, values in tables.items()
             if not (values is False and name in STAGES)
         }
-        try:
+        with as_input_error(str(path), InputError, why=True):
             return cls(**stages)
-        except InputError as error:
-            raise InputError(f"{path}: {error}") from None
 
     def shutter(self, height: int) -> Shutter:
         """Return how the renderer has to expose an image of so many rows."""

@@ -25,45 +25,26 @@ def _none() -> Array:
 
 @dataclass(frozen=True, eq=False)
 class InertialErrors(Record):
-    """What is wrong with a unit: rows of six are gyro x, y, z, rad/s, then accelerometer x, y, z, m/s2.
+    """What is wrong with a unit: rows of six are gyro x, y, z, rad/s, then accelerometer x, y, z, m/s2."""
 
-    Attributes:
-        noise: (6,) density, per sqrt(Hz).
-        bias: (6,) at power-on.
-        walk: (6,) of the bias, per sqrt(s).
-        warming: (6,) change of the bias as the chip warms up.
-        warming_s: time constant of that, s.
-        scale: (6, 3) by how much the matrices of gyro and accelerometer differ from the identity, row by row.
-        g_sensitivity: (3, 3) of the gyro, rad/s per m/s2.
-        largest: (6,) end of the range.
-        step: (6,) that values are rounded to.
-        bandwidth_hz: of the chip's low-pass of second order.
-        rate_hz: readings a second, by its own clock.
-        clock: by how much that clock is slow, relative.
-        lost: share of the readings that are missing.
-        repeated: share of the readings that repeat the one before.
-        mount_hz: resonance of a loose mount about the sensor's x axis; 0: rigid.
-        hum: (6,) amplitude of the motors' vibration.
-        hum_hz: its frequency.
-    """
-
-    noise: Array = field(default_factory=lambda: np.repeat([9e-5, 4e-3], 3))
-    bias: Array = field(default_factory=_none)
-    walk: Array = field(default_factory=_none)
-    warming: Array = field(default_factory=_none)
-    warming_s: float = 60.0
+    noise: Array = field(default_factory=lambda: np.repeat([9e-5, 4e-3], 3))  #: (6,) density, per sqrt(Hz)
+    bias: Array = field(default_factory=_none)  #: (6,) at power-on
+    walk: Array = field(default_factory=_none)  #: (6,) of the bias, per sqrt(s)
+    warming: Array = field(default_factory=_none)  #: (6,) change of the bias as the chip warms up
+    warming_s: float = 60.0  #: time constant of that, s
+    #: (6, 3) by how much the matrices of gyro and accelerometer differ from the identity, row by row
     scale: Array = field(default_factory=lambda: np.zeros((6, 3)))
-    g_sensitivity: Array = field(default_factory=lambda: np.zeros((3, 3)))
-    largest: Array = field(default_factory=lambda: np.repeat([8.726, 39.22], 3))
-    step: Array = field(default_factory=lambda: np.repeat([2.7e-4, 1.2e-3], 3))
-    bandwidth_hz: float = 42.0
-    rate_hz: float = 100.0
-    clock: float = 0.0
-    lost: float = 0.0
-    repeated: float = 0.0
-    mount_hz: float = 0.0
-    hum: Array = field(default_factory=_none)
-    hum_hz: float = 47.0
+    g_sensitivity: Array = field(default_factory=lambda: np.zeros((3, 3)))  #: (3, 3) of the gyro, rad/s per m/s2
+    largest: Array = field(default_factory=lambda: np.repeat([8.726, 39.22], 3))  #: (6,) end of the range
+    step: Array = field(default_factory=lambda: np.repeat([2.7e-4, 1.2e-3], 3))  #: (6,) that values are rounded to
+    bandwidth_hz: float = 42.0  #: of the chip's low-pass of second order
+    rate_hz: float = 100.0  #: readings a second, by its own clock
+    clock: float = 0.0  #: by how much that clock is slow, relative
+    lost: float = 0.0  #: share of the readings that are missing
+    repeated: float = 0.0  #: share of the readings that repeat the one before
+    mount_hz: float = 0.0  #: resonance of a loose mount about the sensor's x axis; 0: rigid
+    hum: Array = field(default_factory=_none)  #: (6,) amplitude of the motors' vibration
+    hum_hz: float = 47.0  #: its frequency
 
     @staticmethod
     def typical(

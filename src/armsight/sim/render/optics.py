@@ -32,16 +32,12 @@ _PARTS_VARIANCE = 1 / (6 * SUB**2)
 
 @dataclass(frozen=True)
 class Optics:
-    """The lens and the light.
+    """The lens and the light."""
 
-    Attributes:
-        psf_sigma_px: standard deviation of the Gaussian blur, px; 0 for none.
-        vignetting: how much darker the image's corners are than its centre, 0 to 1, falling with the square of radius.
-        light_gradient: relative change of the light across the image's full width and height.
-    """
-
-    psf_sigma_px: float = 0.7
+    psf_sigma_px: float = 0.7  #: standard deviation of the Gaussian blur, px; 0 for none
+    #: how much darker the image's corners are than its centre, 0 to 1, falling with the square of radius
     vignetting: float = 0.0
+    #: relative change of the light across the image's full width and height
     light_gradient: tuple[float, float] = (0.0, 0.0)
 
 

@@ -28,15 +28,10 @@ OUTLINE = 16
 
 @dataclass(frozen=True)
 class Shutter:
-    """When the pixels look.
+    """When the pixels look."""
 
-    Attributes:
-        exposure_s: how long each row gathers light, s; 0 freezes all motion.
-        row_s: how much later each row starts than the one above, s; 0 is a global shutter.
-    """
-
-    exposure_s: float = 0.0
-    row_s: float = 0.0
+    exposure_s: float = 0.0  #: how long each row gathers light, s; 0 freezes all motion
+    row_s: float = 0.0  #: how much later each row starts than the one above, s; 0 is a global shutter
 
 
 #: The rays of so many rows are computed at once: those of all would need ten times the memory of the result.

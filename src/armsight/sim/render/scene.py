@@ -28,21 +28,14 @@ RING_HOLE = 0.4
 
 @dataclass(frozen=True, eq=False)
 class Pattern(Record):
-    """One flat pattern; seen from its face only (the side its z axis points away from).
+    """One flat pattern; seen from its face only (the side its z axis points away from)."""
 
-    Attributes:
-        x_edges: (nx + 1,) rising borders of the cells' columns, m, pattern frame.
-        y_edges: (ny + 1,) rising borders of the cells' rows, m, pattern frame.
-        values: (ny, nx) reflectance of each cell; CLEAR lets the background through.
-        discs: (K, 4) centre x, y and radius, m, pattern frame, and reflectance; painted over the cells in this order.
-        T_body_pattern: (4, 4) where the pattern sits on its body.
-    """
-
-    x_edges: Array
-    y_edges: Array
-    values: Array
+    x_edges: Array  #: (nx + 1,) rising borders of the cells' columns, m, pattern frame
+    y_edges: Array  #: (ny + 1,) rising borders of the cells' rows, m, pattern frame
+    values: Array  #: (ny, nx) reflectance of each cell; CLEAR lets the background through
+    #: (K, 4) centre x, y and radius, m, pattern frame, and reflectance; painted over the cells in this order
     discs: Array = field(default_factory=lambda: np.zeros((0, 4)))
-    T_body_pattern: Array = field(default_factory=lambda: np.eye(4))
+    T_body_pattern: Array = field(default_factory=lambda: np.eye(4))  #: (4, 4) where the pattern sits on its body
 
     def __post_init__(self) -> None:
         """Check shapes, and that borders rise."""
@@ -60,19 +53,14 @@ class Pattern(Record):
 
 @dataclass(frozen=True, eq=False)
 class PosedBody(Record):
-    """A rigid body in front of a camera.
+    """A rigid body in front of a camera."""
 
-    Attributes:
-        patterns: what is on the body, painted in this order: a tag comes after the plate it is stuck on.
-        T_camera_body: (4, 4) pose in the camera's frame in the middle of the exposure of the middle row, m.
-        twist: (6,) velocity [m/s; rad/s] in the body's axes.
-        acceleration: (6,) its change, m/s^2 and rad/s^2: at time t the pose is T_camera_body @ exp_se3(t twist +
-            t^2 acceleration / 2).
-    """
-
+    #: what is on the body, painted in this order: a tag comes after the plate it is stuck on
     patterns: tuple[Pattern, ...]
-    T_camera_body: Array
-    twist: Array = field(default_factory=lambda: np.zeros(6))
+    T_camera_body: Array  #: (4, 4) pose in the camera's frame in the middle of the exposure of the middle row, m
+    twist: Array = field(default_factory=lambda: np.zeros(6))  #: (6,) velocity [m/s; rad/s] in the body's axes
+    #: (6,) its change, m/s^2 and rad/s^2: at time t the pose is T_camera_body @ exp_se3(t twist + t^2 acceleration /
+    #: 2)
     acceleration: Array = field(default_factory=lambda: np.zeros(6))
 
     def seen_from(self, T_other_camera: Array) -> PosedBody:

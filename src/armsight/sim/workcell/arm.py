@@ -27,33 +27,20 @@ _CYCLES = (2.0, 9.0)  # how often they swing over its travel
 
 @dataclass(frozen=True)
 class Imperfections:
-    """How far an arm is from its table. Amounts are typical ones: an arm's own are sampled from 0.5 to 1.5 of them.
+    """How far an arm is from its table. Amounts are typical ones: an arm's own are sampled from 0.5 to 1.5 of them."""
 
-    Attributes:
-        length_m: error of link lengths and offsets, m.
-        angle_rad: error of link twists, rad.
-        zero_rad: error of the joints' zeros, rad.
-        backlash_rad: least and greatest backlash between a gear's shaft and its link, rad, from stop to stop.
-        compliance_rad: twist of a joint under the greatest gravity load it carries, rad.
-        pot_linearity: greatest deviation of a potentiometer from its straight line, share of its travel.
-        pot_offset_rad: error of a potentiometer's zero, rad.
-        pot_noise_lsb: noise of one conversion, steps of the converter.
-        adc_bits: of the converter.
-        oversampling: conversions averaged in a tick.
-        friction: friction of the motors and gears, of what is usual.
-    """
-
-    length_m: float = 0.0
-    angle_rad: float = 0.0
-    zero_rad: float = 0.0
+    length_m: float = 0.0  #: error of link lengths and offsets, m
+    angle_rad: float = 0.0  #: error of link twists, rad
+    zero_rad: float = 0.0  #: error of the joints' zeros, rad
+    #: least and greatest backlash between a gear's shaft and its link, rad, from stop to stop
     backlash_rad: tuple[float, float] = (0.0, 0.0)
-    compliance_rad: float = 1e-4
-    pot_linearity: float = 0.0
-    pot_offset_rad: float = 0.0
-    pot_noise_lsb: float = 1.0
-    adc_bits: int = 12
-    oversampling: int = 64
-    friction: float = 1.0
+    compliance_rad: float = 1e-4  #: twist of a joint under the greatest gravity load it carries, rad
+    pot_linearity: float = 0.0  #: greatest deviation of a potentiometer from its straight line, share of its travel
+    pot_offset_rad: float = 0.0  #: error of a potentiometer's zero, rad
+    pot_noise_lsb: float = 1.0  #: noise of one conversion, steps of the converter
+    adc_bits: int = 12  #: of the converter
+    oversampling: int = 64  #: conversions averaged in a tick
+    friction: float = 1.0  #: friction of the motors and gears, of what is usual
 
 
 _USED = Imperfections(

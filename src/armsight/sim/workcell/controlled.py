@@ -42,7 +42,6 @@ class ControlledDevice(Device, Protocol):
     @property
     def truth(self) -> tuple[Array, Array]:
         """(n,) angles where the sensors sit, and of the links, rad."""
-        ...
 
 
 class ControlledArm:
@@ -88,14 +87,10 @@ class ControlledArm:
 
 @dataclass(frozen=True)
 class Controlled:
-    """A kind of arm with a controller of its own.
+    """A kind of arm with a controller of its own."""
 
-    Attributes:
-        board: how its board's name begins, such as ``feetech:``.
-        open: returns arm and board, drives on, at home, from the true table, how far it is from nominal, and a seed.
-    """
-
-    board: str
+    board: str  #: how its board's name begins, such as ``feetech:``
+    #: returns arm and board, drives on, at home, from the true table, how far it is from nominal, and a seed
     open: Callable[[Arm, Imperfections, int], tuple[ControlledArm, MotionBoard]]
 
 

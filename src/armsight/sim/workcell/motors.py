@@ -36,21 +36,13 @@ _SHORTEST_M = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Solids(Record):
-    """Capsules that move with an arm's links.
+    """Capsules that move with an arm's links."""
 
-    Attributes:
-        link: (K,) 0 for the base, 1 to n.
-        ends: (K, 2, 3) their axes' ends, m, row frame of the link.
-        radius: (K,) m.
-        mass: (K,) kg.
-        housing: (K,) whether it is a joint's housing.
-    """
-
-    link: Ids
-    ends: Array
-    radius: Array
-    mass: Array
-    housing: NDArray[np.bool_]
+    link: Ids  #: (K,) 0 for the base, 1 to n
+    ends: Array  #: (K, 2, 3) their axes' ends, m, row frame of the link
+    radius: Array  #: (K,) m
+    mass: Array  #: (K,) kg
+    housing: NDArray[np.bool_]  #: (K,) whether it is a joint's housing
 
 
 def solids(arm: Arm) -> Solids:
@@ -156,33 +148,19 @@ _POSES = 400  # at which the arm is looked at
 
 @dataclass(frozen=True, eq=False)
 class Motors(Record):
-    """Six geared motors; inertia and friction are given at the joint.
+    """Six geared motors; inertia and friction are given at the joint."""
 
-    Attributes:
-        gear_ratio: (6,) revolutions of the motor for one of the joint.
-        torque_constant: (6,) N m/A, also V s/rad, at the motor.
-        resistance_ohm: (6,) of the winding.
-        rotor_inertia: (6,) kg m^2, of rotor and gear, at the joint.
-        current_max_a: (6,) the driver's own limit.
-        coulomb_nm: (6,) dry friction of motor and gear, N m.
-        viscous: (6,) friction that grows with speed, N m s/rad.
-        bearing_nm: (6,) dry friction of the link's own bearing, N m.
-        brake_nm: (6,) what the brake holds, N m; closed until the board opens it.
-        needed_nm: (6,) torque that the joint needs, N m: of gravity and of its greatest acceleration.
-        gravity_nm: (6,) greatest gravity torque, N m.
-    """
-
-    gear_ratio: Array
-    torque_constant: Array
-    resistance_ohm: Array
-    rotor_inertia: Array
-    current_max_a: Array
-    coulomb_nm: Array
-    viscous: Array
-    bearing_nm: Array
-    brake_nm: Array
-    needed_nm: Array
-    gravity_nm: Array
+    gear_ratio: Array  #: (6,) revolutions of the motor for one of the joint
+    torque_constant: Array  #: (6,) N m/A, also V s/rad, at the motor
+    resistance_ohm: Array  #: (6,) of the winding
+    rotor_inertia: Array  #: (6,) kg m^2, of rotor and gear, at the joint
+    current_max_a: Array  #: (6,) the driver's own limit
+    coulomb_nm: Array  #: (6,) dry friction of motor and gear, N m
+    viscous: Array  #: (6,) friction that grows with speed, N m s/rad
+    bearing_nm: Array  #: (6,) dry friction of the link's own bearing, N m
+    brake_nm: Array  #: (6,) what the brake holds, N m; closed until the board opens it
+    needed_nm: Array  #: (6,) torque that the joint needs, N m: of gravity and of its greatest acceleration
+    gravity_nm: Array  #: (6,) greatest gravity torque, N m
 
     @property
     def stall_nm(self) -> Array:

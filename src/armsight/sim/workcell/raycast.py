@@ -303,17 +303,11 @@ _SAMPLES = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))
 
 @dataclass(frozen=True, eq=False)
 class StillView(Record):
-    """What stands still before a camera.
+    """What stands still before a camera."""
 
-    Attributes:
-        light: (H, W) light on each pixel before the lens.
-        depth: (H, W) distance of the surface, m.
-        ids: (H, W) which surface it is.
-    """
-
-    light: NDArray[np.float32]
-    depth: NDArray[np.float32]
-    ids: Image
+    light: NDArray[np.float32]  #: (H, W) light on each pixel before the lens
+    depth: NDArray[np.float32]  #: (H, W) distance of the surface, m
+    ids: Image  #: (H, W) which surface it is
 
 
 def block(

@@ -169,27 +169,16 @@ _POSES_SIZE_M = (
 
 @dataclass(frozen=True, eq=False)
 class WorkcellTruth(Record):
-    """The true values of a workcell up to now. No estimator gets them.
+    """The true values of a workcell up to now. No estimator gets them."""
 
-    Attributes:
-        arm: the true table.
-        rig: the true cameras; covariance zero.
-        T_base_rig: (4, 4) where the left camera is, m.
-        T_tool_body: (4, 4) where the body is on the tool, m.
-        t_s: (N,) every millisecond since the beginning, s.
-        q: (N, n) true joint angles, rad: of the links, behind backlash and twist.
-        shaft: (N, n) true angles of the gears' shafts, where the potentiometers sit, rad.
-        shot_t_s: name of each shot handed out -> middle of its left exposure, s.
-    """
-
-    arm: Arm
-    rig: StereoRig
-    T_base_rig: Array
-    T_tool_body: Array
-    t_s: Array
-    q: Array
-    shaft: Array
-    shot_t_s: dict[str, float]
+    arm: Arm  #: the true table
+    rig: StereoRig  #: the true cameras; covariance zero
+    T_base_rig: Array  #: (4, 4) where the left camera is, m
+    T_tool_body: Array  #: (4, 4) where the body is on the tool, m
+    t_s: Array  #: (N,) every millisecond since the beginning, s
+    q: Array  #: (N, n) true joint angles, rad: of the links, behind backlash and twist
+    shaft: Array  #: (N, n) true angles of the gears' shafts, where the potentiometers sit, rad
+    shot_t_s: dict[str, float]  #: name of each shot handed out -> middle of its left exposure, s
 
     @cached_property
     def T_base_tool(self) -> Array:

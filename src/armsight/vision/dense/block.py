@@ -95,27 +95,17 @@ def _bits_set(x: np.uint8) -> np.uint8:
 
 
 class StripBuffers(NamedTuple):
-    """The buffers of a strip.
+    """The buffers of a strip."""
 
-    Attributes:
-        raw: one row's costs at one disparity, with the windows' reach to either side.
-        threes: sums of three of them, from each on: windows are made of these.
-        along: (T,) sums along the row.
-        kept: sums along rows: as many rows as a window is high, each (count, T), the oldest replaced by the newest.
-        total: (count, T) sums over windows.
-        least: (T,) least total of each left pixel so far.
-        where: (T,) and at which disparity, from the search's first on.
-        right: (T + pad,) least total of each right pixel so far; pixel u is at u + pad.
-    """
-
-    raw: Bytes
-    threes: Bytes
-    along: Bytes
+    raw: Bytes  #: one row's costs at one disparity, with the windows' reach to either side
+    threes: Bytes  #: sums of three of them, from each on: windows are made of these
+    along: Bytes  #: (T,) sums along the row
+    #: sums along rows: as many rows as a window is high, each (count, T), the oldest replaced by the newest
     kept: Bytes
-    total: Counts
-    least: Counts
-    where: Counts
-    right: Counts
+    total: Counts  #: (count, T) sums over windows
+    least: Counts  #: (T,) least total of each left pixel so far
+    where: Counts  #: (T,) and at which disparity, from the search's first on
+    right: Counts  #: (T + pad,) least total of each right pixel so far; pixel u is at u + pad
 
 
 def make_buffers(width: int, further: int, count: int) -> StripBuffers:

@@ -35,27 +35,16 @@ _RAW_MAX = np.uint8(34)
 
 @kernel_types("u1[:, ::1], u1[:, ::1], u1[:, ::1], u4[:, ::1], u1[:, ::1], u1[:, ::1], u1[:, ::1], u4[:, ::1]")
 class CensusPair(NamedTuple):
-    """A pair as the costs need it; the planes of the right image are mirrored and padded by the search.
+    """A pair as the costs need it; the planes of the right image are mirrored and padded by the search."""
 
-    Attributes:
-        left: (H, W) grey.
-        left_low: (H, W) least grey level within half a pixel to either side.
-        left_high: (H, W) greatest.
-        left_census: (H, W) census words.
-        right: (H, W + pad) grey, mirrored.
-        right_low: (H, W + pad) mirrored.
-        right_high: (H, W + pad) mirrored.
-        right_census: (H, W + pad) mirrored.
-    """
-
-    left: Bytes
-    left_low: Bytes
-    left_high: Bytes
-    left_census: Words32
-    right: Bytes
-    right_low: Bytes
-    right_high: Bytes
-    right_census: Words32
+    left: Bytes  #: (H, W) grey
+    left_low: Bytes  #: (H, W) least grey level within half a pixel to either side
+    left_high: Bytes  #: (H, W) greatest
+    left_census: Words32  #: (H, W) census words
+    right: Bytes  #: (H, W + pad) grey, mirrored
+    right_low: Bytes  #: (H, W + pad) mirrored
+    right_high: Bytes  #: (H, W + pad) mirrored
+    right_census: Words32  #: (H, W + pad) mirrored
 
 
 _ODD, _PAIRS, _NIBBLES, _BYTES = (np.uint32(x) for x in (0x55555555, 0x33333333, 0x0F0F0F0F, 0x01010101))

@@ -36,24 +36,16 @@ Starts = NDArray[np.uintp]
 
 
 class PathBuffers(NamedTuple):
-    """The buffers of one strip of rows.
+    """The buffers of one strip of rows."""
 
-    Attributes:
-        raw: (3 * W * size,) raw costs of three rows.
-        mixed: (W * size,) scratch.
-        arena: slots of path costs, and a row's costs. Slots: two rows of W in three directions each, two pixels of the
-            path along the row, and a start before which there is nothing.
-        least: (6 * W,) least cost of each slot of the first two rows.
-        total: (rows * W * size,) sum over the paths.
-        best_right: (W + pad,) least total of each pixel of the right row, mirrored.
-    """
-
-    raw: Bytes
-    mixed: Bytes
+    raw: Bytes  #: (3 * W * size,) raw costs of three rows
+    mixed: Bytes  #: (W * size,) scratch
+    #: slots of path costs, and a row's costs. Slots: two rows of W in three directions each, two pixels of the path
+    #: along the row, and a start before which there is nothing
     arena: Bytes
-    least: Bytes
-    total: Counts
-    best_right: Counts
+    least: Bytes  #: (6 * W,) least cost of each slot of the first two rows
+    total: Counts  #: (rows * W * size,) sum over the paths
+    best_right: Counts  #: (W + pad,) least total of each pixel of the right row, mirrored
 
 
 @kernel(nogil=True)

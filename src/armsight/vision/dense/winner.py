@@ -53,19 +53,12 @@ NOWHERE = np.uint16(65535)
 
 @kernel_types("f4[:, ::1], b1[:, ::1], f4[:, ::1], f4[:, ::1]")
 class Winners(NamedTuple):
-    """The winning disparity of every pixel of the left image.
+    """The winning disparity of every pixel of the left image."""
 
-    Attributes:
-        disparity: (H, W) px, sub-pixel; the winner even where the images do not agree.
-        agreed: (H, W) whether the right image's choice is the same to one disparity.
-        curvature: (H, W) second difference of the totals at the winner; 0 at the ends of the search.
-        least: (H, W) the winner's total.
-    """
-
-    disparity: Singles
-    agreed: NDArray[np.bool_]
-    curvature: Singles
-    least: Singles
+    disparity: Singles  #: (H, W) px, sub-pixel; the winner even where the images do not agree
+    agreed: NDArray[np.bool_]  #: (H, W) whether the right image's choice is the same to one disparity
+    curvature: Singles  #: (H, W) second difference of the totals at the winner; 0 at the ends of the search
+    least: Singles  #: (H, W) the winner's total
 
 
 def make_winners(height: int, width: int) -> Winners:

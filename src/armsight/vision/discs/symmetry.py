@@ -22,22 +22,15 @@ _LEVER = 3.0
 
 @dataclass(frozen=True, eq=False)
 class Symmetry(Record):
-    """One way to take discs for others.
+    """One way to take discs for others."""
 
-    Attributes:
-        seen: (V,) the discs in view, rows of the body's points.
-        taken_for: (V,) what each may be taken for.
-        T: (4, 4) the motion that maps the former onto the latter, p_taken_for ~ T @ p_seen; of the body's mirror image
-            in z = 0 where ``mirrored``.
-        mirrored: whether it is a reflection.
-        off_m: largest difference of two discs' distance from that of the discs they are taken for, m.
-    """
-
-    seen: Ids
-    taken_for: Ids
+    seen: Ids  #: (V,) the discs in view, rows of the body's points
+    taken_for: Ids  #: (V,) what each may be taken for
+    #: (4, 4) the motion that maps the former onto the latter, p_taken_for ~ T @ p_seen; of the body's mirror image in z
+    #: = 0 where ``mirrored``
     T: Array
-    mirrored: bool
-    off_m: float
+    mirrored: bool  #: whether it is a reflection
+    off_m: float  #: largest difference of two discs' distance from that of the discs they are taken for, m
 
 
 def symmetries(

@@ -43,41 +43,23 @@ _STRANGE = 32.0
     "b1[::1], f8[::1], i8[::1], f8, f8[::1]"
 )
 class DiscScene(NamedTuple):
-    """The quantities that are constant from pair to pair.
+    """The quantities that are constant from pair to pair."""
 
-    Attributes:
-        fisheye: (2,) whether a camera is a fisheye.
-        k: (2, 4) intrinsics.
-        d: (2, 8) distortion.
-        first: (2,) column of a camera's first parameter among the rig's.
-        sizes: (2,) number of a camera's parameters.
-        T_right_left: (4, 4).
-        cov_rig: (P, P) covariance of the rig's parameters.
-        variance: of a centre beyond that of the image, px^2.
-        points: (M, 3) centres of the discs, m.
-        normals: (M, 3) their normals, for the bias.
-        faces: (M,) whether the normal's side is known.
-        radii: (M,) m.
-        signs: (M,) 1 bright, -1 dark.
-        apart_s: standard deviation of the time between the two exposures, s.
-        factors: (2,) by which a camera's variances are multiplied, of its discs' centres.
-    """
-
-    fisheye: NDArray[np.bool_]
-    k: Array
-    d: Array
-    first: NDArray[np.int64]
-    sizes: NDArray[np.int64]
-    T_right_left: Array
-    cov_rig: Array
-    variance: float
-    points: Array
-    normals: Array
-    faces: NDArray[np.bool_]
-    radii: Array
-    signs: NDArray[np.int64]
-    apart_s: float
-    factors: Array
+    fisheye: NDArray[np.bool_]  #: (2,) whether a camera is a fisheye
+    k: Array  #: (2, 4) intrinsics
+    d: Array  #: (2, 8) distortion
+    first: NDArray[np.int64]  #: (2,) column of a camera's first parameter among the rig's
+    sizes: NDArray[np.int64]  #: (2,) number of a camera's parameters
+    T_right_left: Array  #: (4, 4)
+    cov_rig: Array  #: (P, P) covariance of the rig's parameters
+    variance: float  #: of a centre beyond that of the image, px^2
+    points: Array  #: (M, 3) centres of the discs, m
+    normals: Array  #: (M, 3) their normals, for the bias
+    faces: NDArray[np.bool_]  #: (M,) whether the normal's side is known
+    radii: Array  #: (M,) m
+    signs: NDArray[np.int64]  #: (M,) 1 bright, -1 dark
+    apart_s: float  #: standard deviation of the time between the two exposures, s
+    factors: Array  #: (2,) by which a camera's variances are multiplied, of its discs' centres
 
 
 @kernel_types(
@@ -86,49 +68,28 @@ class DiscScene(NamedTuple):
     "f8[:, ::1], f8[:, :, ::1], f8[::1], f8[:, :, ::1]"
 )
 class DiscMeasurement(NamedTuple):
-    """The measurement of one pair; M discs, two cameras.
+    """The measurement of one pair; M discs, two cameras."""
 
-    Attributes:
-        codes: (M, 2) the outcome of each: SEEN, or why it was not.
-        uv: (M, 2, 2) centres of the ellipses, raw px.
-        cov_uv: (M, 2, 2, 2) from the image alone, px^2.
-        shape: (M, 2, 3) ellipses, px^2.
-        predicted: (M, 2, 2) where they were predicted, px.
-        contrast: (M, 2) grey levels, kept from pair to pair; 0 where unknown.
-        residual: (M, 2, 2) of the centres at the pose, px.
-        T: (4, 4) pose T_left_body; the prediction at first.
-        H: (6, 6) information.
-        cov: (6, 6) the share of the rig and of ``common`` in the covariance; the noise's share is the inverse of H.
-        p_left: (M, 3) points, m, of the discs that both cameras saw.
-        cov_p: (M, 3, 3) their covariance from the pixel noise, m^2.
-        by_rig: (M, 3, P) their derivative by the rig.
-        whitened: (4 M,) residuals.
-        J: (4 M, 6) whitened.
-        J_rig: (4 M, P) whitened.
-        bias: (M, 2, 2) centre of ellipse less image of centre, px.
-        squares: (2,) sums of the points' squared distances from the body, m^2, and of the residuals, px^2.
-        common: (2, 2, 3) camera; what may have moved its centres together, as in ``Discs``.
-    """
-
-    codes: NDArray[np.int64]
-    uv: Array
-    cov_uv: Array
-    shape: Array
-    predicted: Array
-    contrast: Array
-    residual: Array
-    T: Array
-    H: Array
+    codes: NDArray[np.int64]  #: (M, 2) the outcome of each: SEEN, or why it was not
+    uv: Array  #: (M, 2, 2) centres of the ellipses, raw px
+    cov_uv: Array  #: (M, 2, 2, 2) from the image alone, px^2
+    shape: Array  #: (M, 2, 3) ellipses, px^2
+    predicted: Array  #: (M, 2, 2) where they were predicted, px
+    contrast: Array  #: (M, 2) grey levels, kept from pair to pair; 0 where unknown
+    residual: Array  #: (M, 2, 2) of the centres at the pose, px
+    T: Array  #: (4, 4) pose T_left_body; the prediction at first
+    H: Array  #: (6, 6) information
+    #: (6, 6) the share of the rig and of ``common`` in the covariance; the noise's share is the inverse of H
     cov: Array
-    p_left: Array
-    cov_p: Array
-    by_rig: Array
-    whitened: Array
-    J: Array
-    J_rig: Array
-    bias: Array
-    squares: Array
-    common: Array
+    p_left: Array  #: (M, 3) points, m, of the discs that both cameras saw
+    cov_p: Array  #: (M, 3, 3) their covariance from the pixel noise, m^2
+    by_rig: Array  #: (M, 3, P) their derivative by the rig
+    whitened: Array  #: (4 M,) residuals
+    J: Array  #: (4 M, 6) whitened
+    J_rig: Array  #: (4 M, P) whitened
+    bias: Array  #: (M, 2, 2) centre of ellipse less image of centre, px
+    squares: Array  #: (2,) sums of the points' squared distances from the body, m^2, and of the residuals, px^2
+    common: Array  #: (2, 2, 3) camera; what may have moved its centres together, as in ``Discs``
 
 
 @kernel

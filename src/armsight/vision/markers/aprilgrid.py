@@ -34,21 +34,13 @@ OFF_GRID = 0.2
 
 @dataclass(frozen=True, eq=False)
 class AprilGrid(Record, CalibrationBoard):
-    """A grid of AprilTags.
+    """A grid of AprilTags."""
 
-    Attributes:
-        columns: tags along x.
-        rows: tags along y.
-        tag_m: side of a tag, m.
-        spacing: gap between tags as a share of their side.
-        first: number of its first tag; the others follow.
-    """
-
-    columns: int
-    rows: int
-    tag_m: float
-    spacing: float
-    first: int = 0
+    columns: int  #: tags along x
+    rows: int  #: tags along y
+    tag_m: float  #: side of a tag, m
+    spacing: float  #: gap between tags as a share of their side
+    first: int = 0  #: number of its first tag; the others follow
 
     form = "aprilgrid:COLUMNSxROWS:TAG:SPACING[:first=ID] (tags; gap as a share of the tag), such as aprilgrid:6x6:88mm:0.3"
 

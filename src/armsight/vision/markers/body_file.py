@@ -37,22 +37,14 @@ _POSE_KEYS = ("position_mm", "normal", "x_axis", "quaternion_wxyz", "euler_zyx_d
 
 @dataclass(frozen=True, eq=False)
 class Marker(Record):
-    """One ``[[markers]]`` entry of a body file.
+    """One ``[[markers]]`` entry of a body file."""
 
-    Attributes:
-        where: file and entry, for messages.
-        name: its name.
-        kind: its kind, the key of its own table.
-        fields: its own table.
-        position: (3,) its position, m, body frame.
-        orientation: what the file gives of its orientation: a subset of normal, x_axis, quaternion_wxyz, euler_zyx_deg.
-    """
-
-    where: str
-    name: str
-    kind: str
-    fields: Mapping[str, Any]
-    position: Array
+    where: str  #: file and entry, for messages
+    name: str  #: its name
+    kind: str  #: its kind, the key of its own table
+    fields: Mapping[str, Any]  #: its own table
+    position: Array  #: (3,) its position, m, body frame
+    #: what the file gives of its orientation: a subset of normal, x_axis, quaternion_wxyz, euler_zyx_deg
     orientation: Mapping[str, Array]
 
     def error(self, what: str) -> InputError:

@@ -44,17 +44,11 @@ _ENDS = ((np.s_[0], np.s_[1]), (np.s_[-1], np.s_[-2]), (np.s_[:, 0], np.s_[:, 1]
 
 @dataclass(frozen=True, eq=False)
 class Chessboard(Record, CalibrationBoard):
-    """A chessboard; its points are the inner corners, row by row.
+    """A chessboard; its points are the inner corners, row by row."""
 
-    Attributes:
-        columns: inner corners along x.
-        rows: inner corners along y.
-        square_m: side of a square, m.
-    """
-
-    columns: int
-    rows: int
-    square_m: float
+    columns: int  #: inner corners along x
+    rows: int  #: inner corners along y
+    square_m: float  #: side of a square, m
 
     form = "chessboard:COLUMNSxROWS:SQUARE (inner corners), such as chessboard:9x6:25mm"
 

@@ -126,17 +126,11 @@ def _each_contrast(image: Grey, theta: Array, sign: int, contrast: Array, hollow
 
 @dataclass(frozen=True, eq=False)
 class Blobs(Record):
-    """Outlines of what may be discs of one polarity, in one image.
+    """Outlines of what may be discs of one polarity, in one image."""
 
-    Attributes:
-        theta: (N, 10) start of a fit: centre (raw px), M (1/px^2), blur (px), contrast, base, gradient.
-        contrast: (N,) contrast at the rim, grey levels, positive.
-        radius_px: (N,) geometric mean of the half axes.
-    """
-
-    theta: Array
-    contrast: Array
-    radius_px: Array
+    theta: Array  #: (N, 10) start of a fit: centre (raw px), M (1/px^2), blur (px), contrast, base, gradient
+    contrast: Array  #: (N,) contrast at the rim, grey levels, positive
+    radius_px: Array  #: (N,) geometric mean of the half axes
 
 
 def find_blobs(image: Grey, bright: bool, dark: bool) -> tuple[Blobs, Blobs]:

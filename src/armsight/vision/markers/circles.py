@@ -70,25 +70,15 @@ POLARITIES = {False: "dark", True: "light"}
 
 @dataclass(frozen=True, eq=False)
 class CircleGrid(Record, CalibrationBoard):
-    """A grid of discs.
+    """A grid of discs."""
 
-    Attributes:
-        columns: discs in a row.
-        rows: rows.
-        pitch_m: distance of the grid's lines, m.
-        staggered: whether every other row is shifted by a pitch.
-        disc_radius_m: radius of a disc, m; None where the spec does not give it.
-        light: whether the discs are light on a dark board; None where the spec does not say.
-        rings: (column, row) of the discs that have a hole.
-    """
-
-    columns: int
-    rows: int
-    pitch_m: float
-    staggered: bool
-    disc_radius_m: float | None = None
-    light: bool | None = None
-    rings: tuple[tuple[int, int], ...] = ()
+    columns: int  #: discs in a row
+    rows: int  #: rows
+    pitch_m: float  #: distance of the grid's lines, m
+    staggered: bool  #: whether every other row is shifted by a pitch
+    disc_radius_m: float | None = None  #: radius of a disc, m; None where the spec does not give it
+    light: bool | None = None  #: whether the discs are light on a dark board; None where the spec does not say
+    rings: tuple[tuple[int, int], ...] = ()  #: (column, row) of the discs that have a hole
 
     form = "circles:COLUMNSxROWS:PITCH[:OPTION...], such as circles:7x6:20mm or circles:7x6:20mm:radius=5mm:light"
     staggered_form = "acircles:COLUMNSxROWS:PITCH[:OPTION...] (staggered), such as acircles:4x11:20mm"

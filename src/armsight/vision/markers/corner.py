@@ -210,21 +210,15 @@ _KEPT, _BORDER, _DIVERGED, _MOVED, _FAINT, _MISFIT = range(6)
 
 @dataclass(frozen=True, eq=False)
 class CornerFits(Record):
-    """The fit of each corner.
+    """The fit of each corner."""
 
-    Attributes:
-        models: (N, 10) the model's parameters: c (2), the angles of the edges' normals (2), squared blurs (2), a, b, k
-            (2).
-        cov_uv: (N, 2, 2) covariance from each fit's own residuals; from those of all, what part of them can move a corner,
-            and the correlation of neighbours, px^2.
-        residual: (N,) standard deviation of the residuals at the edges, grey levels.
-        outcome: (N,) index into OUTCOMES; 0 is kept.
-    """
-
+    #: (N, 10) the model's parameters: c (2), the angles of the edges' normals (2), squared blurs (2), a, b, k (2)
     models: Array
+    #: (N, 2, 2) covariance from each fit's own residuals; from those of all, what part of them can move a corner, and
+    #: the correlation of neighbours, px^2
     cov_uv: Array
-    residual: Array
-    outcome: Ids
+    residual: Array  #: (N,) standard deviation of the residuals at the edges, grey levels
+    outcome: Ids  #: (N,) index into OUTCOMES; 0 is kept
 
     @property
     def uv(self) -> Array:

@@ -24,7 +24,6 @@ class Target(Protocol):
     @property
     def body(self) -> Body:
         """The points that can be found and their positions, m, body frame."""
-        ...
 
     @property
     def symmetries(self) -> tuple[Ids, ...]:
@@ -55,7 +54,6 @@ class Target(Protocol):
             The points found: rows of ``body.points``, raw pixels ((0, 0) is the centre of the top-left pixel), and the
             covariance that the image itself supports. Nothing found is ``Detections.none(reason)``, never an exception.
         """
-        ...
 
 
 def detect_parts(image: Image, parts: Iterable[tuple[str, Target]], nothing: str = "") -> Detections:

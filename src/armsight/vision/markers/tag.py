@@ -29,21 +29,13 @@ CORNERS = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0,
 
 @dataclass(frozen=True, eq=False)
 class Tag(Record):
-    """One marker on a body.
+    """One marker on a body."""
 
-    Attributes:
-        name: what its corners are named after.
-        family: a name of :data:`~armsight.vision.markers.aruco.FAMILIES`, or AprilTag 3's.
-        identity: its number in the family.
-        size_m: side of its dark outline, of AprilTag 3's families that of the square where the rings meet, m.
-        T_body_tag: (4, 4) its pose on the body, m.
-    """
-
-    name: str
-    family: str
-    identity: int
-    size_m: float
-    T_body_tag: Array
+    name: str  #: what its corners are named after
+    family: str  #: a name of :data:`~armsight.vision.markers.aruco.FAMILIES`, or AprilTag 3's.
+    identity: int  #: its number in the family
+    size_m: float  #: side of its dark outline, of AprilTag 3's families that of the square where the rings meet, m
+    T_body_tag: Array  #: (4, 4) its pose on the body, m
 
 
 @dataclass(frozen=True, eq=False)

@@ -107,23 +107,14 @@ _SOUND = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Arrow(Record):
-    """Normal equations of Q shared parameters and K own ones of each of S shots.
+    """Normal equations of Q shared parameters and K own ones of each of S shots."""
 
-    Attributes:
-        H_shared: (Q, Q) information of the shared parameters.
-        H_cross: (S, K, Q) what couples them with every shot's own.
-        H_shots: (S, K, K) information of every shot's own parameters.
-        g_shared: (Q,) downhill gradient.
-        g_shots: (S, K) downhill gradient.
-        cost: what is minimised.
-    """
-
-    H_shared: Array
-    H_cross: Array
-    H_shots: Array
-    g_shared: Array
-    g_shots: Array
-    cost: float
+    H_shared: Array  #: (Q, Q) information of the shared parameters
+    H_cross: Array  #: (S, K, Q) what couples them with every shot's own
+    H_shots: Array  #: (S, K, K) information of every shot's own parameters
+    g_shared: Array  #: (Q,) downhill gradient
+    g_shots: Array  #: (S, K) downhill gradient
+    cost: float  #: what is minimised
 
     def step(self, damping: float) -> tuple[Array, Array]:
         """Solve for the shared step (Q,) and the shots' steps (S, K) with Marquardt's damping."""
@@ -214,27 +205,16 @@ def _robust_excess() -> float:
 
 @dataclass(frozen=True, eq=False)
 class BundleSolution(Record):
-    """A minimum of bundle adjustment.
+    """A minimum of bundle adjustment."""
 
-    Attributes:
-        state: the estimate.
-        residuals_px: (N, 2) detection minus projection.
-        sigma_px: standard deviation of a detection beyond its image covariance, px.
-        cov_shared: (Q, Q) covariance of all shared parameters, zero rows for what was held fixed, or (0, 0).
-        cost: robust cost.
-        steps: iterations used.
-        converged: whether it is a minimum; False where the last step that was allowed still lowered the cost.
-        cov_motions: (S, 6, 6) covariance of the motions, or (0, 6, 6).
-    """
-
-    state: BundleState
-    residuals_px: Array
-    sigma_px: float
-    cov_shared: Array
-    cost: float
-    steps: int
-    converged: bool
-    cov_motions: Array
+    state: BundleState  #: the estimate
+    residuals_px: Array  #: (N, 2) detection minus projection
+    sigma_px: float  #: standard deviation of a detection beyond its image covariance, px
+    cov_shared: Array  #: (Q, Q) covariance of all shared parameters, zero rows for what was held fixed, or (0, 0)
+    cost: float  #: robust cost
+    steps: int  #: iterations used
+    converged: bool  #: whether it is a minimum; False where the last step that was allowed still lowered the cost
+    cov_motions: Array  #: (S, 6, 6) covariance of the motions, or (0, 6, 6)
 
 
 def whiteners(observations: Observations, sigma_px: float) -> Array:

@@ -60,17 +60,11 @@ def _poses(rotations: Sequence[NDArray[Any]], translations: Sequence[NDArray[Any
 
 @dataclass(frozen=True, eq=False)
 class Candidate(Record):
-    """A pose that some of one camera's detections agree on.
+    """A pose that some of one camera's detections agree on."""
 
-    Attributes:
-        T_camera_body: (4, 4) the pose.
-        rows: (K,) the detections that agree, each of another point.
-        rms_px: their RMS distance from the projections.
-    """
-
-    T_camera_body: Array
-    rows: Ids
-    rms_px: float
+    T_camera_body: Array  #: (4, 4) the pose
+    rows: Ids  #: (K,) the detections that agree, each of another point
+    rms_px: float  #: their RMS distance from the projections
 
 
 #: A detection agrees with a pose within this share of the body's apparent size, and at least so many px: wide, for the

@@ -24,19 +24,12 @@ _DONE = 1e-8  # relative decrease of the cost
 
 @dataclass(frozen=True, eq=False)
 class PixelObservations(Record):
-    """Detections of one body in one shot, one row each.
+    """Detections of one body in one shot, one row each."""
 
-    Attributes:
-        camera: (N,) 0 left, 1 right.
-        point: (N,) row of the body's points.
-        uv: (N, 2) raw pixels.
-        cov_uv: (N, 2, 2) their covariance, px^2, positive definite.
-    """
-
-    camera: Ids
-    point: Ids
-    uv: Array
-    cov_uv: Array
+    camera: Ids  #: (N,) 0 left, 1 right
+    point: Ids  #: (N,) row of the body's points
+    uv: Array  #: (N, 2) raw pixels
+    cov_uv: Array  #: (N, 2, 2) their covariance, px^2, positive definite
 
     @staticmethod
     def of(seen: Correspondences, sigma_px: float) -> PixelObservations:
@@ -52,21 +45,13 @@ class PixelObservations(Record):
 
 @dataclass(frozen=True, eq=False)
 class PoseFit(Record):
-    """The minimum of a pose fit.
+    """The minimum of a pose fit."""
 
-    Attributes:
-        T_left_body: (4, 4) the pose.
-        residuals_px: (N, 2) detection minus projection.
-        distance2: (N,) squared distance in standard deviations.
-        information: (6, 6) of the tangent [translation m; rotation rad], perturbation on the right.
-        cost: the minimum: the sum of the squared distances, or their Cauchy loss.
-    """
-
-    T_left_body: Array
-    residuals_px: Array
-    distance2: Array
-    information: Array
-    cost: float
+    T_left_body: Array  #: (4, 4) the pose
+    residuals_px: Array  #: (N, 2) detection minus projection
+    distance2: Array  #: (N,) squared distance in standard deviations
+    information: Array  #: (6, 6) of the tangent [translation m; rotation rad], perturbation on the right
+    cost: float  #: the minimum: the sum of the squared distances, or their Cauchy loss
 
 
 def fit_pose(

@@ -155,24 +155,15 @@ class PoseDerivatives(Record):
     """How the measured pose of a body follows from its N pixel positions, weighted alike.
 
     Tangents are [translation m; rotation rad], perturbation on the right.
-
-    Attributes:
-        side: (N,) 0 left, 1 right.
-        point: (N,) row of the body's points.
-        uv: (N, 2) the projections, raw pixels.
-        by_uv: (6, N, 2) derivative of the pose by the pixels.
-        by_rig: (6, P) by the rig's parameters: what the pose is off by where they are.
-        by_point: (6, M, 3) by the true positions of the body's points, the body's file unchanged.
-        uv_by_pose: (N, 2, 6) derivative of the pixels by the pose.
     """
 
-    side: Ids
-    point: Ids
-    uv: Array
-    by_uv: Array
-    by_rig: Array
-    by_point: Array
-    uv_by_pose: Array
+    side: Ids  #: (N,) 0 left, 1 right
+    point: Ids  #: (N,) row of the body's points
+    uv: Array  #: (N, 2) the projections, raw pixels
+    by_uv: Array  #: (6, N, 2) derivative of the pose by the pixels
+    by_rig: Array  #: (6, P) by the rig's parameters: what the pose is off by where they are
+    by_point: Array  #: (6, M, 3) by the true positions of the body's points, the body's file unchanged
+    uv_by_pose: Array  #: (N, 2, 6) derivative of the pixels by the pose
 
     def noise(self, sigma_px: float) -> Array:
         """Return the covariance (6, 6) that pixels of so many px standard deviation cause."""

@@ -60,23 +60,14 @@ def smooth(points: Array, degree: int) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Observations(Record):
-    """Detections of one body over many shots, one row each, sorted by shot.
+    """Detections of one body over many shots, one row each, sorted by shot."""
 
-    Attributes:
-        shot: (N,) row of the shot.
-        camera: (N,) 0 left, 1 right.
-        point: (N,) row of the body's points.
-        uv: (N, 2) raw pixels.
-        cov_uv: (N, 2, 2) covariance the image supports, px^2.
-        shot_count: how many shots there are.
-    """
-
-    shot: Ids
-    camera: Ids
-    point: Ids
-    uv: Array
-    cov_uv: Array
-    shot_count: int
+    shot: Ids  #: (N,) row of the shot
+    camera: Ids  #: (N,) 0 left, 1 right
+    point: Ids  #: (N,) row of the body's points
+    uv: Array  #: (N, 2) raw pixels
+    cov_uv: Array  #: (N, 2, 2) covariance the image supports, px^2
+    shot_count: int  #: how many shots there are
 
     @staticmethod
     def from_shots(shots: list[Correspondences]) -> Observations:
@@ -111,21 +102,14 @@ def _still() -> Array:
 
 @dataclass(frozen=True, eq=False)
 class BundleState(Record):
-    """The state that bundle adjustment estimates.
+    """The state that bundle adjustment estimates."""
 
-    Attributes:
-        cameras: left and right.
-        T_left_right: (4, 4) pose of the right camera in the left one's frame.
-        Ts_left_body: (S, 4, 4) pose of the body in every shot.
-        shape: (K,) coordinates of the body's shape along its modes, m.
-        motions: (S, 6) motion of the body from the left exposure to the right one, in its own frame: translation of its
-            middle, m, and the rotation vector about it, rad; (0, 6) where it stood still.
-    """
-
-    cameras: tuple[Camera, Camera]
-    T_left_right: Array
-    Ts_left_body: Array
-    shape: Array
+    cameras: tuple[Camera, Camera]  #: left and right
+    T_left_right: Array  #: (4, 4) pose of the right camera in the left one's frame
+    Ts_left_body: Array  #: (S, 4, 4) pose of the body in every shot
+    shape: Array  #: (K,) coordinates of the body's shape along its modes, m
+    #: (S, 6) motion of the body from the left exposure to the right one, in its own frame: translation of its middle,
+    #: m, and the rotation vector about it, rad; (0, 6) where it stood still
     motions: Array = field(default_factory=_still)
 
 
@@ -135,23 +119,17 @@ class BundleModel(Record):
 
     The shared parameters are: left intrinsics and distortion, right intrinsics and distortion, the tangent of
     T_left_right, and the shape.
-
-    Attributes:
-        points: (M, 3) nominal points of the body, m.
-        modes: (K, M, 3) shape modes: the body is ``points + shape @ modes``.
-        shape_sigma_m: standard deviation of every shape coordinate before any image, m.
-        free_cameras: whether intrinsics and distortion are estimated.
-        motion_sigmas: (S, 6) standard deviation of every shot's motion between the exposures before any image, m and
-            rad, as in :class:`BundleState`; (0, 6) where the body stands still.
-        disc_radius_m: radius of the discs in the plane z = 0 of which the points are the middles and the centres of their
-            ellipses are observed, m; 0 where the points themselves are.
     """
 
-    points: Array
-    modes: Array
-    shape_sigma_m: float
-    free_cameras: bool
+    points: Array  #: (M, 3) nominal points of the body, m
+    modes: Array  #: (K, M, 3) shape modes: the body is ``points + shape @ modes``
+    shape_sigma_m: float  #: standard deviation of every shape coordinate before any image, m
+    free_cameras: bool  #: whether intrinsics and distortion are estimated
+    #: (S, 6) standard deviation of every shot's motion between the exposures before any image, m and rad, as in
+    #: :class:`BundleState`; (0, 6) where the body stands still
     motion_sigmas: Array = field(default_factory=_still)
+    #: radius of the discs in the plane z = 0 of which the points are the middles and the centres of their ellipses are
+    #: observed, m; 0 where the points themselves are
     disc_radius_m: float = 0.0
 
     def body(self, shape: Array) -> Array:

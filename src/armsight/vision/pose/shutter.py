@@ -70,19 +70,12 @@ class TimedShot(Record):
 
 @dataclass(frozen=True, eq=False)
 class Motion(Record):
-    """The motion of a body about the time of a shot: exp(twist t + acceleration t^2 / 2), in its own axes.
+    """The motion of a body about the time of a shot: exp(twist t + acceleration t^2 / 2), in its own axes."""
 
-    Attributes:
-        twist: (6,) velocity, m/s and rad/s.
-        acceleration: (6,) m/s^2 and rad/s^2.
-        cov: (6, 6) covariance of the twist.
-        centred: whether shots on both sides were there.
-    """
-
-    twist: Array
-    acceleration: Array
-    cov: Array
-    centred: bool
+    twist: Array  #: (6,) velocity, m/s and rad/s
+    acceleration: Array  #: (6,) m/s^2 and rad/s^2
+    cov: Array  #: (6, 6) covariance of the twist
+    centred: bool  #: whether shots on both sides were there
 
 
 def motions(t_s: Array, Ts: Array, covs: Array) -> list[Motion | None]:
@@ -241,19 +234,13 @@ def _birge(scores: Array, H: Array) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Scored(Record):
-    """What the N observations of one shot add to the score.
+    """What the N observations of one shot add to the score."""
 
-    Attributes:
-        row: (N,) 2 point + camera.
-        residual: (N, 2) whitened residuals, weighted.
-        by: (N, 2, 2) whitened derivatives by skew and readout, less what a wrong pose and the shot's own skew explain.
-        weight: (N,) of robust loss, 1 for a residual of zero.
-    """
-
-    row: Ids
-    residual: Array
+    row: Ids  #: (N,) 2 point + camera
+    residual: Array  #: (N, 2) whitened residuals, weighted
+    #: (N, 2, 2) whitened derivatives by skew and readout, less what a wrong pose and the shot's own skew explain
     by: Array
-    weight: Array
+    weight: Array  #: (N,) of robust loss, 1 for a residual of zero
 
 
 def _scored(
@@ -537,19 +524,12 @@ def _score(
 
 @dataclass(frozen=True, eq=False)
 class Alignment(Record):
-    """How the observations of one shot come to its time.
+    """How the observations of one shot come to its time."""
 
-    Attributes:
-        T_left_body: (4, 4) pose at the shot's time.
-        motion: of the body; None where too few neighbours show it.
-        apart_s: by how much the right exposure is later than the left, beyond the mean skew, s.
-        variance: what is not known of it, s^2.
-    """
-
-    T_left_body: Array
-    motion: Motion | None
-    apart_s: float
-    variance: float
+    T_left_body: Array  #: (4, 4) pose at the shot's time
+    motion: Motion | None  #: of the body; None where too few neighbours show it
+    apart_s: float  #: by how much the right exposure is later than the left, beyond the mean skew, s
+    variance: float  #: what is not known of it, s^2
 
 
 def aligned(rig: StereoRig, body: Body, shots: Sequence[TimedShot], shutters: Shutters) -> list[Alignment]:
