@@ -34,27 +34,17 @@ _ASIDE = 0.2
 
 @dataclass(frozen=True, eq=False)
 class Rectification(Record):
-    """The rectification of a rig's images.
+    """The rectification of a rig's images."""
 
-    Attributes:
-        rig: the rig.
-        image_size_px: (width, height) of both rectified images.
-        focal_px: f, of both.
-        principal_px: (column, row) of the principal point, of both.
-        T_left_rectleft: (4, 4) a rotation, from the rectified to the raw left camera.
-        T_right_rectright: (4, 4) a rotation, the same of the right camera.
-        map_left: (H, W, 2) the raw pixel that each rectified pixel shows; NaN where the camera sees nothing.
-        map_right: the same of the right image.
-    """
-
-    rig: StereoRig
-    image_size_px: tuple[int, int]
-    focal_px: float
-    principal_px: tuple[float, float]
-    T_left_rectleft: Array
-    T_right_rectright: Array
+    rig: StereoRig  #: the rig
+    image_size_px: tuple[int, int]  #: (width, height) of both rectified images
+    focal_px: float  #: f, of both
+    principal_px: tuple[float, float]  #: (column, row) of the principal point, of both
+    T_left_rectleft: Array  #: (4, 4) a rotation, from the rectified to the raw left camera
+    T_right_rectright: Array  #: (4, 4) a rotation, the same of the right camera
+    #: (H, W, 2) the raw pixel that each rectified pixel shows; NaN where the camera sees nothing
     map_left: NDArray[np.float32]
-    map_right: NDArray[np.float32]
+    map_right: NDArray[np.float32]  #: the same of the right image
 
     def images(self, left: Image, right: Image) -> tuple[Image, Image]:
         """Rectify a pair of raw images; where a camera sees nothing they are black.

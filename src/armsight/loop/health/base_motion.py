@@ -76,17 +76,11 @@ class Measurements:
 
 
 class Moved(NamedTuple):
-    """A motion of the rig: what was measured is exp(xi) times the true pose of the tool, in the base's frame.
+    """A motion of the rig: what was measured is exp(xi) times the true pose of the tool, in the base's frame."""
 
-    Attributes:
-        xi: (6,) tangent [m; rad].
-        cov: (6, 6) its covariance.
-        Ts_base_tool: poses (4, 4) of the tool that the arm visited, the newest last.
-    """
-
-    xi: Array
-    cov: Array
-    Ts_base_tool: tuple[Array, ...]
+    xi: Array  #: (6,) tangent [m; rad]
+    cov: Array  #: (6, 6) its covariance
+    Ts_base_tool: tuple[Array, ...]  #: poses (4, 4) of the tool that the arm visited, the newest last
 
     def at(self, T_base_tool: Array) -> tuple[Array, Array]:
         """Return what it does to a measured pose of the tool (4, 4): right tangent (6,), covariance."""

@@ -114,19 +114,14 @@ def thinned(times_s: Sequence[float], now_s: float, all_s: float, ratio: float) 
 
 @dataclass(frozen=True)
 class Suspect:
-    """Something that may change.
+    """Something that may change."""
 
-    Attributes:
-        kind: rig: it jumped; drift: it drifts; body: it slipped on the tool; bend: it bends under gravity; joint: its zero
-            jumped; backlash: it grew; time: the camera's clock jumped; rate: it runs at another rate; zoom: both focal
-            lengths changed alike; shake: rig and arm move to and fro.
-        joint: row of the joint; -1 for what is not of one.
-        columns: its parameters among those that may change.
-    """
-
+    #: rig: it jumped; drift: it drifts; body: it slipped on the tool; bend: it bends under gravity; joint: its zero
+    #: jumped; backlash: it grew; time: the camera's clock jumped; rate: it runs at another rate; zoom: both focal
+    #: lengths changed alike; shake: rig and arm move to and fro
     kind: Kind
-    joint: int
-    columns: slice
+    joint: int  #: row of the joint; -1 for what is not of one
+    columns: slice  #: its parameters among those that may change
 
     @property
     def cause(self) -> Cause:
@@ -168,33 +163,21 @@ def suspects(joints: int) -> tuple[Suspect, ...]:
 
 @dataclass(frozen=True, eq=False)
 class Change(Record):
-    """A hypothesis: something changed, by so much.
-
-    Attributes:
-        end_s: time of the newest measurement that was used, s.
-        size: (D,) by how much: tangent of base or tool [m; rad], an angle, rad, or a time, s; of a ramp so far.
-        cov: (D, D) its covariance.
-        chi_square: of the change against none.
-        score: chi-square less what its parameters explain by chance: twice the logarithm of a likelihood, beyond a limit.
-        effect: (6, D) what a unit of it does to the newest measured pose of the tool, right tangent.
-        T_base_tool: (4, 4) that pose.
-        until_s: when it was put right, s.
-        besides: whether it is taken to have happened besides the best one, at another time.
-        seen: who sees the tool; None where that is not known.
-    """
+    """A hypothesis: something changed, by so much."""
 
     suspect: Suspect
     begin_s: float
-    end_s: float
-    size: Array
-    cov: Array
-    chi_square: float
+    end_s: float  #: time of the newest measurement that was used, s
+    size: Array  #: (D,) by how much: tangent of base or tool [m; rad], an angle, rad, or a time, s; of a ramp so far
+    cov: Array  #: (D, D) its covariance
+    chi_square: float  #: of the change against none
+    #: chi-square less what its parameters explain by chance: twice the logarithm of a likelihood, beyond a limit
     score: float
-    effect: Array
-    T_base_tool: Array
-    until_s: float = np.inf
-    besides: bool = False
-    seen: ToolView | None = None
+    effect: Array  #: (6, D) what a unit of it does to the newest measured pose of the tool, right tangent
+    T_base_tool: Array  #: (4, 4) that pose
+    until_s: float = np.inf  #: when it was put right, s
+    besides: bool = False  #: whether it is taken to have happened besides the best one, at another time
+    seen: ToolView | None = None  #: who sees the tool; None where that is not known
 
     def displacement(self, T_base_tool: Array, t_s: float) -> tuple[Array, Array]:
         """Return what it does to a measured pose of the tool (4, 4) at a time, s: right tangent (6,), covariance."""

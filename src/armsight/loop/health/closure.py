@@ -133,12 +133,6 @@ class ClosureWatch:
         sigmas: (K,) standard deviations of the filter's state before anything was measured.
         joints: how many the arm has.
         seen: who sees the tool; None where that is not known.
-
-    Attributes:
-        changes: the hypotheses that explain best what was found, the best first; empty while all is well.
-        explained: the same by the newest test, also where it is smaller than is reported: what another test reports.
-        certain: of these what is as certain as what is reported at first: poses are widened by it.
-        strongest: of all tests the largest chi-square over its limit.
     """
 
     def __init__(self, sigmas: Array, joints: int, seen: ToolView | None = None) -> None:
@@ -156,10 +150,13 @@ class ClosureWatch:
         self._wide = widths(joints)
         self._cov, self._unsure = np.diag(_BLOCK_SIGMA**2), _unsure(joints, int(_BLOCKS))
         self._clear()
+        #: the hypotheses that explain best what was found, the best first; empty while all is well
         self.changes: tuple[Change, ...] = ()
+        #: the same by the newest test, also where it is smaller than is reported: what another test reports
         self.explained: tuple[Change, ...] = ()
+        #: of these what is as certain as what is reported at first: poses are widened by it
         self.certain: tuple[Change, ...] = ()
-        self.strongest = 0.0
+        self.strongest = 0.0  #: of all tests the largest chi-square over its limit
 
     def _clear(self) -> None:
         size = len(self._model)

@@ -68,10 +68,6 @@ class FixedWatch:
 
     Args:
         joints: how many the arm has.
-
-    Attributes:
-        changes: the hypotheses of the test that found the clearest change, the best first; empty where none was found.
-        reopened: how many times the estimator dropped what it had learned, and when it first did, s.
     """
 
     def __init__(self, joints: int) -> None:
@@ -95,7 +91,9 @@ class FixedWatch:
         ] = []  # since the newest beginning, each so long after the one before, s
         self._newest: Innovation | None = None
         self._last_s = -np.inf
+        #: the hypotheses of the test that found the clearest change, the best first; empty where none was found
         self.changes: tuple[Change, ...] = ()
+        #: how many times the estimator dropped what it had learned, and when it first did, s
         self.reopened: tuple[int, float] = (0, np.inf)
 
     def _of(self, suspect: Suspect) -> Ids:

@@ -56,29 +56,20 @@ Poses = Callable[[], Sequence[tuple[float, PoseEstimate]]]
 
 @dataclass(frozen=True, eq=False)
 class RigCorrection(Record):
-    """Something of a rig that was put right.
+    """Something of a rig that was put right."""
 
-    Attributes:
-        what: cameras: the right camera's pose in the left one; base: the rig's pose in the base of the arm.
-        since_s: since when it was wrong, s on the clock of the shots.
-        at_s: from when on poses are measured with it, s.
-        by: what showed it: body, arm, fixed bodies.
-        update: of the cameras; None of the base.
-        motion: (6,) right tangent from the old pose of the rig in the base to the new one, [m; rad]; zero of the cameras.
-        cov: (6, 6) its covariance.
-        tool_m: by how much that displaced the measured tool, where this is what the arm's poses show, and its sigma, m.
-        refines: the correction of the same motion that this one replaces.
-    """
-
+    #: cameras: the right camera's pose in the left one; base: the rig's pose in the base of the arm
     what: Literal["cameras", "base"]
-    since_s: float
-    at_s: float
-    by: Literal["body", "arm", "fixed bodies"]
-    update: RigUpdate | None
+    since_s: float  #: since when it was wrong, s on the clock of the shots
+    at_s: float  #: from when on poses are measured with it, s
+    by: Literal["body", "arm", "fixed bodies"]  #: what showed it: body, arm, fixed bodies
+    update: RigUpdate | None  #: of the cameras; None of the base
+    #: (6,) right tangent from the old pose of the rig in the base to the new one, [m; rad]; zero of the cameras
     motion: Array
-    cov: Array
+    cov: Array  #: (6, 6) its covariance
+    #: by how much that displaced the measured tool, where this is what the arm's poses show, and its sigma, m
     tool_m: tuple[float, float] | None = None
-    refines: RigCorrection | None = None
+    refines: RigCorrection | None = None  #: the correction of the same motion that this one replaces
 
     @property
     def cause(self) -> Cause:
@@ -142,11 +133,7 @@ def correction_lines(corrections: Sequence[RigCorrection], rejected: str | None)
 
 
 class RigFollower:
-    """Decides when a rig can be put right, and by how much.
-
-    Attributes:
-        rejected: why what was found is not put right yet; None where nothing was found, or all was put right.
-    """
+    """Decides when a rig can be put right, and by how much."""
 
     def __init__(self, rig: StereoRig, body: Body) -> None:
         self._rig, self._body = rig, body
@@ -154,6 +141,7 @@ class RigFollower:
         # What estimates a motion of the rig by the arm, and how it was put right with it.
         self._motion: BaseMotion | None = None
         self._put_right: RigCorrection | None = None
+        #: why what was found is not put right yet; None where nothing was found, or all was put right
         self.rejected: str | None = None
 
     def look(

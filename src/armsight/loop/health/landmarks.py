@@ -36,19 +36,15 @@ _LEAST_M = 1e-4
 
 @dataclass
 class _Landmark:
-    """A fixed body.
-
-    Attributes:
-        reference: (6,) mean tangent of the first poses from that; None before there are enough.
-        tangents: those of the mean that is being made, and when the first of them was seen, s.
-        newest: (6,) tangent of the newest mean from the reference, its covariance (6, 6), and since when it is, s.
-    """
+    """A fixed body."""
 
     name: str
     T_left_body: Array | None = None
-    reference: Array | None = None
+    reference: Array | None = None  #: (6,) mean tangent of the first poses from that; None before there are enough
+    #: those of the mean that is being made, and when the first of them was seen, s
     tangents: list[Array] = field(default_factory=list)
     begin_s: float | None = None
+    #: (6,) tangent of the newest mean from the reference, its covariance (6, 6), and since when it is, s
     newest: tuple[Array, Array, float | None] | None = None
 
     def motion(self) -> tuple[Array, Array]:
@@ -80,23 +76,17 @@ _PATIENCE = 4
 
 
 class LandmarkWatch:
-    """Watches the poses of fixed bodies.
-
-    Attributes:
-        cameras_moved: whether the cameras were found to have moved.
-        of_cameras: what says so, or that they may have; None where nothing does.
-        not_fixed: bodies that are not fixed, as others prove.
-        motion: (6,) motion of the cameras, right tangent in the left one's frame, with covariance (6, 6), once two tests in
-            a row agree on it: the mean of a test may hold poses from before.
-    """
+    """Watches the poses of fixed bodies."""
 
     def __init__(self, names: Sequence[str]) -> None:
         self._landmarks = [_Landmark(name) for name in names]
-        self.not_fixed: tuple[HealthFinding, ...] = ()
+        self.not_fixed: tuple[HealthFinding, ...] = ()  #: bodies that are not fixed, as others prove
         self._fresh: set[int] = set()  # bodies with a new mean since the last test
         self._waited = 0
-        self.cameras_moved = False
-        self.of_cameras: HealthFinding | None = None
+        self.cameras_moved = False  #: whether the cameras were found to have moved
+        self.of_cameras: HealthFinding | None = None  #: what says so, or that they may have; None where nothing does
+        #: (6,) motion of the cameras, right tangent in the left one's frame, with covariance (6, 6), once two tests in
+        #: a row agree on it: the mean of a test may hold poses from before
         self.motion: tuple[Array, Array] | None = None
         self._common: tuple[Array, Array] | None = None
 

@@ -88,24 +88,16 @@ Staying = Callable[[ResidualSums, float, bool], float]
 
 @dataclass(frozen=True)
 class Apart:
-    """How the exposures of the shots of a test are apart.
+    """How the exposures of the shots of a test are apart."""
 
-    Attributes:
-        apart_s: standard deviation of the times that each shot has of its own, s.
-        rms_s: RMS of the times by which the right camera is late, s.
-        gained: sum of squares that all explain.
-        occam: twice the logarithm of what chance explains with them.
-        shared_s: (4,) what all shots share: by how much the right camera is late, the last row of the right and of the left
-            one against the middle, s; and what the first lacks of an acceleration.
-        information: (4, 4) inverse of its covariance.
-    """
-
-    apart_s: float
-    rms_s: float
-    gained: float
-    occam: float
+    apart_s: float  #: standard deviation of the times that each shot has of its own, s
+    rms_s: float  #: RMS of the times by which the right camera is late, s
+    gained: float  #: sum of squares that all explain
+    occam: float  #: twice the logarithm of what chance explains with them
+    #: (4,) what all shots share: by how much the right camera is late, the last row of the right and of the left one
+    #: against the middle, s; and what the first lacks of an acceleration
     shared_s: Array
-    information: Array
+    information: Array  #: (4, 4) inverse of its covariance
 
 
 def _normal(shots: Sequence[tuple[Array, Array, float]]) -> tuple[Array, Array, Array]:
@@ -200,20 +192,14 @@ class Times(NamedTuple):
 
 @dataclass(frozen=True)
 class _Doubtful:
-    """A test that something other than chance explains.
-
-    Attributes:
-        times: of exposure; None where those are not known.
-        focal_share: the focal length's change in it, as a share, everything else right.
-        counted: what passes, as it was counted last; None where that is what stays.
-    """
+    """A test that something other than chance explains."""
 
     every: ResidualSums
     rests: dict[Passes, _Rest]
-    times: Times | None
-    focal_share: float
+    times: Times | None  #: of exposure; None where those are not known
+    focal_share: float  #: the focal length's change in it, as a share, everything else right
     swing: Swing | None = None
-    counted: Passes | None = None
+    counted: Passes | None = None  #: what passes, as it was counted last; None where that is what stays
 
     @classmethod
     def of(cls, every: ResidualSums, size: int, times: Times | None, nods: Nods | None) -> _Doubtful:
@@ -277,19 +263,12 @@ def _without(
 
 
 class _Weighed(NamedTuple):
-    """What doubtful tests say, all together.
+    """What doubtful tests say, all together."""
 
-    Attributes:
-        excess: the variance of their noise, over what is expected.
-        stays: log-evidence of what stays.
-        explained: of each cause that passes, its log-evidence alone.
-        ahead: by how much it explains more than what stays does, which may have happened besides.
-    """
-
-    excess: float
-    stays: float
-    explained: dict[Passes, float]
-    ahead: dict[Passes, float]
+    excess: float  #: the variance of their noise, over what is expected
+    stays: float  #: log-evidence of what stays
+    explained: dict[Passes, float]  #: of each cause that passes, its log-evidence alone
+    ahead: dict[Passes, float]  #: by how much it explains more than what stays does, which may have happened besides
 
     @classmethod
     def of(cls, tests: Sequence[_Doubtful], stays: Staying, size: int) -> _Weighed:

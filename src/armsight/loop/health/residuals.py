@@ -87,20 +87,16 @@ def differ(T: Array, other: Array) -> bool:
 
 
 class ExposedShot(NamedTuple):
-    """By how much the times of exposure move the residuals of a shot.
+    """By how much the times of exposure move the residuals of a shot."""
 
-    Attributes:
-        A: (n, 6) derivative of the residuals by the pose, in standard deviations; rows u, v of the left image and of the
-            right one, point by point.
-        roll: (n,) the row of the image, from -1 at its top to 1.
-        track: times, s, and poses T_left_body (4, 4) of the newest shots up to this one.
-        own: (n, K) what is not known of these times, where the detections were moved to one, does to the residuals, by a
-            sigma each; K is 0 else.
-    """
-
+    #: (n, 6) derivative of the residuals by the pose, in standard deviations; rows u, v of the left image and of the
+    #: right one, point by point
     A: Array
-    roll: Array
+    roll: Array  #: (n,) the row of the image, from -1 at its top to 1
+    #: times, s, and poses T_left_body (4, 4) of the newest shots up to this one
     track: tuple[tuple[float, Array], ...]
+    #: (n, K) what is not known of these times, where the detections were moved to one, does to the residuals, by a
+    #: sigma each; K is 0 else
     own: Array
 
     def of(self, rows: NDArray[np.bool_]) -> ExposedShot:
@@ -145,21 +141,14 @@ class ExposedShot(NamedTuple):
 
 
 class ShotResiduals(NamedTuple):
-    """What a shot says, its pose eliminated, of K parameters and M coefficients of what the camera models lack.
-
-    Attributes:
-        rows: (n, 1 + K + M) residuals and their derivatives, in standard deviations.
-        response: (6, K + M) of its pose to these.
-        every: as ``rows``, with points that do not fit, which may be displaced.
-        response_with_all: (6, K + M) of a pose measured with these.
-        exposed: by how much the times of the exposures would move each row of ``rows``, and of ``every``.
-    """
+    """What a shot says, its pose eliminated, of K parameters and M coefficients of what the camera models lack."""
 
     t_s: float
-    rows: Array
-    response: Array
-    every: Array
-    response_with_all: Array
+    rows: Array  #: (n, 1 + K + M) residuals and their derivatives, in standard deviations
+    response: Array  #: (6, K + M) of its pose to these
+    every: Array  #: as ``rows``, with points that do not fit, which may be displaced
+    response_with_all: Array  #: (6, K + M) of a pose measured with these
+    #: by how much the times of the exposures would move each row of ``rows``, and of ``every``
     exposed: tuple[ExposedShot, ExposedShot]
 
 
@@ -172,26 +161,25 @@ class ShotReader:
         sync_s: standard deviation of the time between the two exposures of a shot, s.
 
     Attributes:
-        points: (M,) rows of the body's points that are used.
-        size: K, count of the parameters: the rig's, size and points of the body, readout and skew.
-        track: times, s, and poses T_left_body (4, 4) of the newest shots.
-        used_s: (M,) when a pose was measured with each point.
         noise_px: standard deviation of a coordinate of the newest shot, px.
-        half_px: (2, 2) half of the sizes of the images, px.
     """
 
     def __init__(self, rig: StereoRig, body: Body, sync_s: float) -> None:
         held = len(body.points)
+        #: (M,) rows of the body's points that are used
         self.points = np.linspace(0, held - 1, min(held, MOST_POINTS)).astype(int)
+        #: K, count of the parameters: the rig's, size and points of the body, readout and skew
         self.size = rig.parameter_count + 1 + 3 * len(self.points) + 2
         self._rig, self._sync_s, self.noise_px = rig, sync_s, 0.0
         self._row_of = np.full(held, -1)
         self._row_of[self.points] = np.arange(len(self.points))
+        #: times, s, and poses T_left_body (4, 4) of the newest shots
         self.track: deque[tuple[float, Array]] = deque(maxlen=TRACK)
-        self.used_s = np.full(len(self.points), -np.inf)
+        self.used_s = np.full(len(self.points), -np.inf)  #: (M,) when a pose was measured with each point
         counts = np.array([camera.distortion.size for camera in rig.cameras])
         self._pair = (*pair_arguments(rig.cameras), counts, inverse(rig.T_left_right))
         self._p_body = np.array(body.points, float, order="C")
+        #: (2, 2) half of the sizes of the images, px
         self.half_px = np.array([camera.image_size_px for camera in rig.cameras]) / 2.0
 
     def read(self, estimate: PoseEstimate, now_s: float) -> ShotResiduals | None:
@@ -275,17 +263,11 @@ class ShotReader:
 
 @dataclass(frozen=True, eq=False)
 class ResidualSums:
-    """What whitened residuals say of K parameters, whose priors have variance 1 where they are explained or eliminated.
+    """What whitened residuals say of K parameters, whose priors have variance 1 where they are explained or eliminated."""
 
-    Attributes:
-        M: (1 + K, 1 + K) sum of the outer products of rows [residual; derivatives].
-        freedom: degrees of freedom.
-        begin_s: when the first shot was, s.
-    """
-
-    M: Array
-    freedom: float = 0.0
-    begin_s: float = 0.0
+    M: Array  #: (1 + K, 1 + K) sum of the outer products of rows [residual; derivatives]
+    freedom: float = 0.0  #: degrees of freedom
+    begin_s: float = 0.0  #: when the first shot was, s
 
     @property
     def H(self) -> Array:
@@ -372,15 +354,10 @@ def evidence_of_scales(M: Array, scales: Array) -> Array:
 
 
 class Onset(NamedTuple):
-    """A change that grew from nothing to what it is.
+    """A change that grew from nothing to what it is."""
 
-    Attributes:
-        begin_s: when it began, s.
-        end_s: when it ended, s: of a step when it began, infinite of what goes on.
-    """
-
-    begin_s: float
-    end_s: float = np.inf
+    begin_s: float  #: when it began, s
+    end_s: float = np.inf  #: when it ended, s: of a step when it began, infinite of what goes on
 
     @property
     def goes_on(self) -> bool:

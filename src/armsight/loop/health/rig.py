@@ -111,46 +111,29 @@ _LENS_ALARM = alarm_limit(LENS, 1.0 / (TEST_S * _LENS_TESTS))
 
 @dataclass(frozen=True, eq=False)
 class RigChange(Record):
-    """An estimate of the seven numbers.
+    """An estimate of the seven numbers."""
 
-    Attributes:
-        f: (7,) translation of the right camera across the baseline (2), m, its rotation about its own axes (3), rad, both
-            as tangents of T_left_right on the right; size of the body over that of its file, less 1; by how much the right
-            camera exposes later than is known, s.
-        cov: (7, 7) its covariance.
-        chi_square: of all against zero.
-        alone: the same of each part alone, with the others right.
-        without: the same of the others.
-        excess: by how much the variance of what is left exceeds the noise (Birge ratio).
-        slow: whether the newest tests show that it grows.
-    """
-
+    #: (7,) translation of the right camera across the baseline (2), m, its rotation about its own axes (3), rad, both
+    #: as tangents of T_left_right on the right; size of the body over that of its file, less 1; by how much the right
+    #: camera exposes later than is known, s
     f: Array
-    cov: Array
-    chi_square: float
-    alone: dict[Part, float]
-    without: dict[Part, float]
-    excess: float
-    slow: bool = False
+    cov: Array  #: (7, 7) its covariance
+    chi_square: float  #: of all against zero
+    alone: dict[Part, float]  #: the same of each part alone, with the others right
+    without: dict[Part, float]  #: the same of the others
+    excess: float  #: by how much the variance of what is left exceeds the noise (Birge ratio)
+    slow: bool = False  #: whether the newest tests show that it grows
 
 
 @dataclass(frozen=True, eq=False)
 class LensError(Record):
-    """What the camera models lack.
+    """What the camera models lack."""
 
-    Attributes:
-        beta: (M,) coefficients of its polynomials, px.
-        cov: (M, M) their covariance.
-        size_px: RMS of the residuals that it explains, px, and its standard deviation.
-        chi_square: by how much it explains more than a change of the seven numbers does.
-        needed: which of these are needed besides.
-    """
-
-    beta: Array
-    cov: Array
-    size_px: tuple[float, float]
-    chi_square: float
-    needed: tuple[Part, ...]
+    beta: Array  #: (M,) coefficients of its polynomials, px
+    cov: Array  #: (M, M) their covariance
+    size_px: tuple[float, float]  #: RMS of the residuals that it explains, px, and its standard deviation
+    chi_square: float  #: by how much it explains more than a change of the seven numbers does
+    needed: tuple[Part, ...]  #: which of these are needed besides
 
 
 class _Newest(NamedTuple):
@@ -172,14 +155,9 @@ class RigWatch:
         printed: whether the body is a print whose shape a calibration found: its points are not tested.
 
     Attributes:
-        prior: (K, K) square root of the covariance of all parameters: the rig's, scale and points of the body, readout and
-            skew, which are what is not known of them where detections are moved to one time, else zero.
-        suspected: the change that the newest test found, where it matters and is more likely than not; it widens poses.
         alarm: whether the newest test found one that is certain.
         alarmed: whether any did.
-        lens: what the camera models lack, where that is certain and matters.
         noise: (6, 6) what of the covariance that the newest shot was given differs from shot to shot.
-        passing: what changed from shot to shot, or from test to test.
     """
 
     def __init__(self, rig: StereoRig, body: Body, sync_s: float, *, printed: bool = False) -> None:
@@ -187,6 +165,8 @@ class RigWatch:
         self.reader = ShotReader(rig, body, sync_s)
         self._size, rows = self.reader.size, self.reader.points
         count, shape = rig.parameter_count, 3 * len(rows)
+        #: (K, K) square root of the covariance of all parameters: the rig's, scale and points of the body, readout and
+        #: skew, which are what is not known of them where detections are moved to one time, else zero
         self.prior = np.zeros((self._size, self._size))
         values, vectors = np.linalg.eigh(rig.cov)
         self.prior[:count, :count] = vectors * np.sqrt(np.maximum(values, 0.0))
@@ -221,7 +201,7 @@ class RigWatch:
         self._to_and_fro = np.column_stack([np.eye(self._size)[:, last - 3 : last], apart_f])
         self._alone = np.column_stack([apart_f - 0.5 * both_f, apart_f + 0.5 * both_f])
         self._shots = 0
-        self.passing = Passing()
+        self.passing = Passing()  #: what changed from shot to shot, or from test to test
         self._taken_s = -np.inf
         self._began: Array | None = None
         # The response of the newest poses to everything, and the covariances of these poses.
@@ -234,11 +214,12 @@ class RigWatch:
         self._every = self._fits  # the same of every point, since one did not fit
         self._wholes, self._leftover = History(self._size, columns + LENS), Leftover()  # with the lenses' coefficients
         self._counted: list[Array] = []  # log-evidences of the newest tests, which the former is given later
-        self.lens: LensError | None = None
+        self.lens: LensError | None = None  #: what the camera models lack, where that is certain and matters
         self._timed = False
         self._poses = 0  # that differ
         self.alarm = self.alarmed = False
         self._alarms = 0  # in a row
+        #: the change that the newest test found, where it matters and is more likely than not; it widens poses
         self.suspected: RigChange | None = None
         # When the newest change began, and the test before it, s; and what the newest alarm found.
         self._onset, self._since_s = Onset(0.0), 0.0

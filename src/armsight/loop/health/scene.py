@@ -63,17 +63,13 @@ _SPOT = np.stack(np.meshgrid(*2 * [np.arange(-_HALF, _HALF + 1.0)]), axis=-1).re
 
 
 class CameraMotion(NamedTuple):
-    """How a camera moved since its spots were learned.
+    """How a camera moved since its spots were learned."""
 
-    Attributes:
-        rotation: (3,) of the camera about its own axes, rad, if it rotated alone; covariance (3, 3).
-        shift: (3,) of the camera, m, if it moved alone; covariance (3, 3); None where too few depths are known.
-        favours: by how much the chi-square of a shift is larger than that of a rotation; 0 without a shift.
-    """
-
+    #: (3,) of the camera about its own axes, rad, if it rotated alone; covariance (3, 3)
     rotation: tuple[Array, Array]
+    #: (3,) of the camera, m, if it moved alone; covariance (3, 3); None where too few depths are known
     shift: tuple[Array, Array] | None
-    favours: float
+    favours: float  #: by how much the chi-square of a shift is larger than that of a rotation; 0 without a shift
     seen: int
 
     @property

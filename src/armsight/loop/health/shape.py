@@ -78,24 +78,17 @@ _SEVEN_SCALES = (1.0, 0.03, 0.003)
 
 @dataclass(frozen=True, eq=False)
 class ShapeError(Record):
-    """Points that are displaced on the body, or focal lengths that changed.
+    """Points that are displaced on the body, or focal lengths that changed."""
 
-    Attributes:
-        chosen: what is wrong: rows of the tested points, in the order of what they explain, or FOCAL alone.
-        value: (C,) of all candidates, m for each coordinate of a point, as a share for the focal lengths. Of one point
-            that is displaced the others are zero; of a bent body they are as uncertain as the displacements are large.
-        cov: (C, C) its covariance.
-        chi_square: by how much the first explains more than a change of the seven numbers does.
-        seven: by how much the seven numbers explain more than they all do.
-        alike: what explains nearly as much as the first.
-    """
-
+    #: what is wrong: rows of the tested points, in the order of what they explain, or FOCAL alone
     chosen: tuple[int, ...]
+    #: (C,) of all candidates, m for each coordinate of a point, as a share for the focal lengths. Of one point that is
+    #: displaced the others are zero; of a bent body they are as uncertain as the displacements are large
     value: Array
-    cov: Array
-    chi_square: float
-    seven: float
-    alike: tuple[int, ...]
+    cov: Array  #: (C, C) its covariance
+    chi_square: float  #: by how much the first explains more than a change of the seven numbers does
+    seven: float  #: by how much the seven numbers explain more than they all do
+    alike: tuple[int, ...]  #: what explains nearly as much as the first
     onset: Onset
 
     @property
@@ -157,13 +150,6 @@ class ShapeWatch:
         tolerance_m: standard deviation of each of their coordinates, m.
         rigid: whether single points are not tested.
         strained: whether the body may be elongated, sheared or bent: not a print whose shape a calibration found.
-
-    Attributes:
-        by_wide: (K, C) what the standard deviations of the candidates' priors change of the parameters.
-        doubt: (7 + C, 7 + C) second moment of the seven numbers and the candidates, in units of their priors, by all that
-            may have changed; None where that is improbable, or known: then by what the body is off within its tolerance,
-            where that displaces poses by more than their sigma.
-        found: what the newest test found for certain.
     """
 
     def __init__(
@@ -186,6 +172,7 @@ class ShapeWatch:
         self._by_candidate[:, :2] = focal
         self._by_candidate[first : first + 3 * n, 2:] = np.eye(3 * n)
         self._wide = np.append([FOCAL_SHARE, FOCAL_SHARE], np.full(3 * n, FURTHEST_M))
+        #: (K, C) what the standard deviations of the candidates' priors change of the parameters
         self.by_wide = self._by_candidate * self._wide
         self._candidates = () if rigid else tuple(range(n))
         # What smooth deformations add to sums of the residual, the seven numbers and the candidates; in m of the latter.
@@ -204,8 +191,11 @@ class ShapeWatch:
         self.changed_s = np.inf  # since when something may have changed
         self._alarms = 0  # in a row
         self._suspect: ShapeError | None = None
+        #: (7 + C, 7 + C) second moment of the seven numbers and the candidates, in units of their priors, by all that
+        #: may have changed; None where that is improbable, or known: then by what the body is off within its tolerance,
+        #: where that displaces poses by more than their sigma
         self.doubt: Array | None = None
-        self.found: ShapeError | None = None
+        self.found: ShapeError | None = None  #: what the newest test found for certain
         self.said: ShapeError | None = None
 
     def take(self, t_s: float, rows: Array, T: Array, response: Array, cov: Array, moved: bool) -> None:

@@ -53,26 +53,19 @@ _SIZED = 12
 
 @dataclass(frozen=True, eq=False)
 class RigUpdate(Record):
-    """A rig whose relative pose was estimated again.
-
-    Attributes:
-        rotation_rad: rotation of the right camera against the old rig.
-        sigma_rad: standard deviation of the rotation about its worst axis.
-        shift_m: distance of the right camera from where the old rig has it, across the baseline.
-        depth_errors_m: error of the depth that the old rig measures on the left camera's axis at DEPTHS_M.
-        epipolar_px: RMS distance of the detections from their epipolar lines (Sampson), before and after.
-        stays: how many of them differ from one another.
-        sigma_m: standard deviation of the body's position with the new rig, and what it would be with the calibration's, m.
-    """
+    """A rig whose relative pose was estimated again."""
 
     rig: StereoRig
-    rotation_rad: float
-    sigma_rad: float
-    shift_m: float
+    rotation_rad: float  #: rotation of the right camera against the old rig
+    sigma_rad: float  #: standard deviation of the rotation about its worst axis
+    shift_m: float  #: distance of the right camera from where the old rig has it, across the baseline
+    #: error of the depth that the old rig measures on the left camera's axis at DEPTHS_M
     depth_errors_m: tuple[float, ...]
+    #: RMS distance of the detections from their epipolar lines (Sampson), before and after
     epipolar_px: tuple[float, float]
     shots: int
-    stays: int
+    stays: int  #: how many of them differ from one another
+    #: standard deviation of the body's position with the new rig, and what it would be with the calibration's, m
     sigma_m: tuple[float, float]
 
     def figures(self) -> dict[str, Any]:

@@ -31,21 +31,13 @@ MAX_ROTATION_RAD = 0.3
 
 
 class CheckPlan(NamedTuple):
-    """Poses to go to.
+    """Poses to go to."""
 
-    Attributes:
-        names: of the poses.
-        Ts_base_tool: (N, 4, 4).
-        q: (N, n) joint angles, rad.
-        side_m: of the cube.
-        centre: (3,) of the cube, base, m.
-    """
-
-    names: tuple[str, ...]
-    Ts_base_tool: Array
-    q: Array
-    side_m: float
-    centre: Array
+    names: tuple[str, ...]  #: of the poses
+    Ts_base_tool: Array  #: (N, 4, 4)
+    q: Array  #: (N, n) joint angles, rad
+    side_m: float  #: of the cube
+    centre: Array  #: (3,) of the cube, base, m
 
 
 def everywhere(Ts_base_tool: Array) -> NDArray[np.bool_]:

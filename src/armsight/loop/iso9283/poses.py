@@ -35,21 +35,15 @@ _U = np.linspace(-28.0, 28.0, 113)
 
 @dataclass(frozen=True, eq=False)
 class PoseMetrics(Record):
-    """Clause 7.2: one commanded pose.
-
-    Attributes:
-        AP_m: AP of the position: distance of the attained poses' barycentre from the command.
-        AP_xyz_m: (3,) its parts.
-        AP_rotation_rad: (3,) the rotation from the command to the mean about the command's axes; None if unknown.
-        RP_m: RP of the position: mean distance from the barycentre plus three of its standard deviations.
-        RP_rotation_rad: (3,) RP of the rotation about the command's axes: three standard deviations; None likewise.
-    """
+    """Clause 7.2: one commanded pose."""
 
     count: int
-    AP_m: Metric
-    AP_xyz_m: Array
+    AP_m: Metric  #: AP of the position: distance of the attained poses' barycentre from the command
+    AP_xyz_m: Array  #: (3,) its parts
+    #: (3,) the rotation from the command to the mean about the command's axes; None if unknown
     AP_rotation_rad: Array | None
-    RP_m: Metric
+    RP_m: Metric  #: RP of the position: mean distance from the barycentre plus three of its standard deviations
+    #: (3,) RP of the rotation about the command's axes: three standard deviations; None likewise
     RP_rotation_rad: Array | None
 
 

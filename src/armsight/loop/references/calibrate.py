@@ -53,13 +53,9 @@ GAP_S = 0.5
 
 
 class Carrier(ABC):
-    """What carries the tool, with errors of its own that the readings show too: an arm.
+    """What carries the tool, with errors of its own that the readings show too: an arm."""
 
-    Attributes:
-        sigma: (K,) how far each error may be.
-    """
-
-    sigma: Array
+    sigma: Array  #: (K,) how far each error may be
 
     @abstractmethod
     def at(self, t_s: float) -> tuple[ToolMotion, Array]:
@@ -97,27 +93,16 @@ class _State(NamedTuple, Generic[R]):
 
 @dataclass(frozen=True, eq=False)
 class ReferenceCalibration(Record, Generic[R]):
-    """A calibrated reference, and how far to believe it.
+    """A calibrated reference, and how far to believe it."""
 
-    Attributes:
-        reference: with its parameters, their covariance, its delay and that's sigma.
-        noise: channel -> how many times larger its noise is than its readings say.
-        used: (N,) whether a reading was used; the others are blunders.
-        left_out: (N, m) error of the readings predicted by fits to the other blocks, measured minus predicted.
-        squares: (N,) their squared Mahalanobis distance over m: 1 on average where the covariance is honest.
-        open: parameters that the readings do not determine.
-        carrier: with its errors.
-        cov_carrier: (K, K) their covariance.
-    """
-
-    reference: R
-    noise: dict[str, float]
-    used: NDArray[np.bool_]
-    left_out: Array
-    squares: Array
-    open: tuple[str, ...]
-    carrier: Carrier
-    cov_carrier: Array
+    reference: R  #: with its parameters, their covariance, its delay and that's sigma
+    noise: dict[str, float]  #: channel -> how many times larger its noise is than its readings say
+    used: NDArray[np.bool_]  #: (N,) whether a reading was used; the others are blunders
+    left_out: Array  #: (N, m) error of the readings predicted by fits to the other blocks, measured minus predicted
+    squares: Array  #: (N,) their squared Mahalanobis distance over m: 1 on average where the covariance is honest
+    open: tuple[str, ...]  #: parameters that the readings do not determine
+    carrier: Carrier  #: with its errors
+    cov_carrier: Array  #: (K, K) their covariance
 
 
 def calibrate(

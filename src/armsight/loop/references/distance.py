@@ -28,19 +28,12 @@ EACH = ("x_m", "y_m", "z_m", "offset_m", "scale")  # parameters of an anchor
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Distance(Reference):
-    """A ranging sensor with its anchors.
+    """A ranging sensor with its anchors."""
 
-    Attributes:
-        anchors: (A, 3) their positions in the base, m.
-        p_tool: (3,) the point that is measured, tool, m.
-        offset: (A,) what each range reads beyond the scaled distance, m.
-        scale: (A,) of each range, 1 where it is right.
-    """
-
-    anchors: Array
-    p_tool: Array
-    offset: Array
-    scale: Array
+    anchors: Array  #: (A, 3) their positions in the base, m
+    p_tool: Array  #: (3,) the point that is measured, tool, m
+    offset: Array  #: (A,) what each range reads beyond the scaled distance, m
+    scale: Array  #: (A,) of each range, 1 where it is right
     names: tuple[str, ...] = ()
 
     @property
@@ -90,19 +83,12 @@ START_M, START_M_S = 5.0, 1.0  # sigma of the first position and velocity; half,
 
 
 class RangeNoise(NamedTuple):
-    """How ranges and the body are off.
+    """How ranges and the body are off."""
 
-    Attributes:
-        range_m: white noise of a range, m.
-        bias_m: of an anchor's bias, m.
-        fade_s: in which a bias fades, s.
-        acceleration: density of the body's acceleration, m/s2 per root of Hz.
-    """
-
-    range_m: float = 0.1
-    bias_m: float = 0.2
-    fade_s: float = 20.0
-    acceleration: float = 0.7
+    range_m: float = 0.1  #: white noise of a range, m
+    bias_m: float = 0.2  #: of an anchor's bias, m
+    fade_s: float = 20.0  #: in which a bias fades, s
+    acceleration: float = 0.7  #: density of the body's acceleration, m/s2 per root of Hz
 
 
 @dataclass(frozen=True, eq=False)

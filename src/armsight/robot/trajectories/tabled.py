@@ -14,15 +14,11 @@ STEP_S = 0.004
 
 
 class Tabled:
-    """Another trajectory, looked up. A trajectory.
-
-    Attributes:
-        duration_s: how long the motion takes, s.
-    """
+    """Another trajectory, looked up. A trajectory."""
 
     def __init__(self, motion: Trajectory) -> None:
         """Fill the table."""
-        self.duration_s = motion.duration_s
+        self.duration_s = motion.duration_s  #: how long the motion takes, s
         last = max(self.duration_s, STEP_S)  # a motion that takes no time stands
         t_s = np.append(np.arange(0.0, last - 1e-9, STEP_S), last)
         q, qd, qdd = motion.at(t_s)

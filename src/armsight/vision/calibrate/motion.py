@@ -28,17 +28,13 @@ START_SHARE, _LEAST = 1e-3, 1e-8
 
 @dataclass(frozen=True, eq=False)
 class ExposureMotion(Record):
-    """How boards move between the exposures: the motion's scale, and how each of S pairs departs from it.
+    """How boards move between the exposures: the motion's scale, and how each of S pairs departs from it."""
 
-    Attributes:
-        scales: (2,) scale of the translation of the board's middle along each axis, m, and of the rotation about each, rad.
-        weights: (S,) by how much each pair's variance is smaller than the scale's square: 1 usual, near 0 moved far.
-        rms: (2,) root mean square of both over all pairs, m and rad: the prediction for a new pair.
-    """
-
+    #: (2,) scale of the translation of the board's middle along each axis, m, and of the rotation about each, rad
     scales: Array
+    #: (S,) by how much each pair's variance is smaller than the scale's square: 1 usual, near 0 moved far
     weights: Array
-    rms: Array
+    rms: Array  #: (2,) root mean square of both over all pairs, m and rad: the prediction for a new pair
 
     @staticmethod
     def guessed(points: Array, count: int) -> ExposureMotion:

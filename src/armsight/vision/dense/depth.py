@@ -24,17 +24,11 @@ _COLUMNS, _ROWS, _DEPTHS = 7, 5, 4
 
 @dataclass(frozen=True, eq=False)
 class Depth(Record):
-    """Depths of a rectified left image.
+    """Depths of a rectified left image."""
 
-    Attributes:
-        depth_m: (H, W) along the camera's axis; NaN where the camera sees nothing, or infinitely far.
-        sigma_m: (H, W) standard deviation where it was measured; NaN elsewhere.
-        calibration_m: (H, W) the calibration's share of it, common to neighbours and to all shots.
-    """
-
-    depth_m: Array
-    sigma_m: Array
-    calibration_m: Array
+    depth_m: Array  #: (H, W) along the camera's axis; NaN where the camera sees nothing, or infinitely far
+    sigma_m: Array  #: (H, W) standard deviation where it was measured; NaN elsewhere
+    calibration_m: Array  #: (H, W) the calibration's share of it, common to neighbours and to all shots
 
 
 def calibration_share(rectification: Rectification, uv: Array, disparity: Array) -> Array:

@@ -41,23 +41,14 @@ _TO_M = 5e-4  # m; sides of unknown markers are given to this; half: digits that
 
 @dataclass(frozen=True, eq=False)
 class Charuco(Record, CalibrationBoard):
-    """A chessboard with markers in its bright squares.
+    """A chessboard with markers in its bright squares."""
 
-    Attributes:
-        columns: squares along x.
-        rows: squares along y.
-        square_m: side of a square, m.
-        marker_m: side of a marker, m.
-        family: the markers' family.
-        first: number of its first marker; the others follow.
-    """
-
-    columns: int
-    rows: int
-    square_m: float
-    marker_m: float
-    family: str
-    first: int = 0
+    columns: int  #: squares along x
+    rows: int  #: squares along y
+    square_m: float  #: side of a square, m
+    marker_m: float  #: side of a marker, m
+    family: str  #: the markers' family
+    first: int = 0  #: number of its first marker; the others follow
 
     form = "charuco:COLUMNSxROWS:SQUARE:MARKER:FAMILY[:first=ID] (squares), such as charuco:8x11:15mm:11mm:DICT_5X5_100"
 

@@ -134,23 +134,14 @@ def _jumps(t: _Times, arrival: _Times) -> tuple[tuple[int, int], ...]:
 
 @dataclass(frozen=True)
 class Pairing:
-    """Which messages are one shot.
+    """Which messages are one shot."""
 
-    Attributes:
-        pairs: (left, right) message numbers in the order of time.
-        alone: (side, message number) of those without a partner, 0 left, 1 right -> why.
-        allowed_s: how far apart a pair may be, s.
-        skew_s: median of right minus left over the pairs, s; 0 without any.
-        notes: what was left out.
-        due_ns: (side, message number) -> its time as if no clock had jumped, ns.
-    """
-
-    pairs: tuple[tuple[int, int], ...]
-    alone: dict[tuple[int, int], str]
-    allowed_s: float
-    skew_s: float
-    notes: tuple[str, ...]
-    due_ns: dict[tuple[int, int], int]
+    pairs: tuple[tuple[int, int], ...]  #: (left, right) message numbers in the order of time
+    alone: dict[tuple[int, int], str]  #: (side, message number) of those without a partner, 0 left, 1 right -> why
+    allowed_s: float  #: how far apart a pair may be, s
+    skew_s: float  #: median of right minus left over the pairs, s; 0 without any
+    notes: tuple[str, ...]  #: what was left out
+    due_ns: dict[tuple[int, int], int]  #: (side, message number) -> its time as if no clock had jumped, ns
 
 
 def pair(left: Stamps, right: Stamps, allowed_s: float | None = None) -> Pairing:
