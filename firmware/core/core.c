@@ -204,9 +204,13 @@ static void report(const core_state *core, core_outputs *outputs)
     outputs->rejected_sequence = core->rejected_sequence;
     outputs->rejected_count = core->rejected_count;
     outputs->rejection = core->rejection;
+    outputs->not_homed = 0u;
     for (uint32_t i = 0u; i < JOINTS; i++) { /* of joints that are not there all is 0 */
         const joint_state *joint = &core->joint[i];
         outputs->joint_faults[i] = core->joint_faults[i];
+        if (i < core->config.joint_count && !encoder_is_homed(&joint->encoder, &core->config.joint[i])) {
+            outputs->not_homed |= 1u << i;
+        }
         outputs->limited[i] = joint->limited;
         outputs->duty[i] = (float)core->config.joint[i].motor_direction * joint->motor.duty;
         outputs->angle_rad[i] = joint->pot.angle_rad;

@@ -309,6 +309,7 @@ typedef struct core_outputs {
     uint32_t rejected_sequence;    /* the last command rejected */
     uint32_t rejected_count;       /* how many were, it wraps */
     uint32_t rejection;             /* why that one was, REJECTION_... */
+    uint32_t not_homed;           /* joints whose angle is counted from where nobody knows, one bit 1 << joint each */
     uint32_t limited[JOINTS];     /* LIMITED_... bits of this tick */
     float duty[JOINTS];           /* to the motors, -1 to 1 */
     float angle_rad[JOINTS];      /* measured */

@@ -87,6 +87,7 @@ bool telemetry_fetch(wire_state *wire)
     const uint32_t rejected = outputs->rejected_count;
     const uint32_t state = outputs->state;
     const uint32_t faults = outputs->faults;
+    const uint32_t not_homed = outputs->not_homed;
     if (wire->reports_read == atomic_load(&wire->shared.report_count)) {
         return false;
     }
@@ -108,7 +109,7 @@ bool telemetry_fetch(wire_state *wire)
         wire->fate.rejection = outputs->rejection;
         wire->status_due = 1u;
     }
-    wire->status_urgent |= outputs->state != state || outputs->faults != faults;
+    wire->status_urgent |= outputs->state != state || outputs->faults != faults || outputs->not_homed != not_homed;
     return true;
 }
 
@@ -133,6 +134,7 @@ static void write_status(wire_state *wire)
         .stale_commands = wire->counters.stale_commands,
         .lost_messages = wire->counters.lost_messages,
         .config_stored = wire->counters.config_stored,
+        .not_homed = (uint8_t)outputs->not_homed,
     };
     for (uint32_t joint = 0u; joint < JOINTS; joint++) {
         status.joint_faults[joint] = outputs->joint_faults[joint];

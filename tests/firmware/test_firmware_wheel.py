@@ -71,7 +71,7 @@ def test_what_is_unpacked_from_the_wheel_runs_and_builds(wheel, tmp_path):
         "assert pathlib.Path(firmware.__file__).is_relative_to(pathlib.Path.cwd());"
         "ctypes.CDLL(str(firmware.host_library())).pil_start();"
         "assert elf.read_elf(firmware.image()).hard_float;"
-        "assert firmware.dialect().ARMSIGHT_DIALECT_VERSION == 4;"
+        "assert firmware.dialect().ARMSIGHT_DIALECT_VERSION == 5;"
         "made = build.build_board('pil', pathlib.Path('again.elf'), build.open_compiler('zig'));"
         "assert made.read_bytes() == firmware.image().read_bytes()"
     )

@@ -9,7 +9,7 @@
 #define FRAME_REQUEST 0x51525341u /* "ASRQ" as bytes in memory */
 #define FRAME_ANSWER 0x4E415341u  /* "ASAN" */
 #define FRAME_REJECTED 0x4F4E5341u /* "ASNO": magic or version is another, or it is too long; no tick was run */
-#define FRAME_VERSION 3u          /* goes up whenever a frame changes */
+#define FRAME_VERSION 4u          /* goes up whenever a frame changes */
 #define FRAME_BYTES 512u          /* most bytes of the wire either way in one tick */
 
 /* What a request may do before its tick. */

@@ -2,6 +2,7 @@
 
 ``number.py`` is the number parser, ``lengths.py`` says whether a length can be one, ``document.py`` reads files of names
 and values in any syntax (YAML, JSON, TOML, ..). Tables: ``cells.py`` makes rows of cells of any file, with ``programs.py``
-(robots' controllers) and ``nested.py`` (poses in documents); ``columns.py`` says what the columns are and gives their
-numbers, ``rotations.py`` what those mean; ``poses.py`` has the poses, ``misread.py`` what else they could be.
+(robots' controllers), ``capture.py`` (motion capture) and ``nested.py`` (poses in documents); ``columns.py`` says what
+the columns are and gives their numbers, ``rotations.py`` what those mean; ``poses.py`` has the poses, ``misread.py`` what
+else they could be.
 """

@@ -11,6 +11,7 @@ import numpy as np
 
 from armsight.errors import InputError, nearest
 from armsight.files import DECIMAL_COMMA, TABLE_MB, natural_key, read_table, read_text
+from armsight.tables.capture import capture_rows
 from armsight.tables.lengths import NUMBER, number
 from armsight.tables.nested import BY_COUNT, PACKED, document_rows, is_document, is_packed
 from armsight.tables.programs import program_rows
@@ -173,7 +174,7 @@ def _of_file(path: Path, side: str, whose: str | None, names: Mapping[str, str] 
     """Return what one file holds, its names as they stand there."""
     packed = path.suffix.lower() in PACKED or is_packed(path)
     text = "" if packed else read_text(path, TABLE_MB).removeprefix("\ufeff")
-    if not packed and (points := program_rows(path, text)):
+    if not packed and (points := capture_rows(path, text, side, whose) or program_rows(path, text)):
         return Cells(points.head, _even(path, points.rows, len(points.head)), points.rotation, points.notes)
     written = [(line, row.strip()) for line, row in enumerate(text.splitlines(), 1)]
     written = [(line, row) for line, row in written if row and not row.startswith("#")]

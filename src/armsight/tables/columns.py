@@ -27,6 +27,7 @@ from armsight.tables.lengths import number
 from armsight.tables.rotations import QUATERNION_OFF, rotations_by
 
 NAMES = ("image", "name", "shot")  # columns whose cells name the rows
+TIMES = ("t_s", "__time")  # ours and PlotJuggler's
 MOST_JOINTS = 7  # joints that an arm may have
 #: Names that ``--columns`` may give the file's own for.
 COLUMNS = (
@@ -60,8 +61,14 @@ _MAKERS = {
 _OF_A_MAKER = re.compile(r"(?:([xyz])(?:_(m|mm))?|([abcoprtw])(?:_(deg|rad))?)")  # a column of theirs, in small letters
 UNITLESS = re.compile(r"(?:q|j|joint)_?([1-7])")  # a joint without a unit
 _JOINT = re.compile(r"q(\d+)_(rad|deg)")
+_JOINT_UNITS = ("", "_rad", "_deg")  # that may stand behind an arm's own name of a joint; ROS's has none, and means rad
 #: Numbers that are read of one table; half: half an hour of a run at 1 kHz is rejected, double: 800 MB.
 _MOST_NUMBERS = 50_000_000
+
+
+def joint_columns(joint_names: Sequence[str]) -> tuple[str, ...]:
+    """Return the names by which ``--columns`` may know the joints of an arm, beside q1_rad .. and q1_deg .."""
+    return tuple(name + unit for name in joint_names for unit in _JOINT_UNITS)
 
 
 def understood(
@@ -102,7 +109,11 @@ def _of_ros(bare: Sequence[str], joint_names: Sequence[str], unit: str) -> list[
     """Return our names for those of ROS, of an arm's joints and of spreadsheets; others as they are."""
     ros = [_ROS.fullmatch(name) for name in bare]
     parts = {found[2] for found in ros if found and not found[1]}  # without w they are no quaternion
-    links = {name.lower(): f"q{k}_rad" for k, name in enumerate(joint_names, 1)}
+    links = {
+        f"{name.lower()}{unit}": f"q{k}{unit or '_rad'}"
+        for k, name in enumerate(joint_names, 1)
+        for unit in _JOINT_UNITS
+    }
     recorded = _RECORDED | ({"timestamp": "t_s"} if any(name.startswith("actual_") for name in bare) else {})
     out = []
     for name, found in zip(bare, ros, strict=True):
@@ -110,7 +121,7 @@ def _of_ros(bare: Sequence[str], joint_names: Sequence[str], unit: str) -> list[
         if found and (found[1] or parts == set("xyzw")):
             out.append(f"{found[2]}_{unit}" if found[1] else f"q{found[2]}")
         else:
-            joint = links.get(re.sub(r"^.*/(?=[^/]+$)|_joint$", "", name.removesuffix("/position")))
+            joint = links.get(re.sub(r"^.*/(?=[^/]+$)|_joint(?=(_deg|_rad)?$)", "", name.removesuffix("/position")))
             out.append(joint or recorded.get(name, _THEIRS.get(axis, axis) + mark + rest))
     return out
 
@@ -214,10 +225,12 @@ class _StoredRows(Sequence[tuple[int, list[str]]]):
 
 
 class Columns:
-    """Columns of a table by their names."""
+    """Columns of a table by their names; ``given`` are the file's own, for messages."""
 
-    def __init__(self, path: Path, head: list[str], rows: Rows, links: Sequence[str] = ()) -> None:
-        self.path, self.head, self.rows = path, head, rows
+    def __init__(
+        self, path: Path, head: list[str], rows: Rows, links: Sequence[str] = (), given: Sequence[str] = ()
+    ) -> None:
+        self.path, self.head, self.rows, self.given = path, head, rows, list(given) or head
         self.at = {name: k for k, name in enumerate(head) if name}
         self.used: set[str] = set()
         self.links = links
@@ -252,8 +265,12 @@ class Columns:
         """Raise an InputError where a column is missing; those that are there count as used."""
         for name in names:
             if name not in self.at:
-                raise InputError(f"{self.path}: line 1: column {name} is missing; there are {nearest(name, self.at)}")
+                raise InputError(f"{self.path}: line 1: column {name} is missing; there are {self.near(name)}")
         self.used.update(names)
+
+    def near(self, name: str) -> str:
+        """Return the file's own names, those like ``name`` first, for messages."""
+        return nearest(name, [each for each in self.given if each])
 
     def texts(self, name: str) -> list[str]:
         """Return the cells of a column (N,), "" where there is no such column."""
@@ -284,8 +301,8 @@ class Columns:
             value = number(cell)
             if (cell or not empty) and (value is None or not (gaps or math.isfinite(value))):
                 raise InputError(
-                    f"{self.path}: line {line}: {name} is {cell[:40]!r}, not a number; finite numbers are needed: "
-                    "correct or remove the line"
+                    f"{self.path}: line {line}: {self.given[self.at[name]]} is {cell[:40]!r}, not a number; finite numbers "
+                    "are needed: correct or remove the line"
                 )
 
     def joint_names(self, joint_count: int | None = None, arm: str = "") -> list[str]:
@@ -390,7 +407,7 @@ class Columns:
         if unit is None and "n1" not in self.at:
             raise InputError(
                 f"{self.path}: line 1: no rotation: qw qx qy qz, rx_deg ry_deg rz_deg, or r11 .. r33 are needed; there are "
-                f"{nearest('qw', self.at)}"
+                f"{self.near('qw')}"
             )
         found = self.numbers(names)
         convention = rotation or ("rotvec" if unit == "_rad" else None)

@@ -19,11 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array, Record
-from armsight.errors import InputError, nearest
+from armsight.errors import InputError
 from armsight.files import columns_unused
 from armsight.geometry.pose import pose
 from armsight.tables.cells import Cells, Renames, Rows, read_cells, read_columns
-from armsight.tables.columns import COLUMNS, UNITLESS, Columns, degree_columns, understood
+from armsight.tables.columns import COLUMNS, UNITLESS, Columns, degree_columns, joint_columns, understood
 from armsight.tables.lengths import REACH, UNITS_M
 from armsight.tables.rotations import CONVENTIONS
 
@@ -108,7 +108,7 @@ def read_pose_table(
     q = table.joints(names) if names else None
     if only_joints and q is None:
         raise InputError(
-            f"{path}: line 1: no joint angles: q1_deg .. or q1_rad .. are needed; there are {nearest('q1_deg', table.at)}"
+            f"{path}: line 1: no joint angles: q1_deg .. or q1_rad .. are needed; there are {table.near('q1_deg')}"
         )
     nothing = np.zeros((len(table.rows), 0))
     numbers, written, convention, unit_m, of_joints = nothing, nothing, "", 1.0, False
@@ -127,7 +127,8 @@ def read_pose_table(
     else:
         Ts, of_joints = np.asarray(arm.forward(q)), True
     t_s, row_names, lines = table.times(), table.names(), np.array([line for line, _ in table.rows])
-    unused = tuple(name for name in table.at if name not in table.used | {"_0", "_1", "_2", "_3"})
+    passed = table.used | {"_0", "_1", "_2", "_3"}
+    unused = tuple(table.given[k] for name, k in table.at.items() if name not in passed)
     if arm is not None and q is None:
         notes = (*notes, f"{path}: has no joint angles: --model {arm.name} is not used")
     if unused and not only_joints and not set(table.at) >= _MEASURED:
@@ -143,16 +144,17 @@ def _table(
     """Return the columns of a file, the convention of its rotations, notes, and why rows of it have no pose."""
     if rotation is not None and rotation not in CONVENTIONS:
         raise InputError(f"the rotation convention is {rotation!r}; known are {', '.join(CONVENTIONS)}")
-    cells = read_cells(path, read_columns(columns, (*COLUMNS, "pose")), side)
+    links = () if arm is None else arm.joint_names
+    cells = read_cells(path, read_columns(columns, (*COLUMNS, *joint_columns(links), "pose")), side)
     if cells.listed:
         notes = _notes_of_lists(path, cells.rows[0], arm, unit, rotation)
         names = ["x", "y", "z", "rx_rad", "ry_rad", "rz_rad"] if len(cells.head) == 6 else cells.head
         cells = cells._replace(head=names, notes=(*cells.notes, *notes))
-    table, rotation, notes = columns_in(path, cells, () if arm is None else arm.joint_names, unit, rotation)
+    table, rotation, notes = columns_in(path, cells, links, unit, rotation)
     if not set(table.at) >= _MEASURED:
         return table, rotation, notes, ("",) * len(table.rows)
     rows, missed = _shown(path, table.head, table.rows)
-    return Columns(path, table.head, rows, table.links), rotation, notes, missed
+    return Columns(path, table.head, rows, table.links, table.given), rotation, notes, missed
 
 
 def columns_in(
@@ -166,7 +168,7 @@ def columns_in(
     head, *body = degree_columns(path, [cells.head, *(row for _, row in cells.rows)])
     head, convention, notes = understood(path, head, links, unit, rotation or cells.rotation)
     rows: Rows = [(line, row) for (line, _), row in zip(cells.rows, body, strict=True)]
-    return Columns(path, head, rows, links), convention, (*cells.notes, *notes)
+    return Columns(path, head, rows, links, cells.head), convention, (*cells.notes, *notes)
 
 
 def _shown(path: Path, head: list[str], rows: Rows) -> tuple[Rows, tuple[str, ...]]:
@@ -238,7 +240,7 @@ def _suffix(table: Columns) -> str:
         )
     raise InputError(
         f"{table.path}: line 1: no positions: x_m y_m z_m or x_mm y_mm z_mm are needed, or, with --model, joints q1_rad .. "
-        f"or q1_deg ..; there are {nearest('x_m', table.at)}: --columns x_m=NAME,... gives yours"
+        f"or q1_deg ..; there are {table.near('x_m')}: --columns x_m=NAME,... gives yours"
     )
 
 

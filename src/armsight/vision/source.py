@@ -10,7 +10,7 @@ from collections.abc import Callable, Generator, Iterator
 from typing import Protocol, Self
 
 from armsight.data import Shot
-from armsight.vision.image import BitDepth, images_of
+from armsight.vision.image import DEPTH_IMAGES, BitDepth, images_of
 
 #: A shot that is younger by its own stamp was stamped by a live camera, s; half: a slow start passes for a recording,
 #: double: a recording that was just made passes for live.
@@ -70,20 +70,21 @@ class Source(Protocol):
 
 
 class PlayedSource(Source):
-    """A recording of ``count`` shots that ``shots`` reads, from the first at each call; 16-bit images have one depth."""
+    """A recording of ``count`` shots; ``shots`` reads every so many of them. Its 16-bit images have one depth."""
 
     count: int | None = None
     timed = True
 
     def __init__(
         self,
-        shots: Callable[[], Generator[Shot]],
+        shots: Callable[[int], Generator[Shot]],
         count: int,
         notes: tuple[str, ...] = (),
         depth: BitDepth | None = None,
     ) -> None:
-        self.count, self._notes, self._shots = count, notes, shots()
-        self._depth = depth or BitDepth(lambda: images_of(shots()))
+        self.count, self._notes, self._shots = count, notes, shots(1)
+        every = max(1, -(-2 * count // DEPTH_IMAGES))  # from its whole length: it may begin in the dark
+        self._depth = depth or BitDepth(lambda: images_of(shots(every)))
 
     @property
     def notes(self) -> tuple[str, ...]:

@@ -115,6 +115,29 @@ def test_an_arm_that_is_not_homed_gives_no_angles_until_it_is(monkeypatch):
     assert np.abs(q).max() < np.radians(0.1)  # at rest after homing; unhomed it reads up to -170 degrees
 
 
+def test_a_board_that_loses_its_zero_while_it_is_read_gives_no_more_angles(monkeypatch):
+    class Losing(FakeBoard):
+        homed = property(lambda self: self.reads < 2)
+
+    boards, said, data, lines = [Losing()], threading.Event(), [], []
+
+    def open_any(name):
+        if not boards:
+            said.set()
+            raise InputError("gone")
+        return boards.pop()
+
+    monkeypatch.setattr(readings, "open_any", open_any)
+    monkeypatch.setattr(readings, "is_real", lambda name: True)
+    monkeypatch.setattr(readings, "_PAUSE_S", 0.001)
+    board = BoardReadings("feetech:/dev/none")
+    board.start(data.append, lines.append)
+    assert said.wait(20)
+    board.close()
+    assert lines == ["board: connected", f"board: feetech:/dev/none: {readings.NOT_HOMED}; trying again"]
+    assert sum(isinstance(each, JointsDatum) for each in data) == 1
+
+
 def test_an_emulated_board_is_read_in_real_time_until_it_is_closed():
     data, lines, some = [], [], threading.Event()
     board = BoardReadings("emulated:host")

@@ -402,6 +402,9 @@ def test_a_push_waits_for_its_cell_and_says_what_is_wrong(tmp_path, armsight):
     running.close()
     assert_rejected(armsight("hub", "push", tmp_path, tmp_path / "store", "--cell", "a"), "no runs are here")
     assert_rejected(armsight("hub", "push", folder, "nowhere://x", "--cell", "a"), "nowhere")
+    assert_rejected(
+        armsight("hub", "push", tmp_path, "nowhere://x", "--cell", "a"), "not known: nowhere; expected a folder"
+    )
     assert json.loads(armsight("hub", "push", folder, tmp_path / "store", "--cell", "a", "--json").out)["runs"] == 2
 
 

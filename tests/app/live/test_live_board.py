@@ -8,17 +8,20 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from armsight.app.board.command import NOT_HOMED
 from armsight.app.live import arm
 from armsight.app.live.arm import ArmStep
 from armsight.app.live.step import SessionOptions, Shared
 from armsight.data import JointStates, Missed
 from armsight.errors import DeviceError, InputError
+from armsight.robot.boards.ar4.board import Ar4Board
 from armsight.robot.boards.codes import BoardState, Command
 from armsight.robot.boards.contract import Abilities
 from armsight.robot.boards.feetech.board import FeetechBoard
 from armsight.robot.boards.feetech.bus import ServoBus
 from armsight.robot.boards.stoppable import StoppableBoard
 from armsight.robot.models import MODELS
+from armsight.sim.boards.ar4 import Ar4Teensy
 from armsight.sim.boards.device import SteppedLink
 from armsight.sim.boards.so101 import So101Bus
 from cli_runs import assert_rejected
@@ -150,6 +153,30 @@ def arm_step(tmp_path, board, measuring=None):
     options = SessionOptions(tmp_path, "usb:0,1", board=board)
     measuring = measuring or SimpleNamespace(rig=None, rig_path=None, target_spec=None, newest=None, lacking="")
     return ArmStep(Shared(options, tmp_path, lambda level, text: None), measuring, MODELS["six_r"])
+
+
+def test_the_angles_of_an_arm_that_is_not_homed_are_not_shown(tmp_path):
+    """All six encoders of a Teensy that was just switched on read 0, which are up to 170 degrees."""
+    link = SteppedLink(Ar4Teensy(homing_s=0.2))
+    inner = Ar4Board.connect(link, now=link.now)
+    seen = {"rig": None, "rig_path": None, "target_spec": None, "newest": None, "lacking": "", "followed": True}
+    board, step = StoppableBoard(inner), arm_step(tmp_path, "ar4:PORT", SimpleNamespace(**seen))
+    step._board = board
+    shown = []
+
+    def receive(wait_s):
+        if len(shown) == 3:
+            inner.home()
+        shown.append(step.state)
+        if len(shown) == 6:
+            step._closing.set()
+        return inner.receive(wait_s)
+
+    board.receive = receive
+    step._work(board)
+    assert [(state.q_deg, state.missing) for state in shown[:3]] == [((), NOT_HOMED)] * 3
+    assert len(step.state.q_deg) == 6
+    assert step.state.missing == ""
 
 
 @pytest.mark.parametrize(

@@ -89,6 +89,12 @@ def test_what_was_recorded_comes_back_bit_by_bit(tmp_path):
     assert_nothing_else(result.directory, shots)
 
 
+def test_what_is_odd_about_images_is_said_at_the_end(tmp_path, armsight):
+    record(Played([Shot("a", *[np.full((24, 32), 900, np.uint16)] * 2)]), tmp_path / "a")
+    said = armsight("record", tmp_path / "a", "-o", tmp_path / "b")
+    assert said.err.count("note: its 16-bit images are read as 10 bits, which hold their pixels") == 1
+
+
 def test_a_recording_of_a_recording_is_the_same(tmp_path):
     record(Played(some(3)), tmp_path / "a")
     record(open_source(f"folder:{tmp_path / 'a'}"), tmp_path / "b")

@@ -133,7 +133,7 @@ def test_a_sweep_that_rotates_the_tool_little_is_said(sweep, capsys, tmp_path, m
         ("[imu]\nkind = 'inertial'\nsource = 'imu.csv'\nrate_hz = 5e4", None, "as if t_s were in ms; give s"),
         ("[imu]\nkind = 'inertial'\nrate_hz = 0", None, "rate_hz is 0; expected more"),
         ("[imu]\nkind = 'inertial'\nsource = 3", None, "source is 3; expected a text"),
-        ("[imu]\nkind = 'inertial'", None, r"\[imu\]: no source; name its recording"),
+        ("[imu]\nkind = 'inertial'", None, r"r\.toml: \[imu\]: no source; name its recording"),
         ("kind = 'inertial'", None, "expected a table a reference"),
         (None, lambda v: v / [1, 1, 1, 1, 9.80665, 9.80665, 9.80665], "reads .* at rest, as if in g; give m/s2"),
         (None, lambda v: v[::-1], "the clock runs backwards by .* at reading 2"),

@@ -274,6 +274,21 @@ def test_a_reader_that_is_slow_loses_the_oldest_and_it_is_counted():
     assert sink.got == ["7", "8", "9", "10", "11"]
 
 
+def test_images_that_wait_are_bounded_by_their_memory_and_nothing_else_is_dropped(monkeypatch):
+    from armsight.app.stream import sink
+
+    monkeypatch.setattr(sink, "_IMAGES_MB", 1e-3)
+    waiting, image = sink.Sink(), np.zeros((10, 20), np.uint8)
+    for k in range(4):
+        waiting.put(ShotDatum(Shot(str(k), image, image, 0.1 * k), Missed("")))
+        waiting.put(ShotDatum(Shot(f"{k} jpeg", None, None, 0.1 * k, None, (b"x" * 40, b"x" * 60)), Missed("")))
+        waiting.put(NoteDatum(0.0, str(k)))
+    kept = [each.shot.name for each in waiting._queue if isinstance(each, ShotDatum) and sink._image_bytes(each)]
+    assert kept == ["2", "2 jpeg", "3", "3 jpeg"]
+    assert sum(map(sink._image_bytes, waiting._queue)) == waiting._bytes == 1000
+    assert (len(waiting._queue), waiting.taken, waiting.dropped) == (12, 12, 4)
+
+
 def test_while_a_command_is_due_no_datum_is_begun_unless_many_wait():
     from armsight.app.stream.sink import Sink
 

@@ -23,13 +23,13 @@ def test_every_hello_is_answered_with_who_the_board_is(fresh):
     board.tick(host.hello(nonce=4711))
     board.tick()
     welcome = host.newest("WELCOME")
-    assert (welcome.dialect_version, welcome.config_version, welcome.nonce) == (4, c.CONFIG_VERSION, 4711)
+    assert (welcome.dialect_version, welcome.config_version, welcome.nonce) == (5, c.CONFIG_VERSION, 4711)
     assert (welcome.board, welcome.joints, welcome.baud) == ("pil", c.JOINTS, 921600)
     assert (welcome.ticks_per_s, welcome.config_source) == (c.TICKS_PER_S, c.CONFIG_FACTORY)
     assert welcome.firmware == version("armsight")
 
 
-@pytest.mark.parametrize("other", [{"dialect": 5}, {"config": 1}, {"dialect": 2}])
+@pytest.mark.parametrize("other", [{"dialect": 6}, {"config": 1}, {"dialect": 2}])
 def test_a_host_of_another_version_learns_who_the_board_is_and_may_only_stop_it(working, other):
     board, host = working
     board.run(2, host.hello(nonce=9, **other))
@@ -186,7 +186,7 @@ def test_what_the_board_itself_sends_does_nothing_when_it_comes_back(working):
 
 
 def test_the_dialects_version_is_the_one_the_board_knows():
-    assert firmware.dialect().ARMSIGHT_DIALECT_VERSION == 4
+    assert firmware.dialect().ARMSIGHT_DIALECT_VERSION == 5
 
 
 def test_a_new_host_does_not_find_the_last_ones_commands(working):

@@ -9,7 +9,7 @@ from firmware_wire import BITS_PER_BYTE, BareWire, declare_wire
 
 #: On the wire, with MAVLink's header and checksum and no zeros left out.
 FRAME = 12
-BYTES = {"ANGLES": 28 + FRAME, "JOINTS": 106 + FRAME, "BOARD_STATUS": 92 + FRAME}
+BYTES = {"ANGLES": 28 + FRAME, "JOINTS": 106 + FRAME, "BOARD_STATUS": 93 + FRAME}
 
 
 def load_bytes_per_s(periods) -> float:

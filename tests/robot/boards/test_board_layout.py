@@ -68,7 +68,7 @@ def test_enumerations_are_the_headers(prefix, ours):
 def test_numbers_and_ranges_are_the_headers():
     assert frames.REQUEST_MAGIC.to_bytes(4, "little") + frames.ANSWER_MAGIC.to_bytes(4, "little") == b"ASRQASAN"
     assert f"RESTART_POWER = {frames.RESTART_POWER}, RESTART_WATCHDOG = {frames.RESTART_WATCHDOG}" in FRAMES
-    assert (frames.VERSION, frames.WIRE_BYTES, configuration.ENCODER_REV) == (3, 512, 16384)
+    assert (frames.VERSION, frames.WIRE_BYTES, configuration.ENCODER_REV) == (4, 512, 16384)
     assert headers.ranges("encoder_config")["zero_counts"] == (0, 16383)
     assert headers.ranges("pot_config") == {"node_count": (2, 9), **POT_RANGES}
     assert "sync_led_pin" not in headers.ranges("core_config")

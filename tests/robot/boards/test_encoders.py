@@ -63,9 +63,12 @@ class Encoded:
 
 def test_nothing_is_driven_before_the_zero_is_known_and_then_the_joints_follow():
     here = Encoded()
+    assert here.board.status.not_homed == sum(1 << int(j) for j in np.flatnonzero(KIND == SensorKind.QUADRATURE))
+    assert not here.board.homed
     with pytest.raises(ArmsightError, match="an encoder does not know its zero"):
         here.board.enable()
     here.home()
+    assert here.board.homed
     here.board.enable()
     here.move(0.3, 100)
     assert here.board.status.faults == ()

@@ -77,6 +77,26 @@ def named(K1, D1, K2, D2, R_="R", T_="T", scale=1e3, row=False, **more):
     return {K1: K_LEFT, D1: d[0], K2: K_RIGHT, D2: d[1], R_: R, T_: t, **more}
 
 
+def depthai():
+    """A device of Luxonis: the left camera is known beside the right one, that beside the colour camera; cm."""
+
+    def camera(K, d, to, R_=(), t=0 * T):
+        step = {"rotationMatrix": np.asarray(R_).tolist(), "toCameraSocket": to, "lengthUnit": 1}
+        step |= {
+            key: dict(zip("xyz", v.tolist(), strict=True))
+            for key, v in (("translation", 100 * t), ("specTranslation", 0 * t))
+        }
+        lens = {"cameraType": 0, "distortionCoeff": [*d.tolist(), *[0.0] * 10], "intrinsicMatrix": K.tolist()}
+        return lens | {"extrinsics": step, "width": SIZE[0], "height": SIZE[1]}
+
+    right = camera(K_RIGHT, D_RIGHT, 0, exp_so3(np.array([0.01, -0.02, 0.03])), np.array([0.0375, 0.001, 0.0]))
+    return {
+        "cameraData": [[2, right], [1, camera(K_LEFT, D_LEFT, 2, R, T)], [0, camera(K_LEFT, D_LEFT, -1)]],
+        "stereoRectificationData": {"leftCameraSocket": 1, "rightCameraSocket": 2},
+        "version": 7,
+    }
+
+
 def lists(document):
     return {key: value.tolist() if isinstance(value, np.ndarray) else value for key, value in document.items()}
 
@@ -312,6 +332,7 @@ _third = kalibr_camera(K_RIGHT, D_RIGHT, T_cn_cnm1=nested(np.eye(4) + np.eye(4, 
 
 #: Name -> (program and where it is described), format, files, options.
 PROGRAMS = {
+    "depthai": ("depthai 3.12.0, eepromToJsonFile", "depthai", {"calib.json": json.dumps(depthai())}, {}),
     "stereo_calib": ("opencv 4, samples/cpp/stereo_calib.cpp", "opencv",
         {"both.yml": storage(YML, **named("M1", "D1", "M2", "D2", Q=np.eye(4)))}, MM_SIZE),
     "stereo_calib 5": ("opencv 5, %YAML 1.2 header", "opencv",

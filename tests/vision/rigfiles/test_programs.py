@@ -24,6 +24,7 @@ from program_files import (
     R,
     T,
     camera_info,
+    depthai,
     five,
     mrcal,
     named,
@@ -118,6 +119,29 @@ def test_a_fisheye_of_multical_is_known_by_the_shape_of_its_coefficients(tmp_pat
     expected = cv2.fisheye.projectPoints(far[None], still, still, K, D)[0]
     assert (rig.left.model, rig.right.model) == ("fisheye", "fisheye")
     np.testing.assert_allclose(rig.left.project(far), expected[0], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (
+            lambda cameras: cameras[1]["extrinsics"].update(toCameraSocket=-1),
+            "the extrinsics of CAM_C lead to CAM_A, not to the other camera",
+        ),
+        (
+            lambda cameras: cameras[0]["extrinsics"].update(toCameraSocket=1),
+            "not to the other camera: they were not calibrated",
+        ),
+        (lambda cameras: cameras[1].update(cameraType=2), "cameraType 2"),
+        (lambda cameras: cameras[1].pop("width"), "not as depthai writes it: KeyError('width')"),
+        (lambda cameras: cameras[1]["distortionCoeff"].__setitem__(9, 0.1), "thin-prism"),
+    ],
+)
+def test_a_device_of_luxonis_that_cannot_be_read_is_named(tmp_path, change, said):
+    document = depthai()
+    change([camera for _, camera in document["cameraData"]])
+    with pytest.raises(InputError, match=re.escape(said)):
+        import_rig(None, write(tmp_path, {"calib.json": json.dumps(document)}))
 
 
 # --- what goes wrong -------------------------------------------------------------------------------------------------

@@ -114,6 +114,19 @@ def test_ros_encodings_become_grey_or_bgr(tmp_path):
     assert "encoding 'nv24' is not read" in found[0].problem
 
 
+@pytest.mark.parametrize("container", ["ros1", "mcap", "sqlite3"])
+def test_a_recording_that_begins_in_the_dark_has_one_depth(tmp_path, container):
+    """Nine shots of 10 bits, then bright ones of 12: all of the recording is looked at before the first is scaled."""
+    dark, bright = (np.full((4, 6), most, np.uint16) for most in (900, 4000))
+    sent = [
+        Sent(t, EPOCH_NS + k * STEP_NS, Pixels(dark if k < 9 else bright)) for k in range(24) for t in (LEFT, RIGHT)
+    ]
+    found, notes = shots(f"bag:{write_bag(tmp_path / 'a', container, sent)}")
+    assert {shot.bits for shot in found} == {12}
+    assert (found[0].left == 900 << 4).all()
+    assert notes == ("its 16-bit images are read as 12 bits, which hold their pixels",)
+
+
 @pytest.mark.parametrize("encoding", ["nv12", "nv21"])
 def test_luminance_with_half_the_colours_behind_it_is_read(tmp_path, encoding):
     red = np.full((8, 16, 3), (40, 80, 220), np.uint8)

@@ -172,6 +172,24 @@ def test_two_files_of_one_clock_need_not_begin_at_the_same_moment(tmp_path, suff
     assert sum(shot.problem is None for shot in iter(source.read, None)) == 20
 
 
+@pytest.mark.parametrize("reordered", [0, 1])
+def test_transport_streams_of_one_moment_are_paired_where_one_alone_has_its_frames_reordered(tmp_path, reordered):
+    """FFmpeg's muxer writes no times below 0: a file whose first frame is decoded two before begins two frames later."""
+    files = [tmp_path / "left.ts", tmp_path / "right.ts"]
+    for k, path in enumerate(files):
+        recorded(path, "libx264" if k == reordered else "mpeg4", range(20))
+    begins = [Film(str(path)).begin_s for path in files]
+    assert begins[reordered] - begins[1 - reordered] == pytest.approx(2 / 30, abs=1e-3)
+    source = open_source(f"video:{files[0]},{files[1]}")
+    assert [note.partition(" as its")[0] for note in notes_of(source)] == [
+        f"{files[reordered]} begins 0.067 s after {files[1 - reordered]}"
+    ]
+    greys = [[image.mean() / 5 for image in (shot.left, shot.right)] for shot in iter(source.read, None)]
+    np.testing.assert_allclose(
+        greys, np.repeat(np.arange(20.0)[:, None], 2, axis=1), atol=1.5
+    )  # a shift is 2, rounding by codecs 1.1
+
+
 def test_frames_that_an_edit_list_hides_are_no_damage(tmp_path):
     whole, cut = tmp_path / "whole.mp4", tmp_path / "cut.mp4"
     recorded(whole, "libx264", range(20))

@@ -28,6 +28,11 @@ _BATCH_S = 0.1
 _PAUSE_S, _LONGEST_S = 0.25, 2.0
 
 
+def _check_homed(board: MotionBoard, name: str) -> None:
+    if not board.homed:
+        raise InputError(f"{name}: {NOT_HOMED}")
+
+
 class BoardReadings:
     """Reads the joints of the board of this name, from :meth:`start` on.
 
@@ -54,8 +59,7 @@ class BoardReadings:
             pause_s = min(max(2 * pause_s, _PAUSE_S), _LONGEST_S)
             try:
                 with open_any(self._name) as board:
-                    if not board.homed:
-                        raise InputError(f"{self._name}: {NOT_HOMED}")
+                    _check_homed(board, self._name)
                     self._lost, pause_s = None, _PAUSE_S
                     self._note("connected", "info")
                     self._read(board)
@@ -69,6 +73,7 @@ class BoardReadings:
         clock, real = HostClock(), is_real(self._name)
         while not self._ended.wait(0.0 if real else _BATCH_S):  # an emulated board's time passes at once
             states = board.receive(_BATCH_S)
+            _check_homed(board, self._name)  # an encoder that missed counts has lost its zero
             if len(states.t_s):
                 clock.heard(states.t_s[-1])
                 t_s = states.t_s + clock.offset_s

@@ -56,6 +56,10 @@ def push(cell: Cell, folder: Path, store: str, rate_mb_s: float, advance: Callab
     """
     import fsspec
 
+    try:
+        fsspec.get_filesystem_class(fsspec.utils.get_protocol(store))
+    except (ImportError, ValueError) as error:
+        raise InputError(f"{store}: {error}; expected a folder, or such as s3://bucket") from None
     names = "run.mcap", "summary.json", "shots.csv"
     runs = sorted({path.parent for name in names for path in folder.glob(f"*/{name}")})
     if not runs:
@@ -82,7 +86,7 @@ def push(cell: Cell, folder: Path, store: str, rate_mb_s: float, advance: Callab
         return done
     except InputError:
         raise
-    except (ImportError, ValueError) as error:
+    except ValueError as error:
         raise InputError(f"{store}: {error}") from None
     except Exception as error:  # noqa: BLE001 - a store's library has errors of its own; our own code has its tests
         why = getattr(error, "strerror", None) or str(error) or type(error).__name__

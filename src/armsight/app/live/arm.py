@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
+from armsight.app.board.command import NOT_HOMED
 from armsight.app.live.handeye import (
     HandEyeGuide,
     HandEyeState,
@@ -296,7 +297,8 @@ class ArmStep(PageStep[ArmState]):
             now = time.monotonic()
             qs = np.array([q for at, q in list(self._lately) if now - at < _REST_S])
             if not len(qs):
-                raise InputError("no joints are read: connect the board first")
+                unhomed = self._board is not None and not self._board.homed
+                raise InputError(NOT_HOMED if unhomed else "no joints are read: connect the board first")
             if np.ptp(qs, axis=0).max() > _REST_RAD:
                 raise InputError("a joint moves: take poses at rest")
             q = qs.mean(axis=0)
@@ -377,6 +379,8 @@ class ArmStep(PageStep[ArmState]):
             return f"{self.shared.options.board} commands no motion: another program moves the arm"
         if self._board is None:
             return "the board is not connected"
+        if not self._board.homed:
+            return NOT_HOMED
         if lacking := self._measuring.lacking:
             return lacking
         if not self._measuring.followed:
@@ -395,7 +399,10 @@ class ArmStep(PageStep[ArmState]):
                     time.sleep(_ASK_S)  # its time waits for the images, and a stop does not
                     continue
                 states = board.receive(_IDLE_S)
-                if len(states.q):
+                if not board.homed:  # what it reads are no angles of the arm
+                    self._q = None
+                    self._lately.clear()
+                elif len(states.q):
                     self._q = states.q[-1]
                     self._lately.append((time.monotonic(), states.q[-1]))
                 if simulated is not None:  # polled in every period, so that no image is rendered while a stop waits

@@ -54,7 +54,8 @@ def command(
     unused_folder(output)
     with contextlib.ExitStack() as stack:
         opened = stack.enter_context(contextlib.closing(open_source(source)))
-        for note in notes_of(opened):
+        said = notes_of(opened)
+        for note in said:
             click.echo(f"note: {note}", err=True)
         published = Published(properties=properties(None, None, command="record", source=source))
         say = partial(click.echo, err=True)
@@ -68,6 +69,8 @@ def command(
             advance()
 
         result = record(opened, output, shots=shots, seconds=seconds, on_shot=stored_one)
+        for note in notes_of(opened)[len(said) :]:
+            click.echo(f"note: {note}", err=True)
     if as_json:
         keys = {"directory": str(result.directory), "shots": result.shots, "problems": result.problems}
         click.echo(json.dumps({**keys, "stopped": result.stopped}))

@@ -105,7 +105,7 @@ def _gravity(entry: Entry, model: str, joints: Path) -> Report:
     from armsight.tables.poses import read_pose_table
 
     if not isinstance(unit := entry.reference, Inertial):
-        raise InputError(f"[{unit.name}]: is a magnetometer; gravity is felt by an inertial unit")
+        raise InputError(f"{entry.where}: is a magnetometer; gravity is felt by an inertial unit")
     arm = open_arm(model)
     table = read_pose_table(joints, arm=arm, only_joints=True)
     if table.t_s is None or table.q is None:
@@ -131,14 +131,8 @@ def _gravity(entry: Entry, model: str, joints: Path) -> Report:
         "rests": len(readings),
         "outliers": int((~found.used).sum()),
         "found": [
-            {
-                "name": each.name,
-                "joints": list(each.joints),
-                "value_rad": each.value,
-                "sigma_rad": each.sigma,
-                "open": each.open,
-            }
-            for each in shown
+            {"name": e.name, "joints": list(e.joints), "value_rad": e.value, "sigma_rad": e.sigma, "open": e.open}
+            for e in shown
         ],
     }
     cells = tuple(
@@ -164,7 +158,7 @@ def _recording(entry: Entry) -> tuple[Path, Any, Any]:
     from armsight.loop.references.file import read_recording
 
     if entry.source is None:
-        raise InputError(f'[{entry.reference.name}]: no source; name its recording: source = "imu.csv"')
+        raise InputError(f'{entry.where}: no source; name its recording: source = "imu.csv"')
     return entry.source, *read_recording(entry.source, type(entry.reference))
 
 
@@ -217,17 +211,9 @@ def _check(entry: Entry) -> tuple[dict[str, Any], list[str], list[str]]:
 
     source, t_s, z = _recording(entry)
     name, stream = entry.reference.name, check_stream(t_s, z, str(source))
-    values: dict[str, Any] = {
-        "name": name,
-        "readings": len(t_s),
-        "rate_hz": stream.rate_hz,
-        "jitter_s": stream.jitter_s,
-        "gaps": stream.gaps,
-        "longest_gap_s": stream.longest_gap_s,
-        "doubled": stream.doubled,
-        "frozen_s": stream.frozen_s,
-        "saturated": ["_".join(COLUMNS[type(entry.reference)][k].split("_")[:2]) for k in stream.saturated],
-    }
+    kept = ("rate_hz", "jitter_s", "gaps", "longest_gap_s", "doubled", "frozen_s")
+    values: dict[str, Any] = {"name": name, "readings": len(t_s)} | {each: getattr(stream, each) for each in kept}
+    values["saturated"] = ["_".join(COLUMNS[type(entry.reference)][k].split("_")[:2]) for k in stream.saturated]
     lines = [
         f"{name}: {len(t_s)} readings, {stream.rate_hz:.4g} Hz, jitter {1e3 * stream.jitter_s:.2g} ms, "
         f"{stream.gaps} gaps, the longest {1e3 * stream.longest_gap_s:.0f} ms"

@@ -135,12 +135,15 @@ def _of_source(request: Request, recorded: RecordedRun | None, say: Callable[[st
 
 def _of_images(request: Request, source: Source, bag: Bag | None, say: Callable[[str], None]) -> Replayed:
     assert request.target is not None
-    for note in notes_of(source):
+    said = notes_of(source)
+    for note in said:
         say(f"note: {note}")
     target, rig = open_target(request.target), _rig(request, bag, {})
     published = Published(rig, target.body, properties=_PROPERTIES)
     with contextlib.closing(open_streams(request.streams, published, say)) as publisher:
         replayed = replay_source(rig, target, source, pace=Pace(request.rate), publisher=publisher)
+    for note in notes_of(source)[len(said) :]:
+        say(f"note: {note}")
     return replayed if bag is None else _with_joints(replayed, bag, say)
 
 

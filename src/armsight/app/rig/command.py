@@ -25,7 +25,7 @@ def command() -> None:
 
     Read are OpenCV's stereo calibrations (YAML, XML, JSON, .npz, any names), ROS's camera_info (left.yaml
     right.yaml), Kalibr's and OpenVINS's camchain.yaml, EuRoC's sensor.yaml, Basalt, ORB-SLAM, caliscope, aniposelib,
-    multical, mrcal (left.cameramodel right.cameramodel), Stereolabs (SN*.conf)
+    multical, mrcal (left.cameramodel right.cameramodel), Stereolabs (SN*.conf), Luxonis (eepromToJsonFile)
     and MATLAB's stereoParameters (jsonencode).
     """
 

@@ -17,12 +17,29 @@ from armsight.loop.running.data import Datum, ShotDatum
 TICK_S = 0.25
 #: A sink that has this share of what may wait does not pause: before data are dropped a command may come late.
 _BEHIND = 0.25
+#: Images that wait, MB: 46 pairs of 720p in colour; half: a pause of a second costs images, double: half a gigabyte.
+_IMAGES_MB = 256
 #: How long :meth:`Sink.close` waits for the thread, s, where nothing else is said.
 CLOSE_S = 10.0
 
 
+def _image_bytes(datum: Datum) -> int:
+    """Return how much memory the images of a datum take."""
+    shot = datum.shot if isinstance(datum, ShotDatum) else None
+    raw = (shot.left, shot.right) if shot is not None else ()
+    return sum(each.nbytes for each in raw if each is not None) + sum(map(len, (shot and shot.encoded) or ()))
+
+
+def _without_images(datum: Datum) -> Datum:
+    if not isinstance(datum, ShotDatum):
+        return datum
+    return replace(datum, shot=replace(datum.shot, left=None, right=None, encoded=None))
+
+
 class Sink:
     """A publisher with a thread. The oldest datum is dropped where more than ``limit`` wait: the latest win, counted.
+
+    Where the images that wait take too much memory, the oldest of these are dropped, and counted.
 
     Args:
         wakes: so many that wait wake the thread; fewer wait for at most ``TICK_S``. A thread that is woken for every datum
@@ -41,6 +58,7 @@ class Sink:
         self.problem: str | None = None
         self._limit, self._wakes, self._close_s = limit, wakes, close_s
         self._queue: deque[Datum] = deque()
+        self._bytes = 0  # of the images in it; those that are being written wait no more
         self._changed = threading.Condition()
         self._closing = False
         self._may_write = threading.Event()
@@ -53,18 +71,30 @@ class Sink:
 
     def put(self, datum: Datum) -> None:
         """Take a datum and return at once."""
-        if not self._images and isinstance(datum, ShotDatum):
-            datum = replace(datum, shot=replace(datum.shot, left=None, right=None, encoded=None))
+        datum = datum if self._images else _without_images(datum)
         with self._changed:
             if self._closing or self.problem is not None:
                 return
             self.taken += 1
             if len(self._queue) >= self._limit:
-                self._queue.popleft()
+                self._bytes -= _image_bytes(self._queue.popleft())
                 self.dropped += 1
             self._queue.append(datum)
+            self._bytes += _image_bytes(datum)
+            if self._bytes > _IMAGES_MB * 1e6:
+                self._drop_images()
             if len(self._queue) >= self._wakes:
                 self._changed.notify()
+
+    def _drop_images(self) -> None:
+        """Drop the images of the oldest data that have some, until few enough wait."""
+        for k, datum in enumerate(self._queue):
+            if self._bytes <= _IMAGES_MB * 1e6:
+                break
+            if size := _image_bytes(datum):
+                self._queue[k] = _without_images(datum)
+                self._bytes -= size
+                self.dropped += 1
 
     def pause(self) -> None:
         """Begin to write no other datum until :meth:`resume`, for ``TICK_S`` each at the most, unless much waits.
@@ -93,7 +123,7 @@ class Sink:
                 with self._changed:
                     if len(self._queue) < self._wakes and not self._closing:
                         self._changed.wait(TICK_S)
-                    waiting, self._queue = self._queue, deque()
+                    waiting, self._queue, self._bytes = self._queue, deque(), 0
                     closing = self._closing
                 for n, datum in enumerate(waiting):
                     if len(waiting) - n + len(self._queue) < _BEHIND * self._limit:

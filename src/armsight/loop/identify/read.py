@@ -16,14 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array
-from armsight.errors import InputError, nearest
+from armsight.errors import InputError
 from armsight.loop.handeye.recording import matched_rows
 from armsight.loop.identify.measured import Measured, Read
 from armsight.robot.kinematics.arm import Arm
 from armsight.robot.kinematics.table import FEWEST_JOINTS, MOST_JOINTS
 from armsight.tables.cells import Cells, Renames, Rows, column_parts, read_cells, read_columns
 from armsight.tables.columns import COLUMNS as _COLUMNS
-from armsight.tables.columns import NAMES, Columns
+from armsight.tables.columns import NAMES, TIMES, Columns, joint_columns
 from armsight.tables.lengths import number
 from armsight.tables.poses import ArmJoints, PoseTable, columns_in, read_pose_table
 from armsight.tables.rotations import ROTATIONS
@@ -60,7 +60,8 @@ def read_poses(
     Raises:
         InputError: unreadable, columns missing, fields that are no numbers, or hardly a row without gaps.
     """
-    return _poses_in(Path(path), read_cells(Path(path), read_columns(columns, (*COLUMNS, "pose"))), rotation, arm)
+    known = (*COLUMNS, *joint_columns(() if arm is None else arm.joint_names), "pose")
+    return _poses_in(Path(path), read_cells(Path(path), read_columns(columns, known)), rotation, arm)
 
 
 def read_measured(
@@ -82,7 +83,8 @@ def read_measured(
     if joints is None:
         return read_poses(data, rotation=rotation, columns=columns, arm=arm)
     parts = column_parts(columns)
-    theirs = [part for part in parts if re.match(r"\s*(?:q\d+_|image|name|shot)", part)]
+    own = (*NAMES, *joint_columns(arm.joint_names))
+    theirs = [part for part in parts if part.partition("=")[0].strip() in own or re.match(r"\s*q\d+_", part)]
     table = read_pose_table(joints, columns=theirs, arm=arm, only_joints=True)
     ours = [part for part in parts if part not in theirs]
     cells, notes = _with_joints(data, read_cells(data, read_columns(ours, COLUMNS), "seen"), table)
@@ -109,8 +111,9 @@ def _with_joints(data: Path, read: Cells, table: PoseTable) -> tuple[Cells, list
 def _angles(data: Path, head: list[str], rows: Rows, table: PoseTable) -> tuple[dict[int, Array], list[str]]:
     """Return the joint angles (J,), rad, of rows by their lines, paired by time, name or order; and notes."""
     assert table.q is not None
-    if table.names is None and len(table.q) != len(rows) and table.t_s is not None and "t_s" in head:
-        return _at_rest(data, [(line, row[head.index("t_s")]) for line, row in rows], table)
+    timed = [k for k, name in enumerate(head) if name in TIMES]
+    if table.names is None and len(table.q) != len(rows) and table.t_s is not None and timed:
+        return _at_rest(data, [(line, row[timed[0]]) for line, row in rows], table)
     key = next((name for name in NAMES if name in head), None)
     if table.names is not None and key is None:
         raise InputError(
@@ -175,7 +178,8 @@ def _poses_in(path: Path, cells: Cells, rotation: str | None, arm: ArmJoints | N
     numbers = table.numbers(requested, gaps=True)
     good = np.array(np.isfinite(numbers).all(axis=1))
     notes = (*notes, *unused, *_gaps(table, requested, numbers), *_repeated(table, numbers, good))
-    table = Columns(path, table.head, [row for row, kept in zip(table.rows, good, strict=True) if kept], links)
+    rows = [row for row, kept in zip(table.rows, good, strict=True) if kept]
+    table = Columns(path, table.head, rows, links, table.given)
     p, q = np.stack([unit * table.numbers(point) for point in points], axis=1), table.joints(joints)
     measured = Measured(q, p, approach=_sides(table, approach))
     if rotated:
@@ -209,7 +213,7 @@ def _joints(table: Columns, arm: ArmJoints | None) -> list[str]:
         most = 6 if arm is None else len(arm.joint_names)
         raise InputError(
             f"{table.path}: line 1: no joint angles; columns q1_rad .. q{most}_rad or q1_deg .. q{most}_deg are needed, "
-            f"there are {nearest('q1_deg', table.at)}"
+            f"there are {table.near('q1_deg')}"
         )
     if not FEWEST_JOINTS <= len(joints) <= MOST_JOINTS:
         raise InputError(
@@ -233,7 +237,7 @@ def _points(table: Columns) -> tuple[list[list[str]], float]:
             return [[f"{axis}{suffix}" for axis in "xyz"]], metres
     raise InputError(
         f"{table.path}: line 1: no point 1; columns p1_x_mm .. p1_z_mm, or x_m .. z_m, are needed, there are "
-        f"{nearest('p1_x_mm', table.at)}: --columns p1_x_mm=NAME,... gives yours"
+        f"{table.near('p1_x_mm')}: --columns p1_x_mm=NAME,... gives yours"
     )
 
 

@@ -59,6 +59,7 @@ class Entry(Record):
         live: where it is read in a run; None where that is not said.
         rate_hz: readings a second, as the file says; None where it does not.
         calibrated: whether the file has its parameters.
+        where: the file and the name of its table, for messages.
     """
 
     reference: Sensor
@@ -67,6 +68,7 @@ class Entry(Record):
     live: str | None
     rate_hz: float | None
     calibrated: bool
+    where: str = ""
 
 
 def read_references(path: Path) -> list[Entry]:
@@ -111,7 +113,7 @@ def _entry(path: Path, name: str, table: dict[str, Any]) -> Entry:
     if "parameters" in table:
         sensor = _known(where, sensor, table["parameters"], table.get("covariance"))
     source = path.parent / table["source"] if "source" in table else None
-    return Entry(sensor, like, source, table.get("live"), table.get("rate_hz"), "parameters" in table)
+    return Entry(sensor, like, source, table.get("live"), table.get("rate_hz"), "parameters" in table, where)
 
 
 def _known(where: str, sensor: Sensor, given: object, covariance: object) -> Sensor:

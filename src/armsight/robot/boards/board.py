@@ -71,7 +71,6 @@ class Board(Closing):
     status: BoardStatus  #: its newest status
     joints: JointReport  #: its newest report of how the joints are driven
     abilities: Abilities  #: what it can do
-    homed = True  #: of its encoders that count it does not say so: with them enabling is rejected
 
     def __init__(self, link: Link, name: str) -> None:
         self.name, self._link, self._wire = name, link, Wire(link)
@@ -239,6 +238,11 @@ class Board(Closing):
         does = "holds the arm where it comes to rest" if reaction == Reaction.HOLD else "switches the drives off"
         slows = "slows down and " if reaction == Reaction.HOLD else ""
         return f"; without commands the board {slows}{does} after {ticks / self._ticks_per_s * 1e3:.0f} ms"
+
+    @property
+    def homed(self) -> bool:
+        """Whether all encoders that count were homed since power-on; one that missed counts is not any more."""
+        return not self.status.not_homed
 
     @property
     def broken_messages(self) -> int:

@@ -76,6 +76,7 @@ class BoardStatus:
     stale_commands: int = 0  #: commands dropped because a newer one had come already
     lost_messages: int = 0  #: messages from the host that are missing in the count of the frames
     config_stored: int = 0  #: configurations stored since the start
+    not_homed: int = 0  #: joints whose encoder counts and was not homed since power-on, a bit each
 
     @property
     def drives_on(self) -> bool:

@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 
 #: Format name -> the module here that reads it, imported when it is opened; those of ``programs.py`` are asked first.
 FORMATS = dict.fromkeys(
-    ("stereolabs", "mrcal", "basalt", "orbslam", "multical", "caliscope", "stereoparams", "kalibr"), "programs"
+    ("stereolabs", "mrcal", "basalt", "orbslam", "multical", "caliscope", "depthai", "stereoparams", "kalibr"),
+    "programs",
 ) | {"ros": "ros", "opencv": "opencv"}
 #: Those that are written, too.
 EXPORTED = ("opencv", "ros", "kalibr")

@@ -37,6 +37,12 @@ orbslam: ORB-SLAM's stereo settings: ORB-SLAM3's Camera1.fx .. and Stereo.T_c1_c
 T_c1_c2 takes the right camera's coordinates to the left one's, m; of images that are rectified already the file has
 Stereo.b, the baseline, alone. LEFT and RIGHT are ROS's matrices, and are read as those.
 
+depthai: Luxonis' calibration of a device, CalibrationHandler.eepromToJsonFile's: ``cameraData``, sockets and their cameras,
+called CAM_A, CAM_B, .. The left and the right one are those of ``stereoRectificationData``.
+
+``extrinsics`` take a camera's coordinates to those of ``toCameraSocket``, p_to = R p + t, cm whatever its lengthUnit says
+(depthai 3.12.0 reads them so). They are of raw images of the size beside them, not of StereoDepth's rectified ones.
+
 stereoparams: MATLAB's stereoParameters as JSON, by jsonencode of the object or of toStruct(stereoParams).
 
 Pixels count from 1 there; K, or IntrinsicMatrix, its transpose; ImageSize is (height, width). RotationOfCamera2 is
@@ -50,7 +56,7 @@ from pathlib import Path
 
 import numpy as np
 
-from armsight.data import Array
+from armsight.data import SIDES, Array
 from armsight.errors import InputError
 from armsight.files import natural_key
 from armsight.geometry.check import checked
@@ -202,6 +208,58 @@ def _multical_pose(entries: Entries, name: str) -> tuple[Array, list[str]]:
     if name not in poses:
         raise InputError(f"camera_poses has no {name}; there are {', '.join(poses)}")
     return rigid(need(poses[name], "R"), need(poses[name], "T"), f"R of {name}")
+
+
+#: Luxonis' cameraType -> the lens, and how many of the coefficients beside it are its.
+_DEPTHAI_LENSES = {0: ("perspective", 14), 1: ("fisheye", 4)}
+
+
+def _depthai_entries(documents: Sequence[Document], paths: Sequence[Path]) -> Entries:
+    """Return the cameras, the left and the right one first, each with its step towards the reference, m."""
+    stereo = documents[0].get("stereoRectificationData")
+    first = [stereo.get(f"{side}CameraSocket") for side in SIDES] if isinstance(stereo, Mapping) else []
+    entries = dict[str, Mapping[str, Foreign]]()
+    try:
+        cameras = {int(socket): camera for socket, camera in need(documents[0], "cameraData")}
+        for socket in sorted(cameras, key=lambda socket: (first.index(socket) if socket in first else 2, socket)):
+            camera, step = cameras[socket], cameras[socket]["extrinsics"]
+            lens, count = _DEPTHAI_LENSES.get(camera["cameraType"], (f"cameraType {camera['cameraType']}", 0))
+            entries[_socket(socket)] = {
+                "K": camera["intrinsicMatrix"],
+                "distortion": camera["distortionCoeff"][:count],
+                "distortion_model": lens,
+                "image_size": (camera["width"], camera["height"]),
+                "to": _socket(step["toCameraSocket"]),
+                "rotation": step["rotationMatrix"],
+                "translation_m": [0.01 * step["translation"][axis] for axis in "xyz"],
+            }
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"cameraData is not as depthai writes it: {error!r}") from None
+    return entries
+
+
+def _depthai_pose(entries: Entries, name: str) -> tuple[Array, list[str]]:
+    """Return a camera's pose before the one that all lead to."""
+    T, at, notes = np.eye(4), name, ["raw images, not rectified ones; lengths read as cm"]
+    for _ in entries:
+        if (to := entries[at]["to"]) in entries:
+            step, said = rigid(entries[at]["rotation"], entries[at]["translation_m"], f"rotation of {at}")
+            T, at, notes = step @ T, to, notes + said
+    if at != _reference(entries, next(iter(entries))) or entries[at]["to"] in entries:
+        raise InputError(f"the extrinsics of {name} lead to {at}, not to the other camera: they were not calibrated")
+    return inverse(T), notes
+
+
+def _reference(entries: Entries, name: str) -> str:
+    """Return the camera that a camera's steps lead to."""
+    for _ in entries:
+        name = entries[name]["to"] if entries[name]["to"] in entries else name
+    return name
+
+
+def _socket(number: int) -> str:
+    """Return the name of a socket of Luxonis' boards."""
+    return f"CAM_{chr(ord('A') + number)}"
 
 
 #: Name of a resolution in the file -> its image size, px.
@@ -459,6 +517,12 @@ FORMATS = {
         "a Kalibr camchain",
         ((1, 2), "one file, camchain.yaml, or two sensor.yaml, the left camera's first"),
         *(_kalibr_recognises, _kalibr_entries, _kalibr_pose, _kalibr_write),
+    ),
+    "depthai": posed_format(
+        "Luxonis' calibration of a device as JSON",
+        ((1,), "one file, of eepromToJsonFile"),
+        lambda documents: any(isinstance(document.get("cameraData"), list) for document in documents),
+        *(_depthai_entries, _depthai_pose),
     ),
     "stereolabs": RigFormat("a Stereolabs SN*.conf", _stereolabs_recognises, _stereolabs_read),
     "orbslam": RigFormat("ORB-SLAM's stereo settings", _orbslam_recognises, _orbslam_read),

@@ -203,11 +203,11 @@ class LeRobotSource(PlayedSource):
         notes = tuple(f"episode {number}: {why}: left out" for number, why in missing.items())
         super().__init__(self._read, len(self._rows), notes)
 
-    def _read(self) -> Generator[Shot]:
+    def _read(self, every: int) -> Generator[Shot]:
         number, views = None, tuple[_View, ...]()
         begin_s, last_s = 0.0, 0.0
         try:
-            for row, t_s, episode, frame in self._rows:
+            for row, t_s, episode, frame in self._rows[::every]:
                 if number != episode:
                     # Episodes begin at 0 each; a shot's times must rise.
                     begin_s = 0.0 if number is None else last_s + 1.0

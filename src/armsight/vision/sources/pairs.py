@@ -21,7 +21,7 @@ import numpy as np
 from armsight.data import Image, Shot
 from armsight.errors import InputError
 from armsight.files import natural_key
-from armsight.vision.image import DEPTH_IMAGES, BitDepth, images_of, read_image
+from armsight.vision.image import BitDepth, read_image
 from armsight.vision.source import PlayedSource
 
 #: Endings of video files, in lower case.
@@ -72,13 +72,11 @@ class StoredSource(PlayedSource):
 
     def __init__(self, pairs: Sequence[StoredPair], depth: BitDepth | None = None) -> None:
         self.pairs = tuple(pairs)
-        every = max(1, -(-2 * len(self.pairs) // DEPTH_IMAGES))
-        depth = depth or BitDepth(lambda: images_of(pair.load() for pair in self.pairs[::every]))
         super().__init__(self._load, len(self.pairs), depth=depth)
         self.timed = any(pair.t_s is not None for pair in self.pairs)
 
-    def _load(self) -> Generator[Shot]:
-        yield from (pair.load() for pair in self.pairs)
+    def _load(self, every: int = 1) -> Generator[Shot]:
+        yield from (pair.load() for pair in self.pairs[::every])
 
     @property
     def files(self) -> tuple[Path, ...]:

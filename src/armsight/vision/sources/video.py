@@ -179,6 +179,7 @@ class Film:
         promised_s: how long the file says its images last, s, an estimate in some containers; 0 where it does not say.
         begin_s: when it begins by its own clock, s.
         late_s: how much later than the times' zero it begins, s.
+        coded_s: when its first frame is to be decoded by its own clock, s: before it is shown, where frames are reordered.
         frames: how many were decoded.
         undecoded: how many could not be.
         t_s, end_s: when the current frame is shown, from the beginning, and until when, s.
@@ -212,6 +213,7 @@ class Film:
         self.promised_s = self._promised_s()
         self.frames = self.undecoded = 0
         self.t_s = self.end_s = 0.0
+        self.coded_s: float | None = None
         self._frame: VideoFrame | None = None
         self._frames: Iterator[VideoFrame] = self._decoded()
         first = list(itertools.islice(self._frames, 1))  # the rotation stands in the frames alone
@@ -228,6 +230,11 @@ class Film:
         if context.width * context.height > MOST_PIXELS:
             return f"frames of {context.width}x{context.height} px, more than {MOST_PIXELS >> 20} Mpx"
         return None if context.width * context.height else "damaged: its frames have no size"
+
+    @property
+    def is_transport_stream(self) -> bool:
+        """Whether its container is an MPEG-TS."""
+        return "mpegts" in self._container.format.name
 
     def _promised_s(self) -> float:
         """Return how long the file says its images last, s; the container's duration is that of its sound, too."""
@@ -247,6 +254,8 @@ class Film:
         """Yield what can be decoded; a damaged packet is counted, a damaged container is the end."""
         with contextlib.suppress(self._error, ValueError):
             for packet in self._container.demux(self._stream):
+                if self.coded_s is None and packet.dts is not None:
+                    self.coded_s = float(packet.dts * self._time_base)
                 try:
                     yield from packet.decode()
                 except self._error:
@@ -383,6 +392,11 @@ def _one_clock(first: Film, last: Film) -> tuple[str, ...]:
     late_s = later.begin_s - early.begin_s
     if late_s <= early.period_s / 2:
         return ()
+    # FFmpeg's muxer (9.0) begins a file with its first frame in the order of decoding: one with B-frames begins that later.
+    if early.is_transport_stream and later.is_transport_stream and early.coded_s == later.coded_s:
+        return (
+            f"{later.path} begins {late_s:.3f} s after {early.path} as its frames are reordered: paired from the first on",
+        )
     if 0 < early.promised_s <= late_s:
         return (f"{later.path} begins {late_s:.3f} s after {early.path}, past its end: their beginnings are paired",)
     later.late_s = later.t_s = late_s

@@ -84,12 +84,13 @@ class BagSource(PlayedSource):
         self.topics, self._bag, self._planned = topics, bag, planned_shots(pairing, stamps)
         super().__init__(self._read, len(self._planned), (*bag.notes, *pairing.notes))
 
-    def _read(self) -> Generator[Shot]:
-        whole = [tuple(enumerate(planned.messages)) if planned.problem is None else () for planned in self._planned]
+    def _read(self, every: int) -> Generator[Shot]:
+        plan = self._planned[::every]
+        whole = [tuple(enumerate(planned.messages)) if planned.problem is None else () for planned in plan]
         due = {key: k for k, needed in enumerate(whole) for key in needed}
         held: dict[tuple[int, int | None], BagMessage] = {}
         messages, passes, size = self._bag.messages(self.topics), 0, 0
-        for number, (planned, needed) in enumerate(zip(self._planned, whole, strict=True)):
+        for number, (planned, needed) in enumerate(zip(plan, whole, strict=True)):
             name = f"{number:06d}"
             while any(key not in held for key in needed) and passes <= number + 1:
                 message = next(messages, None)
