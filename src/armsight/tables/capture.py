@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 import io
+import itertools
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -49,11 +50,7 @@ class _Export(NamedTuple):
 def capture_rows(path: Path, text: str, side: str, whose: str | None) -> ProgramPoints | None:
     """Return the times and poses of a rigid body, without the frames that lack it; None where the text is no such export.
 
-    Args:
-        path: the file.
-        text: what it holds.
-        side: "robot" or "seen": whose poses these are, for messages.
-        whose: the name of the body; None: the only one.
+    ``whose``: the name of the body; None: the only one. ``side``: "robot" or "seen", for the option in messages.
 
     Raises:
         InputError: no rigid body, rotations that are not unambiguous, or several bodies; the program and what to export.
@@ -74,7 +71,8 @@ def capture_rows(path: Path, text: str, side: str, whose: str | None) -> Program
         raise InputError(f"{said} whose rotations are three numbers: {_ADVICE[program]}")
     if (unit_m := _UNITS_M.get(export.unit.lower())) is None:
         raise InputError(f"{said} with lengths in {export.unit!r}; known are {', '.join(_UNITS_M)}")
-    frames = list(_frames(export))
+    lines = itertools.dropwhile(lambda line: not _is_frame(line), enumerate(export.lines, export.first_line))
+    frames = list(itertools.takewhile(_is_frame, lines))  # up to the empty one before what else was exported
     rows = list(_rows(path, export, [at[name] for name in (*_POSITION, *rotation)], unit_m, frames))
     if not rows:
         raise InputError(f"{said}: none of its {len(frames)} frames has a pose of the body")
@@ -114,16 +112,8 @@ def _export(text: str) -> _Export | None:
     return None
 
 
-def _frames(export: _Export) -> Iterator[_Line]:
-    """Yield the lines of frames, up to the empty one before what else was exported."""
-    began = False
-    for line, row in enumerate(export.lines, export.first_line):
-        frame = bool(row) and number(row[0]) is not None
-        if began and not frame:
-            return
-        began = frame
-        if frame:
-            yield line, row
+def _is_frame(line: _Line) -> bool:
+    return bool(line[1]) and number(line[1][0]) is not None
 
 
 def _of_motive(above: list[list[str]], head: list[str]) -> tuple[_Bodies, str]:
