@@ -38,10 +38,13 @@ void core_init(core_state *core, const core_config *config, uint32_t source, uin
 static void measure(core_state *core, joint_state *joint, const joint_config *config, uint32_t i, uint32_t counts)
 {
     const bool known = joint->pot.valid != 0u;
-    const uint32_t fault =
-        config->encoder.sensor == SENSOR_POTENTIOMETER
-            ? pot_read(&joint->pot, &config->pot, counts, core->config.pot_ticks)
-            : encoder_read(&joint->encoder, &joint->pot, config, counts, core->config.pot_ticks);
+    uint32_t fault;
+    if (config->encoder.sensor == SENSOR_POTENTIOMETER) {
+        fault = pot_read(&joint->pot, &config->pot, counts, core->config.pot_ticks);
+    } else {
+        fault = encoder_read(&joint->encoder, &joint->pot, config, counts, core->config.pot_ticks);
+        core->not_homed |= encoder_is_homed(&joint->encoder, config) ? 0u : 1u << i;
+    }
     if (fault != FAULT_NONE) {
         safety_raise(core, fault, i);
     }
@@ -128,7 +131,7 @@ static void drive(core_state *core)
 {
     const float per_nominal_v = 1000.0f / (float)core->config.supply_nominal_mv;
     advance_arm(core);
-    for (uint32_t i = 0u; core->elastic != 0u && i < core->config.joint_count; i++) {
+    for (uint32_t i = 0u; core->by_motor != 0u && i < core->config.joint_count; i++) {
         motor_damp(&core->joint[i].motor, core->joint[i].pid.speed_rad_s);
     }
     for (uint32_t i = 0u; i < core->config.joint_count; i++) {
@@ -144,18 +147,6 @@ static void drive(core_state *core)
     safety_watch_joints(core);
 }
 
-/* Put out the joints' duties, for the present supply: gains are those of the nominal one. */
-static void put_out(core_state *core, uint32_t supply_mv)
-{
-    const uint32_t least_mv = core->config.supply_nominal_mv / 2u; /* a sensor of the supply may fail too */
-    const float scale = (float)core->config.supply_nominal_mv / (float)(supply_mv > least_mv ? supply_mv : least_mv);
-    const bool on = safety_drives_on(core);
-    for (uint32_t i = 0u; i < core->config.joint_count; i++) {
-        joint_state *joint = &core->joint[i];
-        joint->motor.duty = on && joint->released == 0u ? number_bound(joint->pid.duty * scale, 1.0f) : 0.0f;
-    }
-}
-
 /* Let the references rest where the joints are, so that nothing is left of the last motion. */
 static void rest(core_state *core)
 {
@@ -164,6 +155,7 @@ static void rest(core_state *core)
         setpoint_hold(&joint->setpoint, joint->pot.angle_rad);
         governor_hold(&joint->reference, joint->pot.angle_rad);
         joint->released = 0u;
+        joint->motor.alone = 0u;
         joint->pid.integral_duty = 0.0f;
         joint->pid.duty = 0.0f;
         joint->pid.error_rad = 0.0f;
@@ -187,13 +179,16 @@ static void close_brakes(core_state *core)
     core->state = core->faults != 0u ? STATE_FAULTED : STATE_DISABLED;
 }
 
-/* Write every field of the outputs. */
-static void report(const core_state *core, core_outputs *outputs)
+/* Write every field of the outputs: the joints' duties for the present supply, as gains are those of the nominal one. */
+static void report(core_state *core, core_outputs *outputs, uint32_t supply_mv)
 {
+    const uint32_t least_mv = core->config.supply_nominal_mv / 2u; /* a sensor of the supply may fail too */
+    const float scale = (float)core->config.supply_nominal_mv / (float)(supply_mv > least_mv ? supply_mv : least_mv);
+    const bool on = safety_drives_on(core);
     outputs->tick = core->tick;
-    outputs->drives_on = safety_drives_on(core) ? 1u : 0u;
+    outputs->drives_on = on ? 1u : 0u;
     outputs->windings_shorted = core->shorted;
-    outputs->brakes_open = safety_drives_on(core) && core->closing == 0u ? 1u : 0u;
+    outputs->brakes_open = on && core->closing == 0u ? 1u : 0u;
     outputs->feed_watchdog = 1u;
     outputs->state = core->state;
     outputs->faults = core->faults;
@@ -204,13 +199,11 @@ static void report(const core_state *core, core_outputs *outputs)
     outputs->rejected_sequence = core->rejected_sequence;
     outputs->rejected_count = core->rejected_count;
     outputs->rejection = core->rejection;
-    outputs->not_homed = 0u;
+    outputs->not_homed = core->not_homed;
     for (uint32_t i = 0u; i < JOINTS; i++) { /* of joints that are not there all is 0 */
-        const joint_state *joint = &core->joint[i];
+        joint_state *joint = &core->joint[i];
+        joint->motor.duty = on && joint->released == 0u ? number_bound(joint->pid.duty * scale, 1.0f) : 0.0f;
         outputs->joint_faults[i] = core->joint_faults[i];
-        if (i < core->config.joint_count && !encoder_is_homed(&joint->encoder, &core->config.joint[i])) {
-            outputs->not_homed |= 1u << i;
-        }
         outputs->limited[i] = joint->limited;
         outputs->duty[i] = (float)core->config.joint[i].motor_direction * joint->motor.duty;
         outputs->angle_rad[i] = joint->pot.angle_rad;
@@ -227,6 +220,7 @@ void core_tick(core_state *core, const core_inputs *inputs, core_outputs *output
         return;
     }
     core->standing = 0u;
+    core->not_homed = 0u;
     const bool closed = core->shorted != 0u; /* the windings, by drives on or off */
     core->supply_v = (float)inputs->supply_mv * 0.001f;
     const bool weak = inputs->supply_mv < core->config.supply_min_mv || core->supply_bad_ticks != 0u;
@@ -238,8 +232,8 @@ void core_tick(core_state *core, const core_inputs *inputs, core_outputs *output
         joint->current_a = (float)(config->motor_direction * inputs->current_ma[i]) * 0.001f - joint->zero.now_a;
         joint->over_a = number_size(joint->current_a) - (float)config->current_limit_ma * 0.001f;
         float angle_rad = joint->pot.angle_rad;
-        if (core->elastic != 0u) { /* where the motor is, by the reading and what the current twists between them */
-            angle_rad += joint->motor.twist_rad_per_a * joint->current_a;
+        if (core->by_motor != 0u) {
+            angle_rad = pid_measure_by_motor(joint, &config->gains);
         }
         if (closed) {
             if ((weak || joint->over_a > 0.0f) && joint->motor.duty != 0.0f) { /* what it does not put out is not known */
@@ -279,6 +273,5 @@ void core_tick(core_state *core, const core_inputs *inputs, core_outputs *output
             safety_watch_sleep(core);
         }
     }
-    put_out(core, inputs->supply_mv);
-    report(core, outputs);
+    report(core, outputs, inputs->supply_mv);
 }

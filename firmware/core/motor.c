@@ -88,23 +88,24 @@ void motor_start(motor_state *motor, float angle_rad, float speed_limit_rad_s, u
     const float duty = motor->duty;
     const bool new = motor->variance_rr == 0.0f; /* else it may still be as warm as it was */
     const float resistance = new ? 1.0f : motor->resistance_scale;
-    *motor = (motor_state){.duty = duty,
-                           .fastest_rad_s = speed_limit_rad_s > SEEN_RAD_S ? speed_limit_rad_s : SEEN_RAD_S,
-                           .last_rad = angle_rad,
-                           .part_rad = angle_rad,
-                           .window_rad = angle_rad,
-                           .window_side = SIDE_UNKNOWN,
-                           .resistance_scale = resistance,
-                           .constant_scale = 1.0f,
-                           .variance_rr = PRIOR_VARIANCE,
-                           .variance_kk = PRIOR_VARIANCE,
-                           .unsure_rad_s = UNKNOWN_RAD_S,
-                           .step_rad_s = UNKNOWN_RAD_S,
-                           .sample_ticks = SETTLE_TICKS + 1u,
-                           .part_ticks = SETTLE_TICKS,
-                           .rough_rad_s = ROUGH_RAD_S,
-                           .trust = CAREFUL,
-                           .phase = phase};
+    *motor = (motor_state){0};
+    motor->duty = duty;
+    motor->fastest_rad_s = speed_limit_rad_s > SEEN_RAD_S ? speed_limit_rad_s : SEEN_RAD_S;
+    motor->last_rad = angle_rad;
+    motor->part_rad = angle_rad;
+    motor->window_rad = angle_rad;
+    motor->window_side = SIDE_UNKNOWN;
+    motor->resistance_scale = resistance;
+    motor->constant_scale = 1.0f;
+    motor->variance_rr = PRIOR_VARIANCE;
+    motor->variance_kk = PRIOR_VARIANCE;
+    motor->unsure_rad_s = UNKNOWN_RAD_S;
+    motor->step_rad_s = UNKNOWN_RAD_S;
+    motor->sample_ticks = SETTLE_TICKS + 1u;
+    motor->part_ticks = SETTLE_TICKS;
+    motor->rough_rad_s = ROUGH_RAD_S;
+    motor->trust = CAREFUL;
+    motor->phase = phase;
 }
 
 static void way_begin(motor_state *motor)
@@ -152,17 +153,21 @@ static float window_noise(motor_state *motor, const motor_config *config, float 
     return WINDOW_NOISE_RAD + crossed * config->backlash_rad + twist_rad + motor->uneven * number_size(way_rad);
 }
 
+static inline void warms(motor_state *motor, const motor_config *config, uint32_t ticks)
+{
+    if (motor->variance_rr < WARM_VARIANCE) {
+        const float sigma = number_root(motor->variance_rr) + WARMS * (float)ticks;
+        motor->variance_rr = sigma * sigma;
+        motor->unsure_per_a = SIGMAS * sigma * config->resistance_ohm / config->constant_v_s;
+    }
+}
+
 /* Learn both scales from the last window: v = r (R i) + k (K w), by recursive least squares (Kalman's form). */
 static void learn(motor_state *motor, const motor_config *config)
 {
     const bool moved = motor->window_side != SIDE_UNKNOWN;
-    const float ticks = (float)motor->mean_ticks;
-    const float wander = WANDER_VARIANCE * ticks;
-    if (motor->variance_rr < WARM_VARIANCE) { /* also where nothing is learnt; a temperature that rises is no random walk */
-        const float sigma = number_root(motor->variance_rr) + WARMS * ticks;
-        motor->variance_rr = sigma * sigma;
-        motor->unsure_per_a = SIGMAS * sigma * config->resistance_ohm / config->constant_v_s;
-    }
+    warms(motor, config, motor->mean_ticks); /* also where nothing is learnt */
+    const float wander = WANDER_VARIANCE * (float)motor->mean_ticks;
     const float ir_v = motor->mean_ir_v;
     const float kw_v = motor->mean_kw_v;
     const float noise_v = motor->mean_noise_v;
@@ -212,6 +217,9 @@ static uint32_t weak_parts(const motor_state *motor, bool agreed)
     return FAULT_BIT(FAULT_MOTOR) | (sure ? 0u : FAULT_BIT(FAULT_POT_SCALE));
 }
 
+/* Return where the oldest of what is known of late stands. */
+static uint32_t oldest_of(const motor_state *motor) { return motor->known > MOTOR_KNOWN ? motor->known % MOTOR_KNOWN : 0u; }
+
 /* Look whether the constant is less than it was: not behind a spring, on which a joint swings while dry friction holds its motor. */
 static void weakened(motor_state *motor)
 {
@@ -223,7 +231,7 @@ static void weakened(motor_state *motor)
     const float by_tr = (rr * motor->lately_tk - motor->lately_tr * motor->lately_rk) * per_square;
     const float kk = motor->lately_kk - by_r * motor->lately_rk - by_tr * motor->lately_tk;
     const float kv = motor->lately_kv - by_r * rv - by_tr * motor->lately_tv;
-    const uint32_t oldest = motor->known > MOTOR_KNOWN ? motor->known % MOTOR_KNOWN : 0u;
+    const uint32_t oldest = oldest_of(motor);
     const float by_rv = (ttr * rv - motor->lately_tr * motor->lately_tv) * per_square;
     const float by_tv = (rr * motor->lately_tv - motor->lately_tr * rv) * per_square;
     const float left = motor->lately_vv + motor->resistance_scale * motor->resistance_scale / WARM_VARIANCE - by_rv * rv -
@@ -265,6 +273,8 @@ static void lately(motor_state *motor)
     if (motor->driven_ticks >= (motor->known + 1u) * KNOWN_TICKS) {
         motor->known_k[motor->known % MOTOR_KNOWN] = motor->constant_scale;
         motor->known_kk[motor->known % MOTOR_KNOWN] = motor->variance_kk;
+        motor->known_r[motor->known % MOTOR_KNOWN] = motor->resistance_scale;
+        motor->known_rr[motor->known % MOTOR_KNOWN] = motor->variance_rr;
         motor->known++;
     }
     motor->weakened = 0u;
@@ -431,7 +441,7 @@ static void sample(motor_state *motor, const motor_config *config, float ir_v, f
     motor->sample_a[at] = motor->part_a;
     motor->sampled++;
     motor->step_rad_s = STEP_RAD_S + ROUGH_TIMES * motor->rough_rad_s;
-    const float ohm = motor->doubted != 0u || motor_stepped(motor) ? 0.0f : config->resistance_ohm;
+    const float ohm = (motor->doubted | motor->alone) != 0u || motor_stepped(motor) ? 0.0f : config->resistance_ohm;
     motor->heard_rad_s = motor->current_a * ohm / (DEAD_SHARE * config->constant_v_s);
     const uint32_t slot = motor->driven_ticks + motor->phase;
     motor->sample_ticks = motor->driven_ticks + SAMPLE_TICKS - slot % SAMPLE_TICKS;
@@ -506,10 +516,32 @@ void motor_doubt(motor_state *motor, const motor_config *config)
     }
 }
 
+void motor_warms(motor_state *motor, const motor_config *config, uint32_t ticks) { warms(motor, config, ticks); }
+
+float motor_way(const motor_state *motor, bool yielding)
+{
+    return TICK_S * (motor->speed_rad_s + (yielding ? motor->unsure_per_a * motor->last_a : 0.0f));
+}
+
+void motor_recall(motor_state *motor)
+{
+    motor->alone = 1u;
+    if (motor->known == 0u) {
+        return;
+    }
+    const uint32_t oldest = oldest_of(motor);
+    motor->resistance_scale = motor->known_r[oldest];
+    motor->constant_scale = motor->known_k[oldest];
+    motor->variance_rr = motor->known_rr[oldest];
+    motor->variance_rk = 0.0f;
+    motor->variance_kk = motor->known_kk[oldest];
+}
+
 /* Take a change of the motor's speed in a tick that is beyond noise: by its torque, its uncertain numbers, or a step. */
 static void changed(motor_state *motor, const motor_config *config, float change_rad_s, float current_a)
 {
-    const float torque_rad_s = motor->swift_per_a * motor->current_a;
+    const float largest_a = number_size(motor->last_a) > motor->current_a ? number_size(motor->last_a) : motor->current_a;
+    const float torque_rad_s = motor->swift_per_a * largest_a;
     const float unsure_rad_s = motor->unsure_per_a * number_size(current_a - motor->last_a);
     if (change_rad_s <= motor->step_rad_s + torque_rad_s + unsure_rad_s || motor_stepped(motor)) {
         return; /* what steps on began with the first */
@@ -614,6 +646,8 @@ uint32_t motor_disagrees(const motor_state *motor, const motor_config *config, f
 
 #define NAME_SAMPLES 24u /* of the last 192 ms: most of them after the joint was let go of; half: noise names parts, double:
                             what was before the fault does */
+#define SLOW_RAD_S 0.1f /* rad/s; a reading that drifts more slowly holds its joint; half: weak motors are drifts, double: slow drifts
+                           are weak motors */
 #define NAME_NOISE_RAD 0.002f /* of a reading; half: noise names faults, double: small ones keep their first name */
 #define JUMP_SHARE 0.7f /* of the way between both, in one sample; half: slips look like jumps, double: no jump is
                            named */
@@ -691,6 +725,20 @@ static float left_by(const motor_sums *s, const combination y, const combination
     return product(s, y, y) - *slope * ay;
 }
 
+/* Take a column out of the sums: what is left of the others once they are fitted by it. */
+static void take_out(motor_sums *s, uint32_t column)
+{
+    const float square = s->of[column * COLUMNS + column];
+    for (uint32_t i = 0u; i < COLUMNS; i++) {
+        s->at[i] = square > 0.0f ? s->of[i * COLUMNS + column] / square : 0.0f;
+    }
+    for (uint32_t i = 0u; i < COLUMNS; i++) {
+        for (uint32_t j = 0u; j < COLUMNS; j++) {
+            s->of[i * COLUMNS + j] -= s->at[i] * s->at[j] * square;
+        }
+    }
+}
+
 /* Return what is left of the reading if it follows late: by least squares a k + x T/lag, of which x alone is what lag adds. */
 static float left_by_lag(const motor_sums *s, float *rate)
 {
@@ -720,6 +768,37 @@ static bool jumped(const motor_state *motor, const motor_config *config, uint32_
     return largest > 10.0f * NAME_NOISE_RAD && largest > JUMP_SHARE * (high - low);
 }
 
+/* Return whether a motor is weak whose reading went further, the reading drifts, or both where they cannot be distinguished. A
+ * drift, or a wrong resistance under a load, adds a steady speed: what is left without one follows the motor's changes of speed,
+ * one to one or further. A motor that rests shows a drift alone. */
+static uint32_t further(const motor_state *motor, motor_sums *s, uint32_t count, float drift, bool rests, float by_lag)
+{
+    const float per_sample = (float)SAMPLE_TICKS * TICK_S;
+    const float slow_rad = SLOW_RAD_S * per_sample; /* a sample */
+    const uint32_t weak = weak_parts(motor, motor->trust == 1.0f);
+    const float unsure_rad = motor->unsure_per_a * motor->current_a * per_sample;
+    bool shared = true;
+    if (!rests) {
+        float share;
+        take_out(s, TIME);
+        const float way = product(s, motors, motors);
+        const float left = left_by(s, reading, motors, &share) + (float)count * NAME_NOISE_RAD * NAME_NOISE_RAD;
+        const float sigma = number_root(left / ((float)count * way));
+        if (by_lag < LAG_SHARE * left) {
+            return FAULT_BIT(FAULT_POT_LAG);
+        }
+        if (share - 1.0f - WEAKENED > SIGMAS * sigma) {
+            return weak;
+        }
+        shared = share + sigma > 1.0f + 2.0f * WEAKENED;
+    }
+    if (number_size(drift) < slow_rad) {
+        return weak;
+    }
+    const bool either = shared && number_size(drift) < slow_rad + unsure_rad;
+    return FAULT_BIT(FAULT_POT_DRIFT) | (either ? FAULT_BIT(FAULT_MOTOR) : 0u);
+}
+
 uint32_t motor_names(const motor_state *motor, const motor_config *config, uint32_t suspect, motor_sums *s)
 {
     const uint32_t count = fewer(motor->sampled, NAME_SAMPLES);
@@ -731,15 +810,19 @@ uint32_t motor_names(const motor_state *motor, const motor_config *config, uint3
     }
     sums_of(motor, config, count, s);
     const float noise = (float)count * NAME_NOISE_RAD * NAME_NOISE_RAD;
-    if (product(s, motors, motors) < 4.0f * noise) { /* the motor rests */
-        return FAULT_BIT(product(s, reading, reading) > 4.0f * noise ? FAULT_POT_DRIFT : suspect);
-    }
+    const bool agreed = motor->trust == 1.0f;
     float share, drift, rate;
     const float by_share = left_by(s, reading, motors, &share) + noise;
     const float by_drift = left_by(s, gap, passing, &drift) + noise;
     const float least = by_share < by_drift ? by_share : by_drift;
-    const bool agreed = motor->trust == 1.0f;
+    const bool rests = product(s, motors, motors) < 4.0f * noise;
     const float by_lag = left_by_lag(s, &rate) + noise;
+    if (suspect == FAULT_POT_DRIFT && (rests || share > 1.0f)) {
+        return further(motor, s, count, drift, rests, rate > 0.0f ? by_lag : FLT_MAX);
+    }
+    if (rests) {
+        return FAULT_BIT(product(s, reading, reading) > 4.0f * noise ? FAULT_POT_DRIFT : suspect);
+    }
     if (by_lag < LAG_SHARE * least && rate > 0.0f) { /* a slip ends late, too */
         return FAULT_BIT(FAULT_POT_LAG) | (agreed && share > 0.0f && share < 1.0f ? FAULT_BIT(FAULT_POT_SLIP) : 0u);
     }
@@ -792,20 +875,6 @@ uint32_t motor_blames(const motor_state *motor, const motor_config *config, floa
         odds += number_bound((1.0f - 0.5f * less - motor->constant_seen) * less / variance, WEIGHS);
     }
     return (odds < DECIDES ? BIT_SENSOR : 0u) | (odds > -DECIDES ? BIT_MOTOR : 0u);
-}
-
-/* Take a column out of the sums: what is left of the others once they are fitted by it. */
-static void take_out(motor_sums *s, uint32_t column)
-{
-    const float square = s->of[column * COLUMNS + column];
-    for (uint32_t i = 0u; i < COLUMNS; i++) {
-        s->at[i] = square > 0.0f ? s->of[i * COLUMNS + column] / square : 0.0f;
-    }
-    for (uint32_t i = 0u; i < COLUMNS; i++) {
-        for (uint32_t j = 0u; j < COLUMNS; j++) {
-            s->of[i * COLUMNS + j] -= s->at[i] * s->at[j] * square;
-        }
-    }
 }
 
 void motor_weakens(motor_state *motor, const motor_config *config, motor_sums *s)

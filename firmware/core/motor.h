@@ -46,6 +46,10 @@ bool motor_flows_asleep(const zero_state *zero, const motor_config *config, floa
 /* Return how fast the motor surely is: sure_rad_s doubts it as at the last sample, and the current may be larger by now. */
 float motor_sure(const motor_state *motor);
 
+/* Return the way of a motor in a tick; yielding: by the least its winding may take of the voltage. Held at rest by that it gives
+ * way to its load as far as its resistance is uncertain, and is never driven on. Its constant has no part in it. */
+float motor_way(const motor_state *motor, bool yielding);
+
 /* Return the joint's speed: the reading's, or the motor's where that is faster beyond all its uncertainty. */
 static inline float motor_witness(const motor_state *motor, float reading_rad_s)
 {
@@ -89,6 +93,12 @@ static inline bool motor_stepped(const motor_state *motor)
 
 /* Look for what the motor's constant is since the step, whatever current's offset and gain are. */
 void motor_weakens(motor_state *motor, const motor_config *config, motor_sums *sums);
+
+/* Let the resistance be as uncertain as it may have changed within so many ticks: a temperature that rises is no random walk. */
+void motor_warms(motor_state *motor, const motor_config *config, uint32_t ticks);
+
+/* Let a motor be the only witness: with what was known of it before what the reading has spoilt. */
+void motor_recall(motor_state *motor);
 
 /* Let a motor be no witness any more, until the drives were off. */
 void motor_doubt(motor_state *motor, const motor_config *config);

@@ -20,6 +20,19 @@ void pid_reset(pid_state *pid, float measured_rad)
 
 extern inline void pid_measure(pid_state *, const joint_gains *, float);
 
+float pid_measure_by_motor(joint_state *joint, const joint_gains *gains)
+{
+    pid_state *pid = &joint->pid;
+    if (joint->motor.alone != 0u) {
+        pid->measured_rad = joint->held_rad;
+        pid->speed_rad_s = joint->held_rad_s;
+        pid_measure(pid, gains, joint->held_rad + motor_way(&joint->motor, joint->suspect == FAULT_NONE));
+        joint->held_rad = pid->measured_rad;
+        joint->held_rad_s = pid->speed_rad_s;
+    }
+    return joint->pot.angle_rad + joint->motor.twist_rad_per_a * joint->current_a;
+}
+
 /* Return the duty asked for held to the limits, and say which of them held it. */
 INLINE float limited_duty(const pid_state *pid, const pid_demand *demand, float asked, uint32_t *limited)
 {

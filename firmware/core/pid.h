@@ -19,6 +19,10 @@ inline void pid_measure(pid_state *pid, const joint_gains *gains, float measured
     pid->measured_rad = measured_rad;
 }
 
+/* Let the motion of its motor count for the reading of a joint that it holds, after pid_measure. Returns where a motor is, by the
+ * reading and what the current twists between them. */
+float pid_measure_by_motor(joint_state *joint, const joint_gains *gains);
+
 /* Compute this tick's duty (-duty_limit to duty_limit) from the last measurement; sets LIMITED_... bits in *limited. */
 float pid_step(pid_state *pid, const joint_gains *gains, const pid_demand *demand, uint32_t *limited);
 

@@ -16,10 +16,14 @@
 #define OVERCURRENT_TICKS 20u /* in a row above the limit; half: a reversal trips it, double: windings heat for longer */
 #define STOP_TICKS 300u /* after which an emergency stop ends with sleeping drives, braked by shorted windings until then; half:
                            a fast joint coasts, double: a bridge that conducts by itself drives on for longer */
-#define NAME_EARLY_TICKS 64u /* after which a weak motor may show: its joint is taken back; half: noise names,
-                                double: it sinks for longer */
-#define NAME_TICKS 160u /* after which a joint let go of has shown which fault it has; half: more are named wrongly, double: the
-                           arm hears of it later */
+#define NAME_EARLY_TICKS 64u /* after which a weak motor may show: its reading holds it again; half: noise names, double: it
+                                sinks for longer */
+#define NAME_TICKS 160u /* after which a joint has shown which fault it has; half: more are named wrongly, double: the arm hears
+                           of it later */
+#define NAME_LATE_TICKS 480u /* likewise, where only rest shows it; half: it still moves, double: the arm hears of it later */
+#define MAY_REST (FAULT_BIT(FAULT_MOTOR) | FAULT_BIT(FAULT_POT_DRIFT)) /* the reading of a weak motor rests, one that drifts does not */
+#define HELD_RAD 0.2f /* rad that a joint which its motor holds may move; half: a reading that drifts drops the arm before it is
+                         known, double: a joint that cannot be held goes further */
 
 #define FAULT_NAME(name, code, reaction, text) [code] = #name,
 #define FAULT_TEXT(name, code, reaction, text) [code] = text,
@@ -104,6 +108,8 @@ void safety_raise(core_state *core, uint32_t fault, uint32_t joint)
     }
     if (joint < JOINTS && reaction == REACTION_JOINT) {
         core->joint[joint].released = 1u;
+        core->joint[joint].motor.alone = 0u;
+        core->joint[joint].suspect = FAULT_NONE;
     } else if (joint < JOINTS && reaction == REACTION_YIELD) {
         yield(&core->joint[joint]);
     }
@@ -265,11 +271,53 @@ static void doubt_motor(joint_state *joint, const joint_config *config)
 {
     motor_doubt(&joint->motor, &config->motor);
     if (joint->released != 0u) {
-        joint->released = 0u;
         joint->motor.sampled = 0u; /* what it did meanwhile it was not driven to */
         pid_reset(&joint->pid, joint->pot.angle_rad);
+    }
+    if ((joint->released | joint->motor.alone) != 0u) {
+        joint->released = joint->motor.alone = 0u;
+        joint->pid.measured_rad = joint->pot.angle_rad;
         yield(joint);
     }
+}
+
+/* Hold a joint by its motor: whichever of both is wrong, a back-EMF of nothing is rest, and the reading shows there what it is. */
+static void doubt_reading(core_state *core, joint_state *joint)
+{
+    joint->released = 0u;
+    core->by_motor = 1u;
+    motor_recall(&joint->motor);
+    joint->held_rad = joint->pot.angle_rad;
+    joint->held_rad_s = joint->pid.speed_rad_s;
+    yield(joint);
+}
+
+/* Watch a joint's current. */
+static void watch_current(core_state *core, joint_state *joint, const joint_config *config, uint32_t i)
+{
+    motor_state *motor = &joint->motor;
+    const bool hot = joint->over_a > (float)config->current_limit_ma * 0.001f; /* more than twice the limit */
+    motor->current_ticks = in_a_row(motor->current_ticks, hot);
+    if (motor->current_ticks >= OVERCURRENT_TICKS) {
+        safety_raise(core, FAULT_OVERCURRENT, i);
+    }
+}
+
+/* Watch a joint that its motor holds. Where its current fails, too, or it leaves its position by the motor or by a reading that
+ * may be right, nothing holds it: the arm is let go of, which closes the brakes. */
+static void watch_held(core_state *core, joint_state *joint, const joint_config *config, uint32_t i)
+{
+    motor_warms(&joint->motor, &config->motor, WATCH_TICKS);
+    const bool blind = joint->suspect == FAULT_NONE && motor_answers_otherwise(&joint->motor, &config->motor);
+    const bool reads = (core->joint_faults[i] & FAULT_BIT(FAULT_MOTOR)) != 0u ||
+                       (joint->suspect == FAULT_POT_DRIFT && joint->suspect_ticks < NAME_TICKS);
+    const float read_rad = reads ? number_size(joint->pot.angle_rad - joint->reference.position_rad) : 0.0f;
+    const float motor_rad = 2.0f * number_size(joint->pid.error_rad); /* so far a joint goes whose motor has half of its constant */
+    if (blind || read_rad > HELD_RAD || motor_rad > HELD_RAD) {
+        safety_raise(core, blind ? FAULT_CURRENT_SENSOR : FAULT_FOLLOWING, i);
+        core->state = STATE_FAULTED;
+    }
+    watch_current(core, joint, config, i);
 }
 
 /* Watch the motor: as a witness of the motion, and for itself. */
@@ -285,26 +333,16 @@ static void watch_motor(core_state *core, joint_state *joint, const joint_config
         } else {
             safety_raise(core, fault, i);
             joint->suspect = fault;
+            const bool rests = fault == FAULT_POT_FROZEN && joint->reference.speed_rad_s == 0.0f;
+            if (motor->trust == 1.0f || rests || fault == FAULT_POT_DRIFT) { /* else coasting shows the reading's share, whatever R is */
+                doubt_reading(core, joint);
+            }
         }
     } else if (motor->weakened != 0u && !motor_answers_otherwise(motor, &config->motor)) {
         doubt_motor(joint, config);
         blame(core, joint, FAULT_MOTOR, i);
         core->joint_faults[i] |= motor->weakened;
         core->faults |= motor->weakened;
-    }
-}
-
-/* Watch a joint's speed and current, by the reading where the motor is no witness. */
-static void watch_limits(core_state *core, joint_state *joint, const joint_config *config, uint32_t i)
-{
-    motor_state *motor = &joint->motor;
-    if (motor_is_fast(motor, &config->motor, joint->pid.speed_rad_s)) {
-        safety_raise(core, FAULT_OVERSPEED, i);
-    }
-    const bool hot = joint->over_a > (float)config->current_limit_ma * 0.001f; /* more than twice the limit */
-    motor->current_ticks = in_a_row(motor->current_ticks, hot);
-    if (motor->current_ticks >= OVERCURRENT_TICKS) {
-        safety_raise(core, FAULT_OVERCURRENT, i);
     }
 }
 
@@ -345,6 +383,9 @@ static void name(core_state *core, joint_state *joint, const joint_config *confi
     }
     if (may_hold(parts)) {
         doubt_motor(joint, config);
+    } else if (joint->released != 0u) {
+        pid_reset(&joint->pid, joint->pot.angle_rad);
+        doubt_reading(core, joint);
     }
     rename_fault(core, i, joint->suspect, fault);
     core->joint_faults[i] |= parts;
@@ -383,8 +424,12 @@ static void name_suspect(core_state *core, joint_state *joint, const joint_confi
     const bool due = joint->suspect_ticks >= NAME_TICKS;
     if (motor->doubted == 0u) {
         const uint32_t parts = motor_names(motor, &config->motor, joint->suspect, &core->sums);
-        if (due || may_hold(parts)) { /* a joint with a weak motor falls meanwhile */
+        const bool settled = (parts & MAY_REST) == 0u || joint->suspect_ticks >= NAME_LATE_TICKS;
+        if (may_hold(parts) || (due && settled)) {
             name(core, joint, config, parts, i);
+        } else if (due && parts == FAULT_BIT(FAULT_POT_DRIFT)) {
+            rename_fault(core, i, joint->suspect, FAULT_POT_DRIFT);
+            joint->suspect = FAULT_POT_DRIFT;
         }
     } else if (due) {
         const float dry_v = config->gains.kf_duty * (float)core->config.supply_nominal_mv * 0.001f;
@@ -394,8 +439,12 @@ static void name_suspect(core_state *core, joint_state *joint, const joint_confi
 
 static void watch_joint(core_state *core, joint_state *joint, const joint_config *config, uint32_t i)
 {
-    if (joint->released != 0u || joint->motor.doubted != 0u) {
+    if ((joint->released | joint->motor.doubted | joint->motor.alone) != 0u) {
         name_suspect(core, joint, config, i);
+        if (joint->motor.alone != 0u && safety_drives_on(core)) {
+            watch_held(core, joint, config, i);
+            return;
+        }
     }
     if (runs_on(core, joint, config, joint->released != 0u)) {
         blame(core, joint, FAULT_BRIDGE, i);
@@ -407,7 +456,10 @@ static void watch_joint(core_state *core, joint_state *joint, const joint_config
     if (joint->motor.doubted == 0u) {
         watch_motor(core, joint, config, i);
     }
-    watch_limits(core, joint, config, i);
+    if (motor_is_fast(&joint->motor, &config->motor, joint->pid.speed_rad_s)) { /* by the reading where the motor is no witness */
+        safety_raise(core, FAULT_OVERSPEED, i);
+    }
+    watch_current(core, joint, config, i);
     if (motor_swings(&joint->motor, joint->pid.speed_rad_s, joint->reference.speed_rad_s, config->speed_limit_rad_s)) {
         safety_raise(core, FAULT_OSCILLATION, i);
         take_back_gains(core, joint, i);

@@ -466,6 +466,9 @@ typedef struct motor_state {
     float sample_read_rad[MOTOR_SAMPLES];
     float sample_v[MOTOR_SAMPLES]; /* sums since the sample before: applied voltage, V ticks, */
     float sample_a[MOTOR_SAMPLES]; /* and current, A ticks */
+    uint32_t alone;              /* not 0: the reading is no witness; the motor holds the joint, and nothing is learnt */
+    float known_r[MOTOR_KNOWN];  /* the resistance's scale as known_k, */
+    float known_rr[MOTOR_KNOWN]; /* and its variance */
 } motor_state;
 
 #define MOTOR_COLUMNS 5u
@@ -543,6 +546,8 @@ typedef struct joint_state {
     zero_state zero;
     observer_state observer;
     motor_state motor;
+    float held_rad;          /* where its motor has brought it, while that holds it, */
+    float held_rad_s;        /* and how fast, filtered */
 } joint_state;
 
 /* The whole controller. */
@@ -554,7 +559,7 @@ typedef struct core_state {
     uint32_t started;        /* not 0 after the first tick */
     uint32_t tick;
     uint32_t silent_ticks;
-    uint32_t elastic;        /* not 0: a joint's transmission twists, or its motor's speed is damped */
+    uint32_t by_motor;       /* not 0: a joint's transmission twists, or its motor's speed is damped, or holds it */
     float supply_v;          /* this tick's */
     uint32_t supply_bad_ticks;
     uint32_t missed;         /* ticks lost of late; fades */
@@ -568,6 +573,7 @@ typedef struct core_state {
     uint32_t crc_right;      /* of the whole, if crc_known */
     uint32_t crc_known;
     uint32_t standing;       /* faults whose cause stands in this tick */
+    uint32_t not_homed;      /* joints, one bit 1 << joint each */
     uint32_t faults;
     uint32_t joint_faults[JOINTS];
     uint32_t first_fault;

@@ -9,6 +9,7 @@ import pytest
 from firmware_layout import c
 
 from armsight.robot.boards.codes import BoardState, Fault
+from armsight.sim.joints import PotFault
 
 FOLDER = Path(__file__).resolve().parents[3] / "benchmarks"
 SEEDS = range(800, 803)
@@ -130,13 +131,10 @@ def test_a_weak_motor_is_named_and_its_joint_held(motors, library):
     assert abs(arm.plant.link[joint] - arm.out[0]["reference_rad"][joint]) < 0.1
 
 
-def test_a_weak_motor_is_named_by_its_joint_and_mostly_held(motors, library):
-    """Of 550 seeds (these, and 400 from 500001): the joint named in 99 %, MOTOR in 93 %, drives on in 99.6 %.
-
-    Within 0.1 rad of its reference stay 77 %, within 0.5 rad 91 %: the rest, whose reading is blamed first, run away.
-    """
+def test_a_weak_motor_is_named_by_its_joint_and_held(motors, library):
+    """Also of those whose reading is blamed first: the seeds from 500005 ran away by 1.3 to 2.2 rad."""
     far, right = [], []
-    for seed in range(881000000, 881000150):
+    for seed in (500005, 500018, 500041, 500113, 500124, 500190, *range(881000000, 881000034)):
         arm = motors.drawn_arm(library, seed)
         arm.enable()
         joint = int(arm.rng.integers(6))
@@ -151,10 +149,28 @@ def test_a_weak_motor_is_named_by_its_joint_and_mostly_held(motors, library):
         right.append((arm.first[1] == joint, motor, arm.out[0]["drives_on"]))
     named, motor, driven = np.mean(right, axis=0)
     assert named > 0.96
-    assert motor > 0.88
-    assert driven > 0.97
-    assert np.mean(np.array(far) < 0.1) > 0.66
-    assert np.mean(np.array(far) < 0.5) > 0.84
+    assert motor > 0.85
+    assert driven > 0.96
+    assert np.mean(np.array(far) < 0.1) > 0.8
+    assert max(far) < 0.35
+
+
+def test_a_joint_whose_reading_drifts_is_held_by_its_motor_until_that_fails_too(motors, library):
+    arm, joint = motors.drawn_arm(library, 825), 2
+    arm.enable()
+    motors.until_moving(arm, joint)
+    arm.rest(600)
+    arm.plant.break_pot(joint, PotFault.DRIFT, 0.5)
+    arm.rest(1000)
+    assert arm.first[1] == joint
+    at = arm.plant.link[joint]
+    arm.rest_on(800)
+    assert arm.first == (Fault.POT_DRIFT, joint)
+    assert arm.out[0]["drives_on"]
+    assert abs(arm.plant.link[joint] - at) < 0.15
+    motors.gain(arm, joint)
+    arm.rest_on(200)
+    assert not arm.out[0]["drives_on"]
 
 
 @pytest.mark.parametrize(("seed", "joint", "share"), [(71003159, 0, 0.57), (71004323, 0, 0.65), (73001419, 2, 0.67)])
