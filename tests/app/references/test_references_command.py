@@ -12,7 +12,7 @@ from armsight.errors import InputError
 from armsight.geometry.pose import exp_se3, inverse, log_se3
 from armsight.geometry.rotation import quaternion_wxyz
 from armsight.loop.references.calibrate import PosePath
-from armsight.loop.references.file import COLUMNS
+from armsight.loop.references.file import COLUMNS, read_references, written
 from armsight.loop.references.heading import Magnetometer
 from armsight.loop.references.inertial import Inertial
 from armsight.loop.references.reference import ToolMotion
@@ -98,28 +98,18 @@ def test_calibrate_finds_the_sensor_and_writes_what_check_reads(sweep, capsys, t
     assert np.sqrt(np.mean((miss / sigma[3:]) ** 2)) < 2.0
     assert found["left_out_over_sigma"] == pytest.approx(1.0, abs=0.2)
     assert run("references", "check", out) == 0
-    from armsight.loop.references.file import read_references
-
     (entry,) = read_references(out)
     apart = log_se3(inverse(entry.reference.T_tool_sensor) @ true.T_tool_sensor)
     assert np.degrees(np.linalg.norm(apart[3:])) < 0.2
 
 
-def test_a_sweep_that_rotates_the_tool_little_is_said(sweep, capsys, tmp_path, monkeypatch):
+def test_a_sweep_that_rotates_the_tool_little_is_said(sweep, capsys, monkeypatch):
     folder, _, _ = sweep
     monkeypatch.setattr(command, "SMALL_DEG", 200.0)
-    run(
-        "references",
-        "calibrate",
-        folder / "references.toml",
-        "--poses",
-        folder / "poses.csv",
-        "-o",
-        tmp_path / "out.toml",
-    )
+    given = "references", "calibrate", folder / "references.toml", "--poses", folder / "poses.csv", "--json"
+    (weak,) = said_of(capsys, *given, kind="inertial").lines[0]["weak"]
     assert re.search(
-        r"the tool rotates by \d+ deg: the lever may be off by more than its sigma; rotate it by 200",
-        "".join(capsys.readouterr()),
+        r"the tool rotates by \d+ deg: the lever may be off by more than its sigma; rotate it by 200", weak
     )
 
 
@@ -180,8 +170,6 @@ def test_gravity_shows_a_tilted_base_and_says_what_is_open(capsys, tmp_path):
 
 
 def test_a_calibration_that_was_written_is_read_whatever_its_name_and_delay(sweep, tmp_path):
-    from armsight.loop.references.file import read_references, written
-
     (entry,) = read_references(sweep[0] / "references.toml")
     late = replace(entry, reference=replace(entry.reference, name="my imu", delay_s=-0.03), calibrated=True)
     out = tmp_path / "written.toml"
@@ -224,4 +212,11 @@ def test_a_magnetometer_is_checked_and_calibrated_and_other_units_are_named(caps
     assert "as if in uT" in said.err
     said = said_of(capsys, "references", "gravity", tmp_path / "out.toml", "--model", "six_r", "--joints", "none.csv")
     assert said.code == 2
-    assert "is a magnetometer" in said.err
+    assert "out.toml: [m]: is a magnetometer" in said.err
+    rest = np.column_stack([t_s, np.mean(z, axis=0) + rng.normal(0.0, 4e-7, z.shape) + 1e-7 * t_s[:, None]])
+    np.savetxt(tmp_path / "field.csv", rest, "%.9g", ",", header=head, comments="")
+    said = said_of(capsys, "references", "check", tmp_path / "field.toml", "--json", kind="magnetometer").lines[0]
+    (found,) = said["references"]
+    assert found["noise_t"] == pytest.approx([4e-7] * 3, rel=0.1)  # not what it drifts by in 30 s
+    assert found["drift_t"] == pytest.approx([2.25e-6] * 3, rel=0.1)
+    assert "it drifts by 2.3 uT at rest" in said["weak"][0]

@@ -110,6 +110,21 @@ def test_readings_near_a_motor_show_its_field_and_sigma_grows_there():
     assert abs(loud.angle_rad) < 3 * loud.sigma_rad
 
 
+def test_a_tool_at_rest_shows_its_field_once_however_it_drifts():
+    rng = np.random.default_rng(12)
+    sensor = some(rng)
+    reference = calibrated(rng, sensor).reference
+    readings, motion = recorded(rng, sensor, 6)
+    at, drift = motion(0.0), 2e-6 * np.array([1.0, -1.0, 0.5])  # 5 degrees of heading in a minute
+    z = sensor.expected(at, 0).z
+    rest = [Reading(100.0 + k, 0, z + drift * k / 300, NOISE_T**2 * np.eye(3)) for k in range(300)]
+    there = lambda t: at if t >= 100.0 else motion(t)  # noqa: E731
+    assert heading_off(reference, rest, there).sigma_rad == np.inf
+    found = heading_off(reference, readings + rest, there)
+    assert abs(found.angle_rad) < 3 * found.sigma_rad
+    assert found.sigma_rad > 0.7 * heading_off(reference, readings, there).sigma_rad
+
+
 def test_too_few_or_flat_attitudes_are_rejected():
     rng = np.random.default_rng(5)
     sensor = some(rng)

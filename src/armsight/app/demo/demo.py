@@ -317,7 +317,7 @@ def run_demo(demo: Demo, *, progress: Progress = lambda line: None) -> Report:
     """Run the experiment in a workcell, and write its folder; the report's JSON is what summary.json holds."""
     began = time.perf_counter()
     pairs, handeyes, study_shots = _AMOUNTS[demo.quick]
-    unit = None if demo.references is None else the_one(read_references(demo.references), demo.references)
+    unit = None if demo.references is None else the_one(read_references(demo.references))
     folder = demo.folder
     progress("building the workcell")
     cameras = demo.cameras or (_SLOW_CAMERAS if demo.model in CONTROLLED else _CAMERAS)

@@ -32,6 +32,8 @@ SMALL_DEG = 60.0
 DELAY_S = 0.5
 #: Errors left out over their sigma up to which it is good; half: chance is a fault, double: looseness is none.
 HONEST = 1.5
+#: A field that drifts by more at rest, T, is said: 3 degrees of heading in Europe; half, double: so much of it.
+DRIFT_T = 1e-6
 #: Units of the Allan deviation's coefficients, in keys of JSON.
 ALLAN = {
     "gyro": ("rad", "rad_per_sqrt_s", "rad_s", "rad_s_per_sqrt_s", "rad_s2"),
@@ -207,7 +209,7 @@ def _check(entry: Entry) -> tuple[dict[str, Any], list[str], list[str]]:
     from armsight.loop.references.heading import check_unit
     from armsight.loop.references.inertial import Inertial
     from armsight.loop.references.reference import STANDARD_GRAVITY_M_S2
-    from armsight.loop.references.stream import check_stream, settling
+    from armsight.loop.references.stream import allan, check_stream, settling
 
     source, t_s, z = _recording(entry)
     name, stream = entry.reference.name, check_stream(t_s, z, str(source))
@@ -230,8 +232,15 @@ def _check(entry: Entry) -> tuple[dict[str, Any], list[str], list[str]]:
         weak.append(f"{name}: no rest of a second was found, so its noise is unknown")
         return values, lines, weak
     if not isinstance(entry.reference, Inertial):
-        values["noise_t"] = [float(sigma) for sigma in rest.std(axis=0, ddof=1)]
-        lines.append(f"{name}: noise {1e6 * max(values['noise_t']):.2g} uT at rest for {values['rest_s']:.1f} s")
+        _, variance, _ = allan(rest, 1.0 / stream.rate_hz)  # of single readings: without what drifts
+        drifts = np.abs(rest[-len(rest) // 4 :].mean(axis=0) - rest[: len(rest) // 4].mean(axis=0))
+        values |= {"noise_t": np.sqrt(variance[0]), "drift_t": drifts}
+        drifted = f"{1e6 * drifts.max():.2g} uT at rest"
+        lines.append(
+            f"{name}: noise {1e6 * values['noise_t'].max():.2g} uT, drift {drifted} for {values['rest_s']:.1f} s"
+        )
+        if drifts.max() > DRIFT_T:
+            weak.append(f"{name}: it drifts by {drifted}: motors near, or it warms up")
         return values, lines, weak
     force = float(np.linalg.norm(rest[:, 3:].mean(axis=0)))
     if abs(force - 1.0) < UNIT:

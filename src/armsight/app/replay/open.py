@@ -77,9 +77,9 @@ def _of_run(request: Request, run: RecordedRun, say: Callable[[str], None]) -> R
         raise InputError("--references goes with the run's own arm and estimator; leave out --arm and --estimator")
     beside, text = None, run.properties.get(REFERENCES)
     if request.references is not None:
-        beside = recorded(the_one(read_references(request.references), request.references))
+        beside = recorded(the_one(read_references(request.references)))
     elif text is not None and request.estimator == "kalman":
-        beside = fused(the_one(entries_of(text, run.path), run.path))
+        beside = fused(the_one(entries_of(text, run.path)))
     with contextlib.closing(open_streams(request.streams, Published(rig, body, arm, _PROPERTIES), say)) as publisher:
         return replay_run(
             run,

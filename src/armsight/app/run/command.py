@@ -108,7 +108,7 @@ def command(
         motions = read_motions(arm, motion)
     targets = handeye_poses(arm, motions.ends, _HANDEYE_POSES, 0)
     files = {"motion.toml": text, "body.toml": read_text(target_spec)}
-    unit = None if references is None else the_one(read_references(references), references)
+    unit = None if references is None else the_one(read_references(references))
     if references is not None:
         files["references.toml"] = read_text(references)
     devices = Devices(source_spec, board_spec, arm, target, 1e-3 * sync_ms, sync_led, unit)

@@ -110,7 +110,7 @@ class Report:
 
     def json(self) -> dict[str, Any]:
         """Return what programs read: the values of all facts, and the notes."""
-        found: dict[str, Any] = {"notes": self.noted("note"), **self.values}
+        found: dict[str, Any] = {"notes": self.noted("note"), "weak": self.noted("weak"), **self.values}
         for block in self.blocks:
             found |= block.values if isinstance(block, Fact) else {}
         return {key: json_of(value) for key, value in found.items()}

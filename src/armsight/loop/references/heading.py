@@ -28,6 +28,8 @@ NOISE_T = 0.5e-6
 LEAST_T = 5e-6
 #: No field is larger, T, as ranges of chips end there; half, double: nothing.
 MOST_T = 5e-3
+#: Attitudes nearer to each other than about this, rad, show one field; half: an arm at rest counts often, double: nothing.
+_NEAR_RAD = 0.1
 #: Fields are compared so far apart, s; half: a motor counts twice, double: sweeps are short of attitudes.
 FIELDS_S = 0.2
 #: One sigma before a calibration: soft iron, relative; hard iron and field, T; half, double: nothing.
@@ -146,7 +148,7 @@ class HeadingOff(Record):
 
     Attributes:
         angle_rad: rotation of the base about its z since the calibration.
-        sigma_rad: its standard deviation, disturbances and calibration included.
+        sigma_rad: its standard deviation, disturbances and calibration included; infinite at one attitude alone.
         disturbance_t: (N,) field of motors and iron at each reading, T, as far as it shows.
     """
 
@@ -170,11 +172,12 @@ def heading_off(sensor: Magnetometer, readings: Sequence[Reading], motion: Calla
     level = float(np.hypot(m[0], m[1]))
     if len(readings) < 2 or level < 0.05 * np.linalg.norm(m):
         raise InputError(f"{sensor.name}: expected two readings, and a field with a horizontal part")
-    angles, shown, noise, by = [], [], [], []
+    angles, shown, noise, by, R = [], [], [], [], []
     for each in readings:
         at = motion(each.t_s - sensor.delay_s)
         expected = sensor.expected(at, each.channel)
-        to_base = at.T_base_tool[:3, :3] @ sensor.R_tool_sensor @ np.linalg.inv(sensor.soft)
+        R.append(at.T_base_tool[:3, :3])
+        to_base = R[-1] @ sensor.R_tool_sensor @ np.linalg.inv(sensor.soft)
         f = m + to_base @ (each.z - expected.z)
         across = np.array([-m[1], m[0], 0.0]) @ to_base / level**2
         angles.append(np.arctan2(m[0] * f[1] - m[1] * f[0], m[0] * f[0] + m[1] * f[1]))
@@ -182,11 +185,18 @@ def heading_off(sensor: Magnetometer, readings: Sequence[Reading], motion: Calla
         noise.append(across @ each.cov @ across)
         by.append(across @ expected.by_parameters)
     squares = np.square(shown).mean(axis=1) / level**2
-    weights = 1.0 / (np.array(noise) + squares + np.median(squares))
+    # What drifts, as a chip that warms up, is no other field at an attitude where the arm rests: each counts once.
+    _, of, counts = np.unique(
+        np.round(log_so3(np.array(R)) / _NEAR_RAD), axis=0, return_inverse=True, return_counts=True
+    )
+    weights = 1.0 / (np.array(noise) + squares + np.median(squares)) / counts[of := of.ravel()]
     weights /= weights.sum()
     begin = float(np.angle(weights @ np.exp(1j * np.array(angles))))
     apart = np.angle(np.exp(1j * (np.array(angles) - begin)))
     angle, shared = float(weights @ apart), weights @ np.array(by)
-    scatter = (weights**2) @ np.maximum((apart - angle) ** 2, squares) * len(readings) / (len(readings) - 1)
+    whole, off, shows = (np.bincount(of, weights * each) for each in (np.ones(len(of)), apart - angle, squares))
+    scatter = np.inf  # one attitude does not show what motors do
+    if len(counts) > 1:
+        scatter = np.maximum(off**2, whole * shows).sum() * len(counts) / (len(counts) - 1)
     sigma = float(np.sqrt(scatter + shared @ sensor.cov @ shared))
     return HeadingOff(-(begin + angle), sigma, level * np.sqrt(squares))

@@ -30,6 +30,8 @@ BLOCK_S, QUIET, REST_S = 0.25, 2.0, 1.0
 STEADY = 6.0
 #: A stop is looked for so long before a rest, s, in such steps, s; half: slow vibration is missed, double: slower.
 STOP_S, STEP_S = 1.5, 0.005
+#: The last of these steps is gone through in so many; half: times are 1 ms worse, double: slower.
+FINE = 5
 #: A vibration leaves so much of itself at most, or so many times the noise; half: a second mode hides the first.
 LEAVES, NOISE = 0.08, 1.5
 #: What is damped more than this, of critical, is no vibration but how a motion ends.
@@ -183,19 +185,19 @@ def _stop(t_s: Array, force: Array, rest: slice) -> tuple[float, float, float, f
     """Return frequency, Hz, damping, amplitude, m, and settling time, s, of a vibration before a rest; None without one."""
     noise = force[rest].std(axis=0, ddof=1)
     step = max(round(STEP_S * (rest.stop - rest.start) / (t_s[rest.stop - 1] - t_s[rest.start])), 1)
-    end = min(rest.start + 50 * step, rest.stop)
+    end, fine = min(rest.start + 50 * step, rest.stop), max(step // FINE, 1)
     first = max(rest.start - round(STOP_S / STEP_S) * step, 0)
-    best, start = None, None
-    for begin in range(rest.start - 2 * step, first, -step):
-        t, f = t_s[begin:end] - t_s[begin], force[begin:end]
-        one = _vibration(t, f, start)
-        if one is None:
-            break
-        found, amplitude, left = one
-        start = found if np.linalg.norm(amplitude) > STEADY * noise.max() else None
-        if (left > np.maximum(NOISE * noise, LEAVES * np.linalg.norm(amplitude))).any():
-            break
-        best = found, float(np.linalg.norm(amplitude))
+    best, start, at = None, None, rest.start - step
+    while True:
+        begin = at - step
+        one = _vibration(t_s[begin:end] - t_s[begin], force[begin:end], start) if begin > first else None
+        if one is None or (one[2] > np.maximum(NOISE * noise, LEAVES * np.linalg.norm(one[1]))).any():
+            if step <= fine:
+                break
+            step = fine  # the stop lies within the last step
+            continue
+        at, best = begin, (one[0], float(np.linalg.norm(one[1])))
+        start = one[0] if best[1] > STEADY * noise.max() else None
     if best is None or start is None:
         return None
     (speed, decay), amplitude_m_s2 = best

@@ -113,7 +113,7 @@ class HostClock:
         return replace(shot, t_s=t_s - self.offset_s)
 
 
-#: Residuals over their sigma below which a unit agrees (1/3 is usual), and outliers' share; half: chance is a fault,
+#: Residuals over their sigma below which a unit agrees (half is usual), and outliers' share; half: chance is a fault,
 #: double: a loose mount agrees.
 HONEST, OUTLIERS = 1.0, 0.01
 #: Sigmas of its calibration from which on a parameter that is found off is said; half: chance is, double: 2 ms are not.
@@ -139,7 +139,7 @@ class FusedRow:
     outliers: int  #: of them rejected
     begin_s: float  #: since when it was used, s: before, the camera's delay is learned
     residual_over_sigma: (
-        float  #: root mean square; 1/3 is usual, as links count as loose; from ``HONEST`` on it disagrees
+        float  #: root mean square; half is usual, as links count as loose; from ``HONEST`` on it disagrees
     )
     agrees: bool  #: whether it agrees with joints and vision
     rejected_s: float | None  #: when it was dropped as images contradict it, s; None where it was not
@@ -272,7 +272,7 @@ class Fused:
             InputError: it was never used; the message says why.
         """
         if not self.windows or not len(covs):
-            raise InputError("; ".join((f"[{self.entry.reference.name}]: {self._unused()}", *self.losses)))
+            raise InputError("; ".join((f"{self.entry.where}: {self._unused()}", *self.losses)))
         ratio = float(np.sqrt(self._squares / max(self.windows - self.outliers, 1)))
         agrees = (
             self.outliers < OUTLIERS * self.windows and self.rejected_s is None and ratio < HONEST and not self._off
@@ -366,9 +366,7 @@ def recorded(entry: Entry) -> Fused:
     """
     if not entry.calibrated or entry.source is None:
         lacks = "source" if entry.calibrated else "parameters"
-        raise InputError(
-            f"[{entry.reference.name}]: has no {lacks}; armsight references calibrate writes a file that has them"
-        )
+        raise InputError(f"{entry.where}: has no {lacks}; armsight references calibrate writes a file that has them")
     t_s, z = read_recording(entry.source, type(entry.reference))
     at = 0
 
@@ -381,7 +379,7 @@ def recorded(entry: Entry) -> Fused:
     return fused(entry, source)
 
 
-def the_one(entries: list[Entry], where: object) -> Entry:
+def the_one(entries: list[Entry]) -> Entry:
     """Return the one reference of a run.
 
     Raises:
@@ -389,9 +387,7 @@ def the_one(entries: list[Entry], where: object) -> Entry:
     """
     first, *others = entries
     if others:
-        raise InputError(
-            f"{where}: [{others[0].reference.name}]: a run takes one reference; leave one table in the file"
-        )
+        raise InputError(f"{others[0].where}: a run takes one reference; leave one table in the file")
     return first
 
 
