@@ -1,7 +1,8 @@
 """References beside vision: what they are worth, in the simulated workcell and on public recordings.
 
 python references.py hidden [N]     body hidden for 0.5, 2, 5 s on the circle, N worn arms (10), joints alone: a minute each
-python references.py fused [N]      the same with an inertial unit, as replay --references fuses it, seeds from 4 on (4)
+python references.py fused [N [SEED]]   the same with an inertial unit, as replay --references fuses it, seeds from 4 on (4)
+python references.py jumps [N [SEED]]   the camera's clock jumps by 3, 10, -10 ms in motion, with a unit and without
 python references.py tilt [N]       base's tilt and the zeros that gravity shows, N simulated worn arms (40): a minute
 python references.py gravity        direction of gravity at rest, arm-imu, each rest left out of the fit: two minutes
 
@@ -13,8 +14,10 @@ import sys
 import tempfile
 from dataclasses import replace
 from functools import cache, partial
+from itertools import product
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 
@@ -24,8 +27,10 @@ from armsight.app.replay.open import Request, replay
 from armsight.app.run.experiment import run_experiment
 from armsight.app.run.metrics import track_metrics
 from armsight.app.run.tracks import Tracks
+from armsight.data import Array
 from armsight.geometry.pose import exp_se3, inverse, log_se3, pose
 from armsight.geometry.rotation import exp_so3, from_quaternion_wxyz
+from armsight.loop.estimators import KalmanEstimator, Outcome, PoseMeasurement
 from armsight.loop.identify.gravity import gravity_shows
 from armsight.loop.references.calibrate import PosePath, calibrate
 from armsight.loop.references.file import COLUMNS, Entry, written
@@ -48,6 +53,8 @@ RESTS = 120
 #: What a sweep leaves of a unit's parameters: rotation, lever, biases, M_a, M_g, G, the base's tilt; and its delay, s.
 SWEPT = np.repeat([8e-4, 5e-4, 2e-4, 5e-3, 5e-4, 5e-4, 2e-5, 3e-4], [3, 3, 3, 3, 6, 9, 9, 2])
 SWEPT_S, MOUNT = 2e-4, exp_se3(np.array([0.02, -0.015, -0.03, 0.3, -0.2, 1.0]))
+#: Jumps of the camera's clock, s.
+JUMPS_S = (3e-3, 10e-3, -10e-3)
 #: How the file may be wrong beyond its covariance: a step of the parameters, and of the delay, s.
 WRONG = {
     "": (np.zeros(38), 0.0),
@@ -144,12 +151,40 @@ def said_and_read(kind: str, seed: int, truth: dict[str, np.ndarray], folder: Pa
     return file
 
 
-def fused(count: int) -> None:
+def jumps(count: int, first: int) -> None:
+    """Print errors and NEES in the two seconds after the camera's clock jumped in motion, without a unit and with."""
+    plain, motions = KalmanEstimator.vision, dict(demo._MOTIONS)
+    found: dict[tuple[str | None, float], list[Array]] = {}
+    for seed in range(first, first + count):
+        with tempfile.TemporaryDirectory() as name:
+            folder, truth = Path(name), dict[str, np.ndarray]()
+            demo._MOTIONS = motions
+            demo.true_track = partial(known_truth, truth)
+            at_s = hidden_run(seed, folder)[1][0][1] + 1.0
+            for kind, by_s in product((None, "icm-42688"), JUMPS_S):
+
+                def vision(
+                    self: KalmanEstimator, seen: PoseMeasurement, by_s: float = by_s, at_s: float = at_s
+                ) -> Outcome:
+                    return plain(self, replace(seen, t_s=seen.t_s + by_s * (seen.t_s > at_s)))
+
+                file = None if kind is None else said_and_read(kind, seed, truth, folder, "")
+                with mock.patch.object(KalmanEstimator, "vision", vision):
+                    live = replay(Request(str(folder / "run"), references=file), lambda line: None).live
+                found.setdefault((kind, by_s), []).append(evaluated(live, truth, [(at_s, at_s + 2.0)])[0])
+    for (kind, by_s), rows in found.items():
+        each = np.array(rows)
+        rms, most, nees = np.sqrt((each[:, 0] ** 2).mean()), each[:, 1].max(), each[:, 2].mean()
+        title = f"{kind or 'joints and vision'}, jump by {1e3 * by_s:.0f} ms"
+        print(f"{title:36s} RMS {rms:.3f} mm, largest {most:.2f} mm, NEES a freedom {nees:.2f}")
+
+
+def fused(count: int, first: int) -> None:
     """Print errors of the estimates while the body was hidden, and in motion while it was not, without a unit and with."""
     cases = [None, *((kind, "") for kind in INERTIAL_CLASSES), *(("icm-42688", wrong) for wrong in WRONG if wrong)]
     found: dict[str, list[np.ndarray]] = {}
     motions = dict(demo._MOTIONS)
-    for seed in range(4, 4 + count):
+    for seed in range(first, first + count):
         with tempfile.TemporaryDirectory() as name:
             folder, truth = Path(name), dict[str, np.ndarray]()
             demo._MOTIONS = motions
@@ -280,10 +315,13 @@ def gravity() -> None:
 
 if __name__ == "__main__":
     what, count = sys.argv[1], int(sys.argv[2]) if len(sys.argv) > 2 else None
+    first = int(sys.argv[3]) if len(sys.argv) > 3 else 4
     if what == "hidden":
         hidden(count or 10)
     elif what == "fused":
-        fused(count or 4)
+        fused(count or 4, first)
+    elif what == "jumps":
+        jumps(count or 2, first)
     elif what == "tilt":
         tilt(count or 40)
     else:

@@ -422,6 +422,22 @@ def test_a_cameras_clock_that_jumps_is_followed_with_a_unit(seed):
     assert np.isfinite(estimator.estimate().cov).all()
 
 
+@pytest.mark.parametrize("beside", [False, True])
+@pytest.mark.parametrize("jump_s", [0.01, -0.03])
+def test_a_cameras_clock_that_jumps_in_motion_does_not_spoil_the_estimate(jump_s, beside):
+    q, Ts, looks, *imu = world(501, 3.2, 3.2)
+    jumped, heard, squares = [replace(each, t_s=each.t_s + jump_s * (each.t_s > 2.0)) for each in looks], ([], []), []
+    for end in (2150, 2300, 2600, 3000, 3200):
+        given = [each for each in jumped if each.t_s < end * TICK_S]
+        estimator = go(q[:end], given, *(imu if beside else ()), heard=heard)
+        e = off(estimator.estimate().T_base_tool, Ts[end - 1])
+        squares.append(e @ np.linalg.solve(estimator.estimate().cov, e))
+    assert max(squares) < chi2.ppf(1 - CHANCE, 6)  # without a mend: 600 and more
+    assert abs(estimator.clock_offset_s(3.2) - jump_s) < 2e-3
+    assert not any(each.outcome is Outcome.REOPENED for each in heard[0])
+    assert bool(estimator.unit_differs()) is beside  # it is used yet
+
+
 def test_samples_that_are_none_are_rejected():
     strapdown, z = Strapdown(unit()), np.zeros((3, 6))
     for t_s, given in ((np.array([0.0, 0.0, 1.0]), z), (np.arange(3.0), z[:, :5]), (np.arange(3.0), z + np.nan)):

@@ -16,6 +16,7 @@ from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import replace
 from functools import partial
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -26,7 +27,7 @@ from armsight.estimate.chance import chi_square_limit
 from armsight.geometry.pose import left_axes
 from armsight.loop.estimators import armerror
 from armsight.loop.estimators.armerror import Prior
-from armsight.loop.estimators.clock import ClockFollower
+from armsight.loop.estimators.clock_doubt import ClockDoubt, JumpingClock
 from armsight.loop.estimators.errormodel import (
     LEARNING,
     NONE_CONSIDERED,
@@ -71,9 +72,9 @@ _GATE = chi_square_limit(6, CHANCE)
 APART_S = 0.01
 #: Windows without an image are at least so long, s; half: twice the cost, double: impacts are said late.
 WINDOW_S = 0.04
-#: While windows are used a link is loose by one sigma of so many rad, for so long, s. Half: joints overrule what was
-#: felt, double: they bound it later.
-LOOSE_RAD, LOOSE_S = 1.5e-3, 0.3
+#: While windows are used a link is anywhere in its gap, for so long, s; half: joints overrule what was felt, double: they
+#: bound it later.
+LOOSE_S = 0.3
 #: The gain is that of images whose noise has so many times its variance while windows are used, as errors of images in a
 #: row are alike; half: the tool follows what they share, double: late speeds.
 ALIKE = 5.0
@@ -136,7 +137,8 @@ class KalmanEstimator:
         #: the same of readings of references, with the reference's name; their innovations have m numbers
         self.on_reading: Callable[[str, Innovation], None] | None = None
         #: follows the camera's clock; None where the delay is learned
-        self.clock = None if learns_delay else ClockFollower(at.size, at.delay, delay.sigma_s)
+        self.clock = None if learns_delay else JumpingClock(at.size, at.delay, delay.sigma_s)
+        self._doubt = ClockDoubt(at.delay)
         self._reference: Array | None = None
         self._waiting: list[PoseMeasurement | Taken | Until] = []
         # The inertial unit, what was known without it, what contradicts it in a row, and the newest window.
@@ -144,7 +146,8 @@ class KalmanEstimator:
         self._unit: Strapdown | None = None
         self._without: Remembered | None = None
         self._against, self._rejected, self._window = dict[type, int](), no_reference, Outcome.WAITING
-        self._outliers: list[Array] = []
+        self._outliers, self._struck_s = list[Array](), -np.inf  # and when links were last struck
+        self._offsets: list[tuple[float, float]] = []  # of the clock, s, that explain outliers, and their information
         self._back: list[ErrorState] = []  # the newest states, smoothed, while a unit is used
         self._backlash_set = True  # whether the readings have the newest estimate of the backlash
         # At the newest reading, until something is heard: the state, the joints and what came of the state, and the tool.
@@ -223,12 +226,14 @@ class KalmanEstimator:
         P = P if self._unit is None else self._delay_apart(P)
         self._states = [newest._replace(x=x, P=P, taken=None, considered=NONE_CONSIDERED, beside=None)]
         self._outliers, self._back, self._newest, self._here = [], [], None, None
+        self._doubt.drop()
         self._waiting, self._backlash_set = [], False
 
     def as_before(self, state: Remembered) -> KalmanEstimator:
         """Return an estimator at the newest reading that knows what this one knew of the arm earlier; it takes nothing."""
         other = copy(self)
         other.clock = other.on_innovation = other.on_reading = None
+        other._doubt = ClockDoubt(self._at.delay)
         other.restore(state)
         return other
 
@@ -338,6 +343,8 @@ class KalmanEstimator:
         """Count outcomes of a kind, images or windows; return whether so many are against the unit that it was dropped."""
         if self._unit is None or self._without is None or outcome is Outcome.WAITING:
             return False
+        if kind is PoseMeasurement and self._offsets:  # an offset of the clock explains it as well
+            return False
         self._against[kind] = 0 if outcome is Outcome.USED else self._against.get(kind, 0) + 1
         if self._against[kind] < STUBBORN:
             return False
@@ -363,7 +370,8 @@ class KalmanEstimator:
             return self.track(np.array([t_s]))[0]
         if self._newest is None:
             state, joints, step = self._now()
-            (T,), (cov,), (own,) = self._model.tracked(state, step, joints)
+            (T,), covs, owns = self._model.tracked(state, step, joints)
+            (cov,), (own,) = self._doubted(state, step, joints, covs, owns)
             t_s = self.span_s[1]
             self._newest = ArmEstimate(t_s, T, cov, own, joints.q[0], joints.qd[0], t_s - state.seen_s)
         return self._newest
@@ -391,7 +399,17 @@ class KalmanEstimator:
     def track(self, t_s: Array) -> Track:
         """Return the poses of the tool at (N,) times."""
         state, joints, step = self._since(np.asarray(t_s, dtype=float))
-        return by_state(self._model, state, t_s, joints, step)
+        track = by_state(self._model, state, t_s, joints, step)
+        covs, own = self._doubted(state, step, joints, track.covs, track.covs_own)
+        return replace(track, covs=covs, covs_own=own)
+
+    def _doubted(self, state: ErrorState, step: Propagation, joints: Smoothed, *covs: Array) -> list[Array]:
+        """Return covariances (N, 6, 6) with what a jump of the clock that is not certain does."""
+        if (doubt := self._doubt.sigma) is None:
+            return list(covs)
+        _, Hs = self._model.poses(state.x * step.kept, joints.q, joints.unseen)
+        off = np.einsum("nij,nj->ni", Hs, step.kept * doubt[: self._at.size])
+        return [each + off[:, :, None] * off[:, None, :] for each in covs]
 
     def smoothed(self, t_s: Array) -> Track:
         """Return the poses of the tool at (N,) times, rising, with the measurements after them used, too."""
@@ -467,6 +485,8 @@ class KalmanEstimator:
         """Report what became of a measurement; return (size,) what a clock that is followed adds to the state, or None."""
         used = innovation.outcome is not Outcome.OUTLIER
         effect = self.clock.take(innovation) if used and self.clock is not None else None
+        if effect is not None and effect.change is not None:
+            self._doubt.corrected(effect.offset_s)
         if self.on_innovation is not None:
             self.on_innovation(innovation if effect is None else replace(innovation, clock=effect))
         return None if effect is None else effect.change
@@ -478,7 +498,7 @@ class KalmanEstimator:
         report: Callable[[Innovation], Array | None] | None = None,
     ) -> tuple[ErrorState | None, Outcome]:
         """Return the state after a measurement, None where it is an outlier; report how it came about."""
-        t_s = max(self._seen_s(pose_measurement, before), before.t_s)
+        t_s, known = max(self._seen_s(pose_measurement, before), before.t_s), before.t_s
         times, jitter_s = np.array([t_s]), self._delay.jitter_s
         if self._unit is not None:
             jitter_s = float(np.hypot(jitter_s, self._delay.sigma_s))
@@ -491,6 +511,8 @@ class KalmanEstimator:
             pose_measurement = replace(given, cov_noise=ALIKE * given.cov_noise)
         at, chi = self._model.predicted(before, step, joints, pose_measurement, jitter_s)
         outcome = self._gate(at, chi)
+        if report is not None and self._mistimed(at, chi, outcome):
+            outcome = Outcome.OUTLIER
         if outcome is Outcome.OUTLIER:
             if report is not None:
                 none = np.zeros((self._at.size, 6))
@@ -511,10 +533,16 @@ class KalmanEstimator:
             whole = np.vstack([K, gain]) @ less
             P = P - whole[: len(P), : len(P)]
             beside = beside._replace(C=beside.C - whole[: len(P), len(P) :], Y=beside.Y - whole[len(P) :, len(P) :])
-            steps = *steps, StateStep(step.kept[0], by, np.vstack([K, gain]), z, S)
+            last = StateStep(step.kept[0], by, np.vstack([K, gain]), z, S)
+        else:
+            last = StateStep(step.kept[0], H * step.kept[0], K, z, at.S)
+        steps = *steps, last
         if not (np.abs(x) < self._furthest).all():  # NaN neither
             return None, Outcome.OUTLIER
         if report is not None:
+            if self.clock is not None:
+                between = (state.steps for state in self._states if self._doubt.t_s < state.t_s <= known)
+                self._doubt.step(t_s, (*chain.from_iterable(between), *steps), at, len(x))
             change = report(self._said(t_s, joints, pose_measurement, at, step, K, outcome))
             if change is not None:
                 x = x + change
@@ -550,17 +578,17 @@ class KalmanEstimator:
         if self._unit is None or window is None:
             return before
         before, joints = self._anew(before, np.array([t_s]))
-        step, loose = self._model.moved(before, joints, np.array([t_s]), learning=LEARNING), self._loose
+        step, loose = self._model.moved(before, joints, np.array([t_s])), self._loose
         kept, added = step.kept[0], step.added[0]
         if not np.isfinite(window).all():  # clipped: links may be anywhere within their gaps
-            kept[loose], added[loose] = 0.0, self._anywhere
+            kept[loose], added[loose], self._struck_s = 0.0, self._anywhere, t_s
             if report and self.on_reading is not None:
                 none = np.zeros((0, 0)), np.zeros((0, len(kept))), kept, np.zeros((len(kept), 0))
                 self.on_reading(self._unit.sensor.name, Innovation(t_s, np.eye(4), np.zeros(0), *none, Outcome.OUTLIER))
             return self._alone(before, t_s, (joints, step))
         share = float(np.exp(-window[0] / LOOSE_S))
         kept[loose] *= share
-        added[loose] += LOOSE_RAD**2 * (1.0 - share**2)
+        added[loose] += self._apart(before, joints, share)
         q, unseen = (
             np.concatenate([getattr(end, part) for end in (before.joints, joints)]) for part in ("q", "unseen")
         )
@@ -571,7 +599,7 @@ class KalmanEstimator:
             said = got.z, got.S, got.by, kept.copy(), got.gain[: len(kept)], outcome
             self.on_reading(self._unit.sensor.name, Innovation(t_s, Ts[1], *said, added=added.copy()))
         if outcome is Outcome.OUTLIER:  # an impact: links may be anywhere within their gaps
-            kept[loose], added[loose] = 0.0, self._anywhere
+            kept[loose], added[loose], self._struck_s = 0.0, self._anywhere, t_s
             got, _, again = self._advanced(self._unit, window, before, step, q, unseen)
             if again is Outcome.OUTLIER:
                 return self._alone(before, t_s, (joints, step))
@@ -584,6 +612,20 @@ class KalmanEstimator:
         came = (StateStep(kept, by, got.gain, got.z, got.S, velocity),)
         last = before.pose_measurement, None, before.seen_s, considered, got.beside._replace(t_s=t_s), came
         return ErrorState(t_s, got.x, got.P, joints, *last)
+
+    def _apart(self, before: ErrorState, joints: Smoothed, share: float) -> Array:
+        """Return the variances (n,) of links in their gaps that a window adds, of whose beginning a share is left.
+
+        A link may be anywhere between the ends (w^2 / 12), and a change of side that joints show may be early or late
+        (w^2 / 4 of a whole one, which moves the side by 2).
+        """
+        at, P = self._at, before.P
+        parts = slice(at.backlash, at.floats), slice(at.floats, at.compliance)
+        squares = np.array([before.x[part] ** 2 + np.diag(P)[part] for part in parts])
+        whole = squares.sum(axis=0) + 2.0 * (before.x[parts[0]] * before.x[parts[1]] + np.diag(P[parts[0], parts[1]]))
+        flips = np.maximum(joints.flips - before.joints.flips, 0.0)[0]
+        within = self._anywhere if before.seen_s < self._struck_s else whole / 12.0  # until images show where they are
+        return np.asarray(within * (1.0 - share**2) + (squares * flips).sum(axis=0) / 8.0)
 
     def _advanced(
         self, unit: Strapdown, window: Array, before: ErrorState, step: Propagation, q: Array, unseen: Array
@@ -677,6 +719,29 @@ class KalmanEstimator:
             reference = partial(self._model.innovation, self._reference, joints, pose_measurement, self._delay.jitter_s)
         seen = t_s, pose_measurement.T_base_tool, at.z, at.S, at.H
         return Innovation(*seen, step.kept[0], gain, outcome, None, reference, step.added[0], at.R)
+
+    def _mistimed(self, at: Predicted, chi: float, outcome: Outcome) -> bool:
+        """Return whether outliers in a row are all of one offset of the clock; then that jumped, and is corrected.
+
+        One number explains six of each image: a camera that was moved, or an arm, is not off along its motion alone.
+        """
+        late = at.H[:, self._at.delay]
+        weighed = np.linalg.solve(at.S, late)
+        information, score = max(float(late @ weighed), 1e-12), float(at.z @ weighed)
+        if self.clock is None or outcome is Outcome.USED or chi - score**2 / information > _GATE:
+            self._offsets = []
+            return False
+        self._offsets.append((score / information, information))
+        offsets, weights = np.array(self._offsets).T
+        mean = float(weights @ offsets / weights.sum())
+        one = weights @ (offsets - mean) ** 2 < chi_square_limit(len(offsets), CHANCE)
+        if outcome is Outcome.OUTLIER or not one:
+            return False
+        if len(offsets) >= STUBBORN:
+            self.clock.jump(mean, 1.0 / float(weights.sum()))
+            self._doubt.drop()
+            self._offsets = []
+        return True
 
     def _gate(self, at: Predicted, chi: float) -> Outcome:
         """Return whether an innovation, with its chi-square, is used, an outlier, or one too many to ignore."""
