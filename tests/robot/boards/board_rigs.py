@@ -95,7 +95,7 @@ class Speaker:
     def status(self, tick=0, *, state=0, rejected=(0, 0, 0)):
         sequence, count, rejection = rejected
         head = (tick, state, 0, [0] * 6, 0, 255, 0, 0, sequence, count, rejection)
-        return self.say("board_status", *head, 12000, 0, 0, 0, 0, 0, 0)
+        return self.say("board_status", *head, 12000, 0, 0, 0, 0, 0, 0, 0)
 
     def joints(self, tick=0):
         return self.say("joints", tick, *[[0.0] * 6 for _ in range(4)], [0] * 6)

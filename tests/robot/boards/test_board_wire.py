@@ -40,7 +40,7 @@ def stream(rng, disturbed, count=100):
         if rng.random() < 0.2:
             message = spoken.MAVLink_joints_message(tick, angles, angles, angles, angles, [0] * 6)
         elif rng.random() < 0.1:  # its array lies between other numbers
-            message = spoken.MAVLink_board_status_message(tick, 3, 0, [1, 0, 2, 0, 0, 4], *range(14))
+            message = spoken.MAVLink_board_status_message(tick, 3, 0, [1, 0, 2, 0, 0, 4], *range(15))
         elif rng.random() < 0.1:  # its fields are sent in another order
             message = spoken.MAVLink_heartbeat_message(2, 8, 128, 3, 4, 3)
         elif rng.random() < 0.1:  # text is left to the parser
