@@ -27,26 +27,26 @@ def fit_rigid(p_b: Array, p_a: Array, weights: Array | None = None) -> Array:
     """Fit ``T_a_b`` with ``p_a ~ T_a_b @ p_b`` in weighted least squares.
 
     Args:
-        p_b: (N, 3) points in b, N >= 3, not all on one line.
-        p_a: (N, 3) the same points in a.
+        p_b: (..., N, 3) points in b, N >= 3, not all on one line.
+        p_a: (..., N, 3) the same points in a.
         weights: (N,) non-negative weights, equal by default.
 
     Returns:
-        (4, 4) T_a_b.
+        (..., 4, 4) T_a_b.
 
     Raises:
         InputError: fewer than three points.
     """
-    if len(p_b) < 3 or len(p_b) != len(p_a):
-        raise InputError(f"a rigid fit needs 3 or more matched points, got {len(p_b)} and {len(p_a)}")
-    w = np.full(len(p_b), 1.0 / len(p_b)) if weights is None else weights / np.sum(weights)
+    if p_b.shape[-2] < 3 or p_b.shape != p_a.shape:
+        raise InputError(f"a rigid fit needs 3 or more matched points, got {p_b.shape[-2]} and {p_a.shape[-2]}")
+    w = np.full(p_b.shape[-2], 1.0 / p_b.shape[-2]) if weights is None else weights / np.sum(weights)
     mean_b, mean_a = w @ p_b, w @ p_a
-    U, _, Vt = np.linalg.svd((p_a - mean_a).T @ (w[:, None] * (p_b - mean_b)))
+    U, _, Vt = np.linalg.svd(
+        (p_a - mean_a[..., None, :]).swapaxes(-1, -2) @ (w[:, None] * (p_b - mean_b[..., None, :]))
+    )
+    U[np.linalg.det(U @ Vt) < 0, :, 2] *= -1.0  # a mirror image fits better: flip the direction of least spread
     R = U @ Vt
-    if np.linalg.det(R) < 0:  # a mirror image fits better: flip the direction of least spread
-        U[:, 2] = -U[:, 2]
-        R = U @ Vt
-    return pose(R, mean_a - R @ mean_b)
+    return pose(R, mean_a - (R @ mean_b[..., None])[..., 0])
 
 
 def fit_scale(p_b: Array, p_a: Array) -> float:

@@ -168,14 +168,8 @@ def _minimise(
     rays_left: Array, rays_right: Array, p: Array, cov: Array, by_rig: Array,
 ) -> None:  # fmt: skip
     """Move points p from their start to the minimum, NaN where there is none, and fill covariances and derivatives."""
-    r, J, q, xy, J_p, J_d = (
-        np.empty((2, 2)),
-        np.empty((2, 2, 3)),
-        np.empty((2, 3)),
-        np.empty((2, 2)),
-        np.empty((2, 2, 3)),
-        np.empty((2, 2, 8)),
-    )
+    r, J, q, xy = np.empty((2, 2)), np.empty((2, 2, 3)), np.empty((2, 3)), np.empty((2, 2))
+    J_p, J_d = np.empty((2, 2, 3)), np.empty((2, 2, 8))
     weight, JW, H, L = np.empty((2, 2, 2)), np.empty((3, 4)), np.empty((3, 3)), np.empty((3, 3))
     g, step, J_rig = np.empty(3), np.empty(3), np.empty((4, by_rig.shape[2]))
     for n in range(len(p)):
@@ -208,6 +202,29 @@ def _minimise(
                 gain = cov[n, j, 0] * JW[0, i] + cov[n, j, 1] * JW[1, i] + cov[n, j, 2] * JW[2, i]
                 for m in range(J_rig.shape[1]):
                     by_rig[n, j, m] -= gain * J_rig[i, m]
+
+
+@kernel("b1[::1], f8[:, ::1], f8[:, ::1], i8[::1], f8[:, ::1], const f8[:, ::1], f8[:, :, ::1]")
+def _by_rig(
+    fisheye: NDArray[np.bool_], k: Array, d: Array, counts: Ids, T_right_left: Array, p: Array, out: Array
+) -> None:
+    """Fill what :func:`pixels_by_rig` returns."""
+    r, J, q, xy = np.empty((2, 2)), np.empty((2, 2, 3)), np.empty((2, 3)), np.empty((2, 2))
+    J_p, J_d, uv = np.empty((2, 2, 3)), np.empty((2, 2, 8)), np.zeros((2, 2))
+    for n in range(len(p)):
+        _linearise(fisheye, k, d, T_right_left, p[n], uv, r, J, q, xy, J_p, J_d)
+        if np.isfinite(r.sum()):
+            _rig_jacobian(counts, q[1], xy, J_p, J_d, out[n])
+        else:
+            out[n] = np.nan
+
+
+def pixels_by_rig(rig: StereoRig, p_left: Array) -> Array:
+    """Return (N, 4, P) derivative of both images (left u, v, right u, v) of points by the rig's parameters; NaN unseen."""
+    counts = np.array([camera.distortion.size for camera in rig.cameras])
+    out = np.empty((len(p_left), 4, rig.parameter_count))
+    _by_rig(*pair_arguments(rig.cameras), counts, inverse(rig.T_left_right), np.ascontiguousarray(p_left), out)
+    return out
 
 
 @kernel

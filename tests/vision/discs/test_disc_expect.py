@@ -10,8 +10,9 @@ import pytest
 from armsight.data import Correspondences
 from armsight.geometry.pose import exp_se3, inverse, log_se3, pose, transform
 from armsight.geometry.rotation import exp_so3
-from armsight.vision.discs.bias import bias_normals, centred, expect, visible
+from armsight.vision.discs.bias import centred, expect, visible
 from armsight.vision.pose.measure import locate_discs
+from armsight.vision.triangulate import pixels_by_rig
 from asserts import assert_jacobian
 from disc_rims import disc_ellipses
 from disc_views import PLATE, SHAPE_NOISE, discs_of, hd_rig, someplace, views
@@ -49,7 +50,8 @@ def test_derivatives():
 
     # The derivative of an ellipse's centre leaves out how the lens' curvature over the ellipse changes: 2e-4 of it.
     assert_jacobian(e.J, lambda xi: moved(xi).uv, np.zeros(6), 1e-4, rtol=5e-4)
-    assert_jacobian(e.J_rig, lambda d: expect(rig.perturbed(d), SOLID, T).uv, np.zeros(22), 1e-5, rtol=1e-2)
+    by_rig = pixels_by_rig(rig, transform(T, SOLID.body.points)).reshape(-1, 2, 2, 22)
+    assert_jacobian(by_rig, lambda d: expect(rig.perturbed(d), SOLID, T).uv, np.zeros(22), 1e-5, rtol=1e-2)
 
 
 def test_bias_of_a_large_disc_nearby_and_what_correcting_leaves():
@@ -90,10 +92,10 @@ def test_the_error_of_a_pose_is_what_the_centres_noise_makes_of_it_wherever_the_
 
 def test_normals_nobody_gave():
     flat, solid = discs_of(PLATE.body.points, normal=None), discs_of(SOLID.body.points, normal=None)
-    assert np.abs(bias_normals(flat)[:, 2]) == pytest.approx(1)
-    assert np.isnan(bias_normals(solid)).all()
+    assert np.abs(flat.bias_normals[:, 2]) == pytest.approx(1)
+    assert np.isnan(solid.bias_normals).all()
     some = replace(solid, normals=np.array([[0, 0, 1.0], *np.full((3, 3), np.nan)]))
-    assert np.isfinite(bias_normals(some)[:, 0]).tolist() == [True, False, False, False]
+    assert np.isfinite(some.bias_normals[:, 0]).tolist() == [True, False, False, False]
     rig, T = hd_rig(), someplace(np.random.default_rng(2))
     np.testing.assert_allclose(expect(rig, flat, T).uv, expect(rig, PLATE, T).uv, atol=1e-9)
     assert np.isnan(expect(rig, flat, T).facing).all()

@@ -199,7 +199,8 @@ class Loop:
         # Of a lost body in the shot that is measured: its predicted pose and its velocity.
         self._expected: Array | None = None
         self._twist: Array | None = None
-        self._search: tuple[Shot, PoseEstimate | Missed, float] | None = None  # in lock-step; and when it will be over
+        #: In lock-step: what was measured, when the search will be over, board's clock, and when it ended, host's clock, s.
+        self._search: tuple[Shot, PoseEstimate | Missed, float, float] | None = None
         # Of the host's clock, s: when the next iteration is due, and when the measurement of the newest shot began.
         self._due = self._taken_s = 0.0
 
@@ -386,11 +387,12 @@ class Loop:
             result = self._measured(shot)
             if self.follower.way == "followed":
                 return shot, result
-            self._search = shot, result, self.t_s + SIMULATED_SEARCH_S
-        shot, result, over_s = self._search
+            self._search = shot, result, self.t_s + SIMULATED_SEARCH_S, time.perf_counter()
+        shot, result, over_s, found_s = self._search
         if self.t_s < over_s:
             return None
         self._search = None
+        self._taken_s += time.perf_counter() - found_s  # to simulate that time is no part of the search
         return shot, result
 
     def _measured(self, shot: Shot) -> PoseEstimate | Missed:

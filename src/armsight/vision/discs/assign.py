@@ -90,13 +90,10 @@ def settle(view: DiscView, T_left_body: Array, cov: Array, rows: Ids) -> Assigne
     T, rows = T_left_body, rows.copy()
     while True:
         expected = expect(view.rig, view.target, T)
-        see = visible(view.rig, expected)
-        free = [np.isin(np.arange(len(seen.uv)), rows[:, s], invert=True) for s, seen in enumerate(view.discs)]
-        claims: dict[int, Claim] = {}
-        for m in np.flatnonzero((rows < 0).all(axis=1) & see.any(axis=1)).tolist():
-            left, right = (_near(view, expected, cov, m, s, free[s]) if see[m, s] else _NONE for s in (0, 1))
-            if len(left) or len(right):
-                claims[m] = _together(view, expected, cov, m, (left, right))
+        see = np.asarray(visible(view.rig, expected) & (rows < 0).all(axis=1, keepdims=True))
+        free = [np.bincount(rows[:, s] + 1, minlength=1 + len(seen.uv))[1:] == 0 for s, seen in enumerate(view.discs)]
+        near = [_near(view, expected, cov, s, see[:, s, None] & free[s]) for s in (0, 1)]
+        claims = _claims(view, expected, cov, *near)
         unique = _unambiguous(claims)
         if not len(unique):
             break
@@ -106,28 +103,34 @@ def settle(view: DiscView, T_left_body: Array, cov: Array, rows: Ids) -> Assigne
     return Assigned(rows, T, tuple(Dropped(names[m], _competing(claim)) for m, claim in claims.items()))
 
 
-def _near(view: DiscView, expected: Expected, cov: Array, m: int, side: int, free: NDArray[np.bool_]) -> Ids:
-    """Return the free detections of one camera that may be disc m."""
-    rows = np.flatnonzero(free & view.alike(m, side, float(expected.radius_px[m, side])))
+def _near(view: DiscView, expected: Expected, cov: Array, side: int, free: NDArray[np.bool_]) -> tuple[Ids, Ids]:
+    """Return discs (K,) and detections (K,) of one camera that may be these, of those that are ``free`` (M, N)."""
+    m, rows = np.nonzero(free & view.alike(expected, side))
     gap = view.discs[side].uv[rows] - expected.uv[m, side]
-    J = expected.J[m, side]
-    S = J @ cov @ J.T + view.covariances(expected, np.full(len(rows), m), side, rows)
-    far = np.einsum("ni,nij,nj->n", gap, np.linalg.inv(S), gap)
-    return np.asarray(rows[far <= _GATE_ONE])
+    J = expected.J[:, side]
+    S = (J @ cov @ J.swapaxes(1, 2))[m] + view.covariances(expected, m, side, rows)
+    good = np.einsum("ni,nij,nj->n", gap, np.linalg.inv(S), gap) <= _GATE_ONE
+    return m[good], rows[good]
 
 
-def _together(view: DiscView, expected: Expected, cov: Array, m: int, near: Claim) -> Claim:
-    """Return those of a disc's detections with which both cameras agree; all of them where only one camera has any."""
-    if not len(near[0]) or not len(near[1]):
-        return near
-    a, b = (grid.ravel() for grid in np.meshgrid(*near, indexing="ij"))
-    J = expected.J[m].reshape(4, 6)
-    S = np.tile(J @ cov @ J.T, (len(a), 1, 1))
-    S[:, :2, :2] += view.covariances(expected, np.full(len(a), m), 0, a)
-    S[:, 2:, 2:] += view.covariances(expected, np.full(len(b), m), 1, b)
+def _claims(
+    view: DiscView, expected: Expected, cov: Array, left: tuple[Ids, Ids], right: tuple[Ids, Ids]
+) -> dict[int, Claim]:
+    """Return, by disc, those of its detections with which both cameras agree; all where only one camera has any."""
+    i, j = np.nonzero(left[0][:, None] == right[0])
+    m, a, b = left[0][i], left[1][i], right[1][j]
+    J = expected.J.reshape(-1, 4, 6)
+    S = (J @ cov @ J.swapaxes(1, 2))[m]
+    S[:, :2, :2] += view.covariances(expected, m, 0, a)
+    S[:, 2:, 2:] += view.covariances(expected, m, 1, b)
     gap = np.concatenate([view.discs[0].uv[a] - expected.uv[m, 0], view.discs[1].uv[b] - expected.uv[m, 1]], axis=1)
     good = np.einsum("ni,nij,nj->n", gap, np.linalg.inv(S), gap) <= _GATE_BOTH
-    return np.unique(a[good]), np.unique(b[good])
+    both, claims = set(m.tolist()), dict[int, Claim]()
+    for disc in np.union1d(left[0], right[0]).tolist():
+        agreed = good & (m == disc)
+        once = left[1][left[0] == disc], right[1][right[0] == disc]
+        claims[disc] = (np.unique(a[agreed]), np.unique(b[agreed])) if disc in both else once
+    return claims
 
 
 def _unambiguous(claims: dict[int, Claim]) -> Ids:

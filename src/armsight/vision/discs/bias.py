@@ -29,10 +29,10 @@ from numpy.typing import NDArray
 
 from armsight.data import Array, Correspondences, Record
 from armsight.geometry.check import checked
+from armsight.geometry.matrix import applied, dot
 from armsight.geometry.pose import inverse, transform
-from armsight.geometry.rotation import skew
 from armsight.kernels import kernel
-from armsight.vision.camera import Camera, distort
+from armsight.vision.camera import Camera, distort, pair_arguments
 from armsight.vision.markers.disc.fit import factor, solve
 from armsight.vision.markers.discs import DiscTarget
 from armsight.vision.rig import StereoRig
@@ -186,13 +186,8 @@ def _refine(fisheye: bool, k: Array, d: Array, P: Array, n: Array, radius: float
             mu, mv = m11 * u + m12 * v, m12 * u + m22 * v
             s, slope = np.sqrt(u * mu + v * mv), np.hypot(mu, mv)
             inside = (1.0 - s) * s / slope
-            J[0], J[1], J[2], J[3], J[4] = (
-                mu / slope,
-                mv / slope,
-                -u * u / (2 * slope),
-                -u * v / slope,
-                -v * v / (2 * slope),
-            )
+            J[0], J[1], J[2], J[3] = mu / slope, mv / slope, -u * u / (2 * slope), -u * v / slope
+            J[4] = -v * v / (2 * slope)
             for i in range(5):
                 g[i] -= weight * J[i] * inside
                 for j in range(i + 1):
@@ -306,8 +301,6 @@ def apparent_radii(camera: Camera, T_camera_board: Array, points: Array, shape: 
 
 #: A disc is not found where the cosine between its normal and the direction to the camera is below this.
 LEAST_FACING = 0.09
-#: Points count as coplanar where their third singular value is below this share of the first.
-_FLAT = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -321,7 +314,6 @@ class Expected(Record):
         radius_px: (M, 2) longer half axes of the ellipses, px.
         facing: (M, 2) cosine between a disc's normal and its direction to the camera; NaN where the normal is unknown.
         J: (M, 2, 2, 6) derivative of ``uv`` by the tangent of the pose.
-        J_rig: (M, 2, 2, P) derivative of ``uv`` by the rig's parameters.
         cov_bias: (M, 2, 2, 2) covariance of the bias where the normal is not known, px^2; zero where it is.
     """
 
@@ -331,58 +323,65 @@ class Expected(Record):
     radius_px: Array
     facing: Array
     J: Array
-    J_rig: Array
     cov_bias: Array
 
 
-def bias_normals(target: DiscTarget) -> Array:
-    """Return normals (M, 3) for the perspective bias, for which their sign does not matter.
+@kernel(
+    "b1[::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1], const f8[:, ::1], const f8[:, ::1], const f8[:, ::1], const f8[::1], "
+    "f8[:, :, ::1], f8[:, :, ::1], f8[:, :, ::1], f8[:, ::1], f8[:, ::1], f8[:, :, :, ::1], f8[:, :, :, ::1]"
+)
+def _expect(
+    fisheye: NDArray[np.bool_], k: Array, d: Array, Ts: Array, points: Array, faces: Array, normals: Array, radii: Array,
+    uv: Array, bias: Array, shape: Array, radius_px: Array, facing: Array, J: Array, cov: Array,
+) -> None:  # fmt: skip
+    """Fill :class:`Expected` camera by camera, whose poses of the body are Ts (2, 4, 4).
 
-    Where none is given, that of the plane of all discs; NaN where they are not coplanar.
+    ``faces``: the discs' normals, NaN where unknown; ``normals``: those for the bias.
     """
-    normals = np.array(target.normals)
-    unknown = np.isnan(normals[:, 0])
-    centred = target.body.points - target.body.points.mean(axis=0)
-    if unknown.any() and len(centred) >= 3:
-        _, spread, axes = np.linalg.svd(centred)
-        if spread[1] > _FLAT * spread[0] and spread[2] <= _FLAT * spread[0]:
-            normals[unknown] = axes[2]
-    return normals
+    count, xy, J_p, J_d = len(points), np.empty(2), np.empty((2, 3)), np.empty((2, 8))
+    P, n, J_P, J_n = np.empty((count, 3)), np.empty((count, 3)), np.empty((count, 2, 3)), np.empty((count, 2, 3))
+    for side in range(2):
+        R, focal, where = Ts[side, :3, :3].copy(), k[side, :2], k[side, 2:]
+        for m in range(count):
+            P[m] = applied(R, points[m]) + Ts[side, :3, 3]
+            far = np.sqrt(dot(P[m], P[m]))
+            facing[side, m] = -dot(P[m], applied(R, faces[m])) / far
+            n[m] = applied(R, normals[m]) if np.isfinite(normals[m, 0]) else P[m] / far
+        _each(fisheye[side], k[side], d[side], P, n, radii, uv[side], shape[side], J_P, J_n)
+        for m in range(count):
+            p, b, c = points[m], np.zeros(3), shape[side, m]
+            distort(fisheye[side], d[side], P[m], xy, J_p, J_d)
+            for i in range(2):
+                scale = focal[i] if fisheye[side] or P[m, 2] > 0.0 else np.nan
+                J_p[i] *= scale
+                xy[i] = scale * xy[i] + where[i]
+            cov[side, m] = 0.0
+            if np.isfinite(normals[m, 0]):
+                b[:] = normals[m]
+            else:
+                uv[side, m], J_P[m], J_n[m] = xy, J_p, 0.0
+                reach2 = (radii[m] * radii[m] / P[m, 2]) ** 2 / 15.0
+                for i in range(2):
+                    for j in range(2):
+                        across = J_p[i, 0] * J_p[j, 0] + J_p[i, 1] * J_p[j, 1]
+                        cov[side, m, i, j] = reach2 * (across + 8.0 * J_p[i, 2] * J_p[j, 2])
+            radius_px[side, m] = np.sqrt((c[0] + c[2]) / 2 + np.hypot((c[0] - c[2]) / 2, c[1]))
+            for i in range(2):
+                bias[side, m, i] = uv[side, m, i] - xy[i]
+                g, e, by = applied(R.T, J_P[m, i]), applied(R.T, J_n[m, i]), J[side, m, i]
+                by[:3] = g
+                by[3] = g[2] * p[1] - g[1] * p[2] + e[2] * b[1] - e[1] * b[2]
+                by[4] = g[0] * p[2] - g[2] * p[0] + e[0] * b[2] - e[2] * b[0]
+                by[5] = g[1] * p[0] - g[0] * p[1] + e[1] * b[0] - e[0] * b[1]
 
 
 def expect(rig: StereoRig, target: DiscTarget, T_left_body: Array) -> Expected:
     """Predict what both cameras see of a body's discs at a pose (4, 4)."""
-    points, normals = target.body.points, bias_normals(target)
-    known = np.isfinite(normals[:, 0])
-    T_right_left, count = inverse(rig.T_left_right), len(points)
-    uv, bias, shape = np.empty((count, 2, 2)), np.empty((count, 2, 2)), np.empty((count, 2, 3))
-    facing, J = np.empty((count, 2)), np.empty((count, 2, 2, 6))
-    J_rig, cov = np.zeros((count, 2, 2, rig.parameter_count)), np.zeros((count, 2, 2, 2))
-    first = 0
-    for side, camera in enumerate(rig.cameras):
-        T = T_left_body if side == 0 else T_right_left @ T_left_body
-        R, p = T[:3, :3], transform(T, points)
-        facing[:, side] = -np.einsum("mi,mi->m", p, target.normals @ R.T) / np.linalg.norm(p, axis=1)
-        n = np.where(known[:, None], normals, 0.0) @ R.T
-        n[~known] = p[~known] / np.linalg.norm(p[~known], axis=1, keepdims=True)
-        centre, J_p, J_camera = camera.project_jacobians(p)
-        uv[:, side], shape[:, side], J_P, J_n = project_discs(camera, p, n, target.radii_m)
-        uv[~known, side] = centre[~known]
-        J_P[~known], J_n[~known] = J_p[~known], 0.0
-        by_position = np.concatenate([np.broadcast_to(R, (count, 3, 3)), -R @ skew(points)], axis=2)
-        J[:, side] = J_P @ by_position
-        J[:, side, :, 3:] -= J_n @ (R @ skew(np.where(known[:, None], normals, 0.0)))
-        bias[:, side] = uv[:, side] - centre
-        reach2 = (target.radii_m**2 / p[:, 2]) ** 2
-        moved = reach2[:, None, None] * np.diag([1.0, 1.0, 8.0]) / 15
-        cov[~known, side] = (J_p @ moved @ np.swapaxes(J_p, 1, 2))[~known]
-        J_rig[:, side, :, first : first + J_camera.shape[2]] = J_camera
-        first += J_camera.shape[2]
-        if side == 1:
-            J_rig[:, side, :, first:] = np.concatenate([-J_p, J_p @ skew(p)], axis=2)
-    mean, half = (shape[..., 0] + shape[..., 2]) / 2, (shape[..., 0] - shape[..., 2]) / 2
-    radius = np.sqrt(mean + np.hypot(half, shape[..., 1]))
-    return Expected(uv, bias, shape, radius, facing, J, J_rig, cov)
+    points, faces, radii = (np.ascontiguousarray(a) for a in (target.body.points, target.normals, target.radii_m))
+    Ts = np.stack([T_left_body, inverse(rig.T_left_right) @ T_left_body])
+    out = [np.empty((2, len(radii), *shape)) for shape in ((2,), (2,), (3,), (), (), (2, 6), (2, 2))]
+    _expect(*pair_arguments(rig.cameras), Ts, points, faces, target.bias_normals, radii, *out)
+    return Expected(*(np.swapaxes(filled, 0, 1) for filled in out))
 
 
 def centred(rig: StereoRig, target: DiscTarget, T_left_body: Array, seen: Correspondences) -> Correspondences:

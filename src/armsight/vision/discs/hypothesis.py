@@ -12,8 +12,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from armsight.data import Array, Correspondences, Ids, Record
 from armsight.estimate.chance import chi_square_limit
@@ -21,12 +23,15 @@ from armsight.geometry.pose import exp_se3, transform
 from armsight.vision.discs.assign import GATE_QUANTILE, correspondences, settle
 from armsight.vision.discs.bias import LEAST_FACING, Expected, expect, visible
 from armsight.vision.discs.pairing import DEPTHS_M, SIZE_SIGMAS, SIZE_TOLERANCE, DiscView, Pairs
+from armsight.vision.triangulate import pixels_by_rig
 
 #: A disc in view is found with this probability.
 FOUND = 0.9
 #: One standard deviation of an ellipse's size about the disc's, as a share, beside its noise.
 SIZE_SHARE = SIZE_TOLERANCE / 3
 _STEPS, _DONE = 12, 1e-4
+#: Per camera (M, N) which detections have the shape of which disc's ellipse.
+Congruent: TypeAlias = tuple[NDArray[np.bool_], NDArray[np.bool_]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,10 +105,11 @@ def hypothesis(view: DiscView, pairs: Pairs, T_left_body: Array, rows: Ids) -> H
     tilt_rad = 3.0 * np.sqrt(np.linalg.eigvalsh(fit.cov[3:, 3:])[-1])
     if (expected.facing[found.rows >= 0] + tilt_rad < LEAST_FACING).any():
         return "its discs would be seen from behind"
-    sizes = _size_chi2(view, expected, found.rows)
+    congruent = view.congruent(expected, 0), view.congruent(expected, 1)
+    sizes = _size_chi2(view, expected, congruent, found.rows)
     if sizes is None:
         return "the discs do not have the shape that the body's would have"
-    score = _score(view, pairs, expected, found.rows, fit) - sizes / 2
+    score = _score(view, pairs, expected, congruent, found.rows, fit) - sizes / 2
     return Hypothesis(found.rows, fit.T_left_body, fit.cov, correspondences(view, found), score)
 
 
@@ -122,7 +128,8 @@ def _fit(view: DiscView, T: Array, rows: Ids) -> _Fit | None:
         gap = (uv - expected.uv[m, side]).ravel()
         if not np.isfinite(gap).all():
             return None
-        by_rig = expected.J_rig[m, side].reshape(len(gap), -1) @ view.rig_root
+        by_rig = pixels_by_rig(view.rig, transform(T, view.target.body.points)).reshape(-1, 2, 2, len(view.rig_root))
+        by_rig = by_rig[m, side].reshape(len(gap), -1) @ view.rig_root
         S = by_rig @ by_rig.T
         for s in (0, 1):
             here = np.flatnonzero(side == s)
@@ -141,19 +148,20 @@ def _fit(view: DiscView, T: Array, rows: Ids) -> _Fit | None:
     return None
 
 
-def _size_chi2(view: DiscView, expected: Expected, rows: Ids) -> float | None:
+def _size_chi2(view: DiscView, expected: Expected, congruent: Congruent, rows: Ids) -> float | None:
     """Return the chi-square of the ellipses' sizes, or None where one does not fit at all."""
     total = 0.0
-    for m, side in np.argwhere(rows >= 0).tolist():
-        row, long = rows[m, side], float(expected.radius_px[m, side])
-        if not view.congruent(expected, m, side)[row]:
+    for s in (0, 1):
+        m = np.flatnonzero(rows[:, s] >= 0)
+        row, long = rows[m, s], expected.radius_px[m, s]
+        if not congruent[s][m, row].all():
             return None
-        sigma2 = (SIZE_SHARE * long) ** 2 + float(view.tolerance_px[side][row] / SIZE_SIGMAS) ** 2
-        total += (float(view.radius_px[side][row]) - long) ** 2 / sigma2
+        sigma2 = (SIZE_SHARE * long) ** 2 + (view.tolerance_px[s][row] / SIZE_SIGMAS) ** 2
+        total += float(((view.radius_px[s][row] - long) ** 2 / sigma2).sum())
     return total
 
 
-def _score(view: DiscView, pairs: Pairs, expected: Expected, rows: Ids, fit: _Fit) -> float:
+def _score(view: DiscView, pairs: Pairs, expected: Expected, congruent: Congruent, rows: Ids, fit: _Fit) -> float:
     """Return the logarithm of the Bayes factor of the centres; see the module."""
     side, m = np.nonzero(rows.T >= 0)
     lost = int((visible(view.rig, expected) & (rows < 0)).sum())
@@ -162,9 +170,7 @@ def _score(view: DiscView, pairs: Pairs, expected: Expected, rows: Ids, fit: _Fi
     prior = -np.log(8 * np.pi**2 * 3 * _volume(view, z) * np.log(DEPTHS_M[1] / DEPTHS_M[0]))
     pose = 3 * np.log(2 * np.pi) + np.linalg.slogdet(fit.cov)[1] / 2 + prior
     seen = len(m) * np.log(FOUND) + lost * np.log(1 - FOUND)
-    in_image = np.log(
-        [_density(view, expected, rows[:, s], i, s) for i, s in zip(m.tolist(), side.tolist(), strict=True)]
-    )
+    in_image = np.log(np.concatenate([_density(view, expected, congruent[s], rows[:, s], s) for s in (0, 1)]))
     flat = _integrated(fit.weight, np.eye(2 * len(m))) + in_image.sum()
     both = np.asarray((rows >= 0).all(axis=1))
     ids = np.flatnonzero(both)
@@ -209,15 +215,17 @@ def _pairs_density(view: DiscView, pairs: Pairs, rows: Ids, fit: _Fit) -> float:
     return max((int(other.sum()) + 1) / _volume(view, farthest), about)
 
 
-def _density(view: DiscView, expected: Expected, mine: Ids, m: int, side: int) -> float:
-    """Return the number per square pixel of discs that may be disc m: in the image, or about the body where denser."""
-    long = float(expected.radius_px[m, side])
-    alike = view.congruent(expected, m, side)
-    other = np.array(alike)
-    other[mine[mine >= 0]] = False
-    uv = expected.uv[np.isfinite(expected.uv[:, side, 0]), side]
+def _density(view: DiscView, expected: Expected, alike: NDArray[np.bool_], rows: Ids, s: int) -> Array:
+    """Return (K,) the number per square pixel of discs that may be each disc that camera s saw.
+
+    In the image, or about the body where they are denser.
+    """
+    seen = rows >= 0
+    uv = expected.uv[np.isfinite(expected.uv[:, s, 0]), s]
     middle = uv.mean(axis=0)
-    reach = float(np.linalg.norm(uv - middle, axis=1).max()) + 2 * long
-    about = int((other & (np.linalg.norm(view.discs[side].uv - middle, axis=1) <= reach)).sum())
-    width, height = view.rig.cameras[side].image_size_px
-    return max(int(alike.sum()) / (width * height), about / (np.pi * reach**2))
+    reach = float(np.linalg.norm(uv - middle, axis=1).max()) + 2 * expected.radius_px[seen, s]
+    near = np.linalg.norm(view.discs[s].uv - middle, axis=1) <= reach[:, None]
+    near[:, rows[seen]] = False
+    width, height = view.rig.cameras[s].image_size_px
+    about = (alike[seen] & near).sum(axis=1) / (np.pi * reach**2)
+    return np.asarray(np.maximum(alike[seen].sum(axis=1) / (width * height), about))

@@ -10,7 +10,6 @@ and all other namings together, are those of ERROR_ODDS: an ambiguous answer is 
 
 from __future__ import annotations
 
-import itertools
 from collections import Counter
 from dataclasses import dataclass
 from itertools import combinations
@@ -21,6 +20,7 @@ from numpy.typing import NDArray
 
 from armsight.data import SIDES, Array, Correspondences, Discs, Ids, Missed, Record
 from armsight.geometry.near import pairs_within
+from armsight.geometry.rigid import fit_rigid
 from armsight.kernels import kernel
 from armsight.vision.discs.hypothesis import Hypothesis, hypothesis
 from armsight.vision.discs.pairing import MOST_PAIRS, DiscView, Pairs, pair, wrong_size
@@ -33,7 +33,6 @@ DISTANCE_SIGMAS = 4.5
 SLIM = 0.05
 #: With more edges than this none is examined; no more triples than this are listed.
 MOST_EDGES, MOST_TRIPLES = 500_000, 5_000
-_NONE = np.zeros(0, np.int64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +80,7 @@ def triples(view: DiscView, pairs: Pairs) -> Triples | None:
     third = np.searchsorted(first * len(nodes) + second, found[:, 1] * len(nodes) + found[:, 2])
     order = np.lexsort([chi2[found[:, 3]] + chi2[found[:, 4]] + chi2[third], -support])
     ids, rows = ids[order], rows[order]
-    Ts = _rigid(view.target.body.points[ids], pairs.p_left[rows])
+    Ts = fit_rigid(view.target.body.points[ids], pairs.p_left[rows])
     return Triples(ids, rows, Ts, _most(support[order]), int(_most(np.array([enough - 1]))[0]))
 
 
@@ -101,7 +100,7 @@ def _edges(view: DiscView, pairs: Pairs) -> tuple[Ids, Ids, Ids, Array] | None:
     if not len(pair):
         return nodes, pair, pair, np.zeros(0)
     # No two discs lie farther apart than this, the least certain pairs included.
-    sigma = np.sqrt(np.linalg.eigvalsh(pairs.cov)[:, -1].max() * 2)
+    sigma = np.sqrt(np.trace(pairs.cov, axis1=1, axis2=2).max() * 2)
     near = pairs_within(pairs.p_left, sides.max() + DISTANCE_SIGMAS * (sigma + tolerance), MOST_EDGES + 1)
     if len(near) > MOST_EDGES:
         return None
@@ -115,23 +114,35 @@ def _edges(view: DiscView, pairs: Pairs) -> tuple[Ids, Ids, Ids, Array] | None:
     variance = (
         np.einsum("ni,nij,nj->n", along, pairs.cov[i] + pairs.cov[j], along) + (by_rig**2).sum(axis=1) + tolerance**2
     )
-    order = np.argsort(distance)
-    i, j, distance, variance = i[order], j[order], distance[order], variance[order]
-    widest = DISTANCE_SIGMAS * np.sqrt(variance.max(initial=0.0))
-    first, second, chi2 = [_NONE], [_NONE], [np.zeros(0)]
-    for a, b in itertools.combinations(range(len(points)), 2):
-        low, high = np.searchsorted(distance, [sides[a, b] - widest, sides[a, b] + widest])
-        off = (distance[low:high] - sides[a, b]) ** 2 / variance[low:high]
-        close = low + np.flatnonzero(off <= DISTANCE_SIGMAS**2)
-        for u, v in ((i[close], j[close]), (j[close], i[close])):
-            fit = pairs.fits[u, a] & pairs.fits[v, b]
-            ends = node[u[fit], a], node[v[fit], b]
-            first.append(np.minimum(*ends))
-            second.append(np.maximum(*ends))
-            chi2.append(off[close[fit] - low])
-        if sum(map(len, first)) > MOST_EDGES:
-            return None
-    return nodes, np.concatenate(first), np.concatenate(second), np.concatenate(chi2)
+    ends, chi2 = np.empty((MOST_EDGES, 2), np.int64), np.empty(MOST_EDGES)
+    count = _joined(i, j, distance, variance, sides, np.ascontiguousarray(pairs.fits), node, ends, chi2)
+    return None if count > MOST_EDGES else (nodes, ends[:count, 0], ends[:count, 1], chi2[:count])
+
+
+@kernel("i8[::1], i8[::1], f8[::1], f8[::1], f8[:, ::1], const b1[:, ::1], i8[:, ::1], i8[:, ::1], f8[::1]")
+def _joined(
+    first: Ids, second: Ids, distance: Array, variance: Array, sides: Array, fits: NDArray[np.bool_], node: Ids, ends: Ids,
+    chi2: Array,
+) -> int:  # fmt: skip
+    """Join the nodes of two pairs, ``distance`` (E,) apart, that are discs as far from each other: ``sides`` (M, M).
+
+    fits, node (K, M): which disc a pair may be, and that node. Fill ``ends`` (L, 2), the lower node first, and ``chi2``
+    (L,); return their number, at most L + 1.
+    """
+    count, n = 0, len(sides)
+    for e in range(len(first)):
+        i, j = first[e], second[e]
+        for a in range(n):
+            for b in range(n):
+                off = (distance[e] - sides[a, b]) ** 2
+                if a == b or not (fits[i, a] and fits[j, b] and off <= DISTANCE_SIGMAS**2 * variance[e]):
+                    continue
+                if count == len(ends):
+                    return count + 1
+                ends[count, 0], ends[count, 1] = min(node[i, a], node[j, b]), max(node[i, a], node[j, b])
+                chi2[count] = off / variance[e]
+                count += 1
+    return count
 
 
 @kernel("i8[::1], i8[::1], i8[::1], i8, i8[:, ::1]")
@@ -177,18 +188,6 @@ def spread(p: Array) -> NDArray[np.bool_]:
     u, v, w = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0], p[:, 2] - p[:, 1]
     longest2 = np.max([(s**2).sum(axis=1) for s in (u, v, w)], axis=0)
     return np.asarray(np.linalg.norm(np.cross(u, v), axis=1) >= SLIM * longest2)
-
-
-def _rigid(p_b: Array, p_a: Array) -> Array:
-    """Fit (T, 4, 4) transforms of triangles p_b (T, 3, 3) to p_a: :func:`~armsight.geometry.rigid.fit_rigid`, batched."""
-    mean_b, mean_a = p_b.mean(axis=1), p_a.mean(axis=1)
-    U, _, Vt = np.linalg.svd(np.swapaxes(p_a - mean_a[:, None], 1, 2) @ (p_b - mean_b[:, None]))
-    flip = np.ones((len(U), 1, 3))
-    flip[:, 0, 2] = np.linalg.det(U) * np.linalg.det(Vt)
-    T = np.tile(np.eye(4), (len(U), 1, 1))
-    T[:, :3, :3] = (U * flip) @ Vt
-    T[:, :3, 3] = mean_a - np.einsum("nij,nj->ni", T[:, :3, :3], mean_b)
-    return T
 
 
 #: A naming is accepted only where it is so many times likelier than all others together, and than clutter.
@@ -252,13 +251,13 @@ def _hypotheses(view: DiscView, pairs: Pairs, found: Triples) -> list[Hypothesis
     many = Missed(f"ambiguous: {_counts(discs)} show {target.body.name} at more than {MOST_HYPOTHESES} poses")
     if len(possible) > MOST_HYPOTHESES * comb(count, 3):  # each body has so many triples, and no more
         return many
-    tried = 0
+    tried, contained = 0, np.zeros(len(found.ids), bool)
     for n in possible:
         if _settled(accepted, int(found.most[n])):
             return accepted
-        ids, detections = found.ids[n], both[found.rows[n]]
-        if any((h.rows[ids] == detections).all() for h in accepted):
+        if contained[n]:
             continue
+        ids, detections = found.ids[n], both[found.rows[n]]
         if tried == MOST_HYPOTHESES:
             return many
         tried += 1
@@ -269,6 +268,7 @@ def _hypotheses(view: DiscView, pairs: Pairs, found: Triples) -> list[Hypothesis
             reasons[result] += 1
         elif not any((h.rows == result.rows).all() for h in accepted):
             accepted.append(result)
+            contained |= (result.rows[found.ids] == both[found.rows]).all(axis=(1, 2))
     if found.left_out and not _settled(accepted, found.left_out):
         return many
     if accepted:

@@ -13,6 +13,7 @@ radii or distances to the body's is reported.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import permutations
 from typing import NamedTuple
 
@@ -22,14 +23,13 @@ from numpy.typing import NDArray
 from armsight.data import Array, Discs, Ids, Record
 from armsight.geometry.near import pairs_within
 from armsight.geometry.pose import inverse, transform
-from armsight.geometry.rotation import skew
 from armsight.kernels import kernel, kernel_types
 from armsight.vision.camera import Camera
 from armsight.vision.discs.bias import Expected
 from armsight.vision.markers.discs import DiscTarget
 from armsight.vision.match import GATE_PX, epipolar_distances
 from armsight.vision.rig import StereoRig
-from armsight.vision.triangulate import midpoints, optimal_points
+from armsight.vision.triangulate import midpoints, optimal_points, pixels_by_rig
 
 #: An ellipse may be this much longer or shorter than the disc would look, beyond so many standard deviations of its
 #: rim.
@@ -78,31 +78,29 @@ class DiscView(Record):
             (left.cov_uv + more, right.cov_uv + more),
             (_radius_once(left), _radius_once(right)),
             (next(tolerance), next(tolerance)),
-            _root(rig.cov),
+            _root(rig),
             UNMODELLED_SHARE * float(np.linalg.norm(np.ptp(target.body.points, axis=0))),
         )
 
-    def alike(self, m: int, side: int, radius_px: float) -> NDArray[np.bool_]:
-        """(N,) whether detections of one camera have disc m's brightness and about a longer half axis of ``radius_px``."""
-        seen, tolerance = self.radius_px[side], self.tolerance_px[side]
-        low, high = (1 - SIZE_TOLERANCE) * radius_px - tolerance, (1 + SIZE_TOLERANCE) * radius_px + tolerance
-        size = (seen >= low) & (seen <= high)
-        return np.asarray(size & (self.discs[side].bright == self.target.bright[m]))
+    def alike(self, expected: Expected, side: int) -> NDArray[np.bool_]:
+        """(M, N) which detections of one camera have a disc's brightness and about the length of its ellipse."""
+        seen, long, share = self.radius_px[side], expected.radius_px[:, side, None], SIZE_TOLERANCE
+        size = np.abs(seen - long) <= share * long + self.tolerance_px[side]
+        return np.asarray(size & (self.discs[side].bright == self.target.bright[:, None]))
 
-    def congruent(self, expected: Expected, m: int, side: int) -> NDArray[np.bool_]:
-        """(N,) whether detections of one camera have the size, the slenderness and the direction of disc m's ellipse."""
-        alike = self.alike(m, side, float(expected.radius_px[m, side]))
-        if np.isnan(expected.facing[m, side]):
-            return alike
-        a, b, c = expected.shape[m, side]
+    def congruent(self, expected: Expected, side: int) -> NDArray[np.bool_]:
+        """(M, N) which detections of one camera have the size, the slenderness and the direction of a disc's ellipse."""
+        alike = self.alike(expected, side)
+        m, n = np.nonzero(alike & np.isfinite(expected.facing[:, side, None]))
+        a, b, c = expected.shape[m, side].T
         det = a * c - b * b
-        s11, s12, s22 = self.discs[side].shape[alike].T
+        s11, s12, s22 = self.discs[side].shape[n].T
         # Squares of how many times longer each ellipse is: the eigenvalues of S_expected^-1 S.
         mean, product = (c * s11 - 2 * b * s12 + a * s22) / (2 * det), (s11 * s22 - s12**2) / det
         half = np.sqrt(np.maximum(mean**2 - product, 0.0))
-        tolerance = SHAPE_TOLERANCE + self.tolerance_px[side][alike] / np.sqrt(det / max(a, c))
+        tolerance = SHAPE_TOLERANCE + self.tolerance_px[side][n] / np.sqrt(det / np.maximum(a, c))
         slim = (np.sqrt(np.maximum(mean - half, 0.0)) < 1 - tolerance) | (np.sqrt(mean + half) > 1 + tolerance)
-        alike[np.flatnonzero(alike)[slim]] = False
+        alike[m[slim], n[slim]] = False
         return alike
 
     def covariances(self, expected: Expected, m: Ids, side: int, rows: Ids) -> Array:
@@ -125,8 +123,10 @@ def _radius_once(discs: Discs) -> Array:
     return radius
 
 
-def _root(cov: Array) -> Array:
-    """Return (P, R) with root @ root.T = cov, without the directions that are exact."""
+@lru_cache(maxsize=4)
+def _root(rig: StereoRig) -> Array:
+    """Return (P, R) with root @ root.T the rig's covariance, without the directions that are exact."""
+    cov = rig.cov
     sigma = np.sqrt(np.diag(cov))
     scale = np.where(sigma > 0, sigma, 1.0)
     values, vectors = np.linalg.eigh(cov / np.outer(scale, scale))
@@ -176,16 +176,11 @@ def _explains(ratio: float, tolerance: float) -> bool:
 
 def _size_scale(p: Array, points: Array) -> float | None:
     """Return the one ratio by which a triangle of p (N, 3) is similar to the body's first three discs; None without one."""
-    body = points[:3]
-    found = []
-    for rows in permutations(range(len(p)), 3):
-        sides = [
-            np.linalg.norm(p[rows[a]] - p[rows[b]]) / np.linalg.norm(body[a] - body[b])
-            for a, b in ((0, 1), (1, 2), (2, 0))
-        ]
-        if np.ptp(sides) < _ALIKE_LENGTH * np.mean(sides):
-            found.append(float(np.mean(sides)))
-    return found[0] if found and np.ptp(found) < _ALIKE_LENGTH * found[0] else None
+    corners, body = p[np.array(list(permutations(range(len(p)), 3)))], points[:3]
+    sides = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2)
+    sides /= np.linalg.norm(body - np.roll(body, -1, axis=0), axis=1)
+    found = sides[np.ptp(sides, axis=1) < _ALIKE_LENGTH * sides.mean(axis=1)].mean(axis=1)
+    return float(found[0]) if len(found) and np.ptp(found) < _ALIKE_LENGTH * found[0] else None
 
 
 #: Nearest and farthest disc, m.
@@ -298,20 +293,9 @@ def _share_of_rig(view: DiscView, lines: _Lines) -> Array:
     there = np.asarray(np.isfinite(uv_right).all(axis=1))
     right = _lines(rig, 1, np.where(there[:, None], uv_right, 0.0), view.cov_uv[0])
     w = np.concatenate([lines.by_pixel, -right.by_pixel], axis=1)
-    J = _by_rig(rig, p) @ view.rig_root
+    J = pixels_by_rig(rig, p) @ view.rig_root
     share = np.einsum("ni,nir->nr", w, np.where(np.isfinite(J), J, 0.0))
     return np.asarray(np.nan_to_num((share**2).sum(axis=1)))
-
-
-def _by_rig(rig: StereoRig, p_left: Array) -> Array:
-    """Return (N, 4, P) derivative of both images (left u, v, right u, v) of points by the rig's parameters."""
-    p_right = transform(inverse(rig.T_left_right), p_left)
-    _, _, K_l = rig.left.project_jacobians(p_left)
-    _, J_r, K_r = rig.right.project_jacobians(p_right)
-    J, n = np.zeros((len(p_left), 4, rig.parameter_count)), K_l.shape[2]
-    J[:, :2, :n], J[:, 2:, n:-6] = K_l, K_r
-    J[:, 2:, -6:] = np.concatenate([-J_r, J_r @ skew(p_right)], axis=2)
-    return J
 
 
 @kernel_types("const f8[::1], const f8[::1], const f8[:, ::1], const f8[:, ::1], f8[::1], f8[::1], const b1[::1]")
@@ -334,16 +318,9 @@ def _side(view: DiscView, of: _Lines, s: int) -> _Side:
 
 @kernel("f8[::1], i8[::1], f8[::1], _Side, _Side, f8[::1], f8[::1], b1[::1], i8[:, ::1]")
 def _sweep(
-    gate: Array,
-    order: Ids,
-    angle_r: Array,
-    left: _Side,
-    right: _Side,
-    t: Array,
-    radii: Array,
-    bright: NDArray[np.bool_],
+    gate: Array, order: Ids, angle_r: Array, left: _Side, right: _Side, t: Array, radii: Array, bright: NDArray[np.bool_],
     rows: Ids,
-) -> int:
+) -> int:  # fmt: skip
     """Write the possible pairs into ``rows`` (L, 2); return their number, more than its length when it overflows.
 
     gate (N,): largest difference of the epipolar planes' angles for each left disc, rad; order (K,): right discs that
@@ -397,7 +374,7 @@ def _triangulated(view: DiscView, lines: tuple[_Lines, _Lines], rows: Ids) -> Pa
     i, j, p = i[good], j[good], p[good]
     w = np.concatenate([lines[0].by_pixel[i], -lines[1].by_pixel[j]], axis=1)
     gap = lines[0].angle[i] - lines[1].angle[j]
-    share = np.einsum("ni,nir->nr", w, _by_rig(rig, p) @ view.rig_root)
+    share = np.einsum("ni,nir->nr", w, pixels_by_rig(rig, p) @ view.rig_root)
     met = gap**2 <= GATE_SIGMAS**2 * (lines[0].variance[i] + lines[1].variance[j] + (share**2).sum(axis=1))
     kind = np.array(discs[0].bright[i][:, None] == target.bright[None])
     for side, chosen, p_camera in ((0, i, p), (1, j, transform(inverse(rig.T_left_right), p))):

@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from armsight.data import SIDES, Array, Correspondences, Dropped, Missed, Points, PoseEstimate, Record, Shot
 from armsight.errors import InputError
 from armsight.geometry.pose import inverse, log_se3
-from armsight.vision.discs.bias import bias_normals
 from armsight.vision.follow.kernel import (
     ASTRAY,
     FACING_AWAY,
@@ -166,7 +165,7 @@ class Follower:
             np.array(rig.cov),
             max(rig.sigma_px, 1e-6) ** 2,
             np.array(discs.body.points),
-            bias_normals(discs),
+            discs.bias_normals,
             np.isfinite(discs.normals[:, 0]),
             np.array(discs.radii_m),
             np.where(discs.bright, 1, -1),
@@ -322,7 +321,7 @@ def follows(target: Target) -> TypeGuard[Composite]:
     discs = target.discs  # only a Composite has discs
     if discs is None or len(discs.body.points) < len(target.body.points):
         return False
-    return len(discs.radii_m) >= 3 and bool(np.isfinite(bias_normals(discs)).all())
+    return len(discs.radii_m) >= 3 and bool(np.isfinite(discs.bias_normals).all())
 
 
 def _buffers(count: int, parameters: int) -> DiscMeasurement:

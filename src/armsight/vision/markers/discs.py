@@ -27,6 +27,8 @@ MOST_REPORTED = 100
 _MOST_CANDIDATES, _NEVER = fit.MOST_DISCS, 99
 #: An outline in a smaller copy this large, as a share of the longest half chord in the image, is looked at.
 _LARGE = 0.8
+#: Points count as coplanar where their third singular value is below this share of the first.
+_FLAT = 1e-3
 #: Code -> rank among the reported.
 _ORDER = np.array(
     [fit.LOOK_ALIKES.index(c) if c in fit.LOOK_ALIKES else _NEVER for c in range(1 + max(fit.REASONS))], np.uint8
@@ -71,6 +73,19 @@ class DiscTarget(Record):
     def _kinds(self) -> tuple[bool, bool]:
         """Whether there are bright discs, and dark ones."""
         return bool(self.bright.any()), not bool(self.bright.all())
+
+    @cached_property
+    def bias_normals(self) -> Array:
+        """(M, 3) normals for the perspective bias, for which their sign does not matter.
+
+        Where none is given, that of the plane of all discs; NaN where they are not coplanar.
+        """
+        normals, unknown = np.array(self.normals), np.isnan(self.normals[:, 0])
+        if unknown.any() and len(normals) >= 3:
+            _, spread, axes = np.linalg.svd(self.body.points - self.body.points.mean(axis=0))
+            if spread[1] > _FLAT * spread[0] and spread[2] <= _FLAT * spread[0]:
+                normals[unknown] = axes[2]
+        return normals
 
     def find(self, image: NDArray[np.uint8]) -> Discs:
         """Find the discs in one grey image (H, W), of the kinds, bright or dark, that the body has.
@@ -138,10 +153,12 @@ def _larger(image: NDArray[np.uint8], bright: bool, dark: bool) -> tuple[Array, 
     starts, codes, signs, work = _KEPT.outlines
     thetas, kinds = [np.empty((0, fit.UNKNOWNS))], [np.empty(0, np.int64)]
     for scale, copy in itertools.islice(copies(image), 1, None):
-        n = search.outlines(copy, copy.view(np.uint64), bright, dark, starts, codes, signs, work)
-        large = (starts[:n, 2] * starts[:n, 4] - starts[:n, 3] ** 2) ** -0.25 > _LARGE * search.REACH / 2
-        thetas.append(enlarged(starts[:n][large], scale))
-        kinds.append(signs[:n][large])
+        noise = search.noise_of(copy)
+        n, _ = search.search(copy, copy.view(np.uint64), noise, bright, dark, starts, codes, signs, work)
+        found, signs_found = starts[:n][codes[:n] == 0], signs[:n][codes[:n] == 0]
+        large = (found[:, 2] * found[:, 4] - found[:, 3] ** 2) ** -0.25 > _LARGE * search.REACH / 2
+        thetas.append(enlarged(found[large], scale))
+        kinds.append(signs_found[large])
     return np.concatenate(thetas), np.concatenate(kinds)
 
 

@@ -38,6 +38,7 @@ REACH = 44
 _RAYS = 16
 #: From one ray to the next one followed: those along a stripe, which has no end there, are met early.
 _STRIDE = 5
+_ONE = np.uint64(1)
 _COS = np.cos(2 * np.pi * np.arange(_RAYS) / _RAYS)
 _SIN = np.sin(2 * np.pi * np.arange(_RAYS) / _RAYS)
 
@@ -58,6 +59,11 @@ _INSIDE, _INSIDE_PX, _CHANCE = 0.5, 4.0, 3.0
 #: limit is so many times as high. Half: outlines of 9 discs in 2,500, not of 5, are rejected; double: twice as many of
 #: bricks and wood are fitted.
 _ROUND_PX, _ROUND, _CLEAR, _UNCLEAR = 0.5, 0.03, 2.5, 3.0
+#: Corners are so far from the middle of chords, as a share of these, which have so many pixels at least: one of an ellipse
+#: is 1 px or more beyond its rim.
+_CORNER, _BOX_PX = 0.45, 12
+#: With so many times the contrast across the rim in the middle of what is no ellipse, something else lies there.
+_IN_MIDDLE = 3.0
 #: Reasons of candidates whose ellipse is known.
 OUTLINED = (NOT_ELLIPSE, FAINT, HILLY, NOT_UNIFORM)
 #: Steps from a pixel of a blurred rim onto the disc, at most, and the least difference of grey that is a step.
@@ -73,7 +79,7 @@ def _walk(image: Grey, x: int, y: int, dx: int, dy: int, half: int, sign: int, r
     height, width = image.shape
     end = x if dx < 0 else width - 1 - x if dx > 0 else y if dy < 0 else height - 1 - y
     for k in range(1, min(2 * reach - 1, end) + 1):
-        if sign * (np.int64(image[y + k * dy, x + k * dx]) - half) <= 0:
+        if sign * (np.int64(image[np.uint64(y + k * dy), np.uint64(x + k * dx)]) - half) <= 0:
             return k - 1
     return -1
 
@@ -121,10 +127,10 @@ def _ray(image: Grey, x: int, y: int, k: int, first: int, reach: int, half: int,
         u, v = x + step * c, y + step * s
         if u < 0.0 or v < 0.0 or u >= width - 1.0 or v >= height - 1.0:
             return -2.0
-        i, j = int(u), int(v)
-        fu, fv = u - i, v - j
-        level = (1 - fv) * ((1 - fu) * image[j, i] + fu * image[j, i + 1]) + fv * (
-            (1 - fu) * image[j + 1, i] + fu * image[j + 1, i + 1]
+        i, j = np.uint64(int(u)), np.uint64(int(v))  # unsigned: no index counts from the end
+        fu, fv, i1, j1 = u - np.int64(i), v - np.int64(j), i + _ONE, j + _ONE
+        level = (1 - fv) * ((1 - fu) * image[j, i] + fu * image[j, i1]) + fv * (
+            (1 - fu) * image[j1, i] + fu * image[j1, i1]
         )
         if sign * (level - half) <= 0.0:
             return float(step - 1.0 + (before - half) / (before - level))
@@ -263,6 +269,23 @@ def _hilly(image: Grey, noise: float, theta: Array) -> bool:
 
 
 @kernel
+def _box(image: Grey, x: int, y: int, half: int, across: int, down: int, sign: int) -> float:
+    """Return the contrast of a box with chords through its middle (x, y); 0 where one of its corners is not like a disc.
+
+    An ellipse p u^2 + 2 q u v + r v^2 = 1 with half chords a and b has a mean of 2 at the corners (+-a, +-b).
+    """
+    if min(across, down) < _BOX_PX:
+        return 0.0
+    u, v, most = int(_CORNER * (across + 1) + 0.5), int(_CORNER * (down + 1) + 0.5), 0.0
+    for i, j in ((x - u, y - v), (x + u, y - v), (x - u, y + v), (x + u, y + v)):
+        gap = sign * (np.float64(image[j, i]) - half)
+        if gap <= 0.0:
+            return 0.0
+        most = max(most, gap)
+    return 2.0 * sign * min(most, sign * (np.float64(image[y, x]) - half))  # a disc may lie on it
+
+
+@kernel
 def outline(
     image: Grey, x: int, y: int, low: int, sign: int, theta: Array, room: Room, reach: int, least: float
 ) -> int:
@@ -279,6 +302,10 @@ def outline(
         return 9
     if across < 2 or down < 2 or across + down + 2 < 8:
         return 7
+    theta[6] = _box(image, x, y, half, across, down, sign)
+    if theta[6] != 0.0:
+        theta[0], theta[1], theta[2], theta[3], theta[4] = x, y, 4.0 / across**2, 0.0, 4.0 / down**2
+        return NOT_ELLIPSE
     radii, p = room[2], room[5]
     within, start = 0.0, int(0.6 * shortest)
     # Half chords at right angles, a and b, have 1 / a^2 + 1 / b^2 of the half axes, and these are at most so unlike.
@@ -314,10 +341,11 @@ def outline(
     if not sign * theta[6] > 0.0:
         theta[6] = 2.0 * (inside - half)
         theta[7] = half - (inside - half)
-    if code != 0:
-        theta[6] = 2.0 * (inside - half)
-        return code
     contrast, uneven = _across(image, theta)
+    if code != 0:
+        middle = 2.0 * abs(inside - half)
+        theta[6] = sign * (middle if middle < _IN_MIDDLE * contrast else contrast)
+        return code
     return NOT_UNIFORM if uneven > _UNEVEN else FAINT if contrast < least else 0
 
 
@@ -381,16 +409,23 @@ def noise_of(image: Grey) -> float:
     return 1.0
 
 
+@kernel(forceinline=True)
+def _quarter(word: np.uint64) -> np.uint64:
+    """Divide the bytes of a word by four."""
+    return (word >> _TWO) & _SIX
+
+
 @kernel
 def _marks(a: np.uint64, b: np.uint64, t: np.uint64) -> np.uint64:
     """Mark, with the high bit of its byte, each pixel of b that is brighter than that of a by t times four levels."""
-    return ((((b >> _TWO) & _SIX) | _HIGH) - ((a >> _TWO) & _SIX) - t) & _HIGH
+    return ((_quarter(b) | _HIGH) - _quarter(a) - t) & _HIGH
 
 
 @kernel(forceinline=True)
 def _apart(row: Words64, i: int, t: np.uint64) -> np.uint64:
-    """Mark the pixels of word i of a row that differ from those eight further on."""
-    return _marks(row[i], row[i + 1], t) | _marks(row[i + 1], row[i], t)
+    """Mark, with the high bits of bytes, the pixels of word i of a row that differ from those eight further on."""
+    gap = (_quarter(row[i + 1]) | _HIGH) - _quarter(row[i])  # 128 more than the difference
+    return (gap - t) | ~(gap + t - _EVERY_BYTE)
 
 
 @kernel
@@ -399,7 +434,7 @@ def differs(row: Words64, t: np.uint64) -> bool:
     every = _EMPTY
     for i in range(len(row) - 1):
         every |= _apart(row, i, t)
-    return bool(every != _EMPTY)
+    return bool(every & _HIGH != _EMPTY)
 
 
 @kernel(forceinline=True)
@@ -412,7 +447,7 @@ def _halves(word: np.uint64) -> np.uint64:
 def any_differs(words: Words64, y: int, t: np.uint64, sums: Words64) -> bool:
     """Return whether any two pixels of the eight searched rows from y differ as in :func:`differs`.
 
-    All eight rows' cache lines are waited for at once. ``sums`` (W / 8,): of the 64 pixels of a cell, filled.
+    All eight rows' cache lines are waited for at once. ``sums`` (W / 8,): of quarters of a cell's 64 pixels, filled.
     """
     every = _EMPTY
     a, b, c, d = words[y], words[y + _ROW_STEP], words[y + 2 * _ROW_STEP], words[y + 3 * _ROW_STEP]
@@ -421,21 +456,26 @@ def any_differs(words: Words64, y: int, t: np.uint64, sums: Words64) -> bool:
     for i in range(len(a) - 1):
         every |= _apart(a, i, t) | _apart(b, i, t) | _apart(c, i, t) | _apart(d, i, t)
         every |= _apart(e, i, t) | _apart(f, i, t) | _apart(g, i, t) | _apart(h, i, t)
-        s = _halves(a[i]) + _halves(b[i]) + _halves(c[i]) + _halves(d[i])
-        s += _halves(e[i]) + _halves(f[i]) + _halves(g[i]) + _halves(h[i])
+        s = _halves(_quarter(a[i]) + _quarter(b[i]) + _quarter(c[i]) + _quarter(d[i]))
+        s += _halves(_quarter(e[i]) + _quarter(f[i]) + _quarter(g[i]) + _quarter(h[i]))
         s = (s & _FOURS) + ((s >> np.uint64(16)) & _FOURS)
         sums[i] = (s + (s >> np.uint64(32))) & np.uint64(0xFFFF)
-    return bool(every != _EMPTY)
+    return bool(every & _HIGH != _EMPTY)
 
 
 @kernel
 def _large(sums: Words64) -> bool:
     """Whether the means of two cells of a row (W / 8,), 32 or 64 px apart, differ by half the least contrast."""
+    limit, least, most, n = np.int64(8.0 * LEAST_CONTRAST), np.int64(sums[0]), np.int64(sums[0]), len(sums) - 1
+    for i in range(n):
+        least, most = min(least, np.int64(sums[i])), max(most, np.int64(sums[i]))
+    if most - least <= limit:
+        return False
     most = np.int64(0)
     for apart in (4, 8):
-        for i in range(len(sums) - 1 - apart):
+        for i in range(n - apart):
             most = max(most, abs(np.int64(sums[i]) - np.int64(sums[i + apart])))
-    return bool(most > 32.0 * LEAST_CONTRAST)
+    return bool(most > limit)
 
 
 @kernel
@@ -485,7 +525,10 @@ def _strongest(image: Grey, y: int, i: int, sign: int, left: np.uint64) -> tuple
     return left, x, best
 
 
-@kernel
+@kernel(
+    "const u1[:, ::1], const u8[:, ::1], f8, b1, b1, f8[:, ::1], i8[::1], i8[::1], "
+    "(f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[::1])"
+)
 def search(
     image: Grey, words: Words64, noise: float, bright: bool, dark: bool, starts: Array, codes: NDArray[np.int64],
     signs: NDArray[np.int64], room: Room,
@@ -534,23 +577,6 @@ def search(
                         mine[y >> 3, x >> 3] = n
                     n += 1
     return n, large
-
-
-@kernel(
-    "const u1[:, ::1], const u8[:, ::1], b1, b1, f8[:, ::1], i8[::1], i8[::1], "
-    "(f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[::1], f8[::1])"
-)
-def outlines(
-    image: Grey, words: Words64, bright: bool, dark: bool, starts: Array, codes: NDArray[np.int64],
-    signs: NDArray[np.int64], room: Room,
-) -> int:  # fmt: skip
-    """Search an image as :func:`search` does; the outlines of discs come first. Return their number."""
-    (n, _), good = search(image, words, noise_of(image), bright, dark, starts, codes, signs, room), 0
-    for i in range(n):
-        if codes[i] == 0:
-            starts[good], signs[good] = starts[i], signs[i]
-            good += 1
-    return good
 
 
 @kernel
