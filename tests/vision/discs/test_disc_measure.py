@@ -1,6 +1,6 @@
-"""Bodies with discs import re
-from rendered images to pose, by the way a user goes: body file, target, measure."""
+"""Bodies with discs from rendered images to pose, by the way a user goes: body file, target, measure."""
 
+import re
 from functools import cache
 
 import numpy as np
