@@ -300,7 +300,7 @@ def outline(
     x, y, half, across, down, shortest = _chords(image, x, y, low, sign, reach)
     if across < 0:
         return 9
-    if across < 2 or down < 2 or across + down + 2 < 8:
+    if min(across, down) < 2 or across + down < 6:
         return 7
     theta[6] = _box(image, x, y, half, across, down, sign)
     if theta[6] != 0.0:
