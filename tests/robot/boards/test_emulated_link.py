@@ -104,7 +104,7 @@ def test_a_whole_board_runs_in_a_world_that_owns_the_time():
 def test_an_answer_of_another_image_is_rejected(changed):
     link = EmulatedLink(RecordingEmulator(**changed), JointPlant())
     with pytest.raises(
-        DeviceError, match="did not answer tick 1 with a frame of version 3: its image and this armsight"
+        DeviceError, match="did not answer tick 1 with a frame of version 4: its image and this armsight"
     ):
         link.step()
 

@@ -146,6 +146,7 @@ class Discerning:
 
     def __init__(self, target, found):
         self.body, self.radii_m, self.bright, self.normals = target.body, target.radii_m, target.bright, target.normals
+        self.bias_normals = target.bias_normals
         self._found = list(found)
 
     def find(self, image):
