@@ -1,6 +1,7 @@
 """Columns of a CSV by their names, and the names that ``--columns`` gives them."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -148,3 +149,24 @@ def test_joints_are_read_as_recorders_name_them(tmp_path):
         read_pose_table(path, arm=arm, only_joints=True)
     path.write_text(" ".join(["timestamp", *(f"actual_q_{k}" for k in range(6))]) + "\n7.5 " + " ".join(map(str, q[0])))
     np.testing.assert_allclose(read_pose_table(path, arm=arm, only_joints=True).t_s, [7.5])
+
+
+def test_joints_of_a_model_whose_names_end_in_joint(tmp_path):
+    """UR's own URDF names them shoulder_pan_joint ..; files name them with the ending or without."""
+    ours = open_arm("ur5e")
+    arm = replace(ours, joint_names=tuple(f"{name}_joint" for name in ours.joint_names))
+    path, q = tmp_path / "a.csv", np.random.default_rng(3).uniform(-1, 1, 6).round(6)
+    row = ",".join(map(str, q))
+
+    def read(names, columns=None):
+        path.write_text(f"{','.join(['__time', *names])}\n0.5,{row}\n")
+        return read_pose_table(path, arm=arm, columns=columns, only_joints=True).q[0]
+
+    whole = arm.joint_names
+    for names in (whole, ours.joint_names, [f"/joint_states/{name}/position" for name in whole]):
+        np.testing.assert_allclose(read(names), q)
+    np.testing.assert_allclose(read([f"{name}_deg" for name in whole]), np.radians(q))
+    np.testing.assert_allclose(read("ABCDEF", ",".join(map("=".join, zip(whole, "ABCDEF", strict=True)))), q)
+    np.testing.assert_allclose(read(["pan", *whole[1:]], "shoulder_pan_joint=pan"), q)
+    with pytest.raises(InputError, match=r"column 'shoulder_pan_jont' is not known: is it shoulder_pan_joint\?"):
+        read(["shoulder_pan_jont", *whole[1:]])

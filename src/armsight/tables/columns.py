@@ -61,6 +61,7 @@ _MAKERS = {
 _OF_A_MAKER = re.compile(r"(?:([xyz])(?:_(m|mm))?|([abcoprtw])(?:_(deg|rad))?)")  # a column of theirs, in small letters
 UNITLESS = re.compile(r"(?:q|j|joint)_?([1-7])")  # a joint without a unit
 _JOINT = re.compile(r"q(\d+)_(rad|deg)")
+_SUFFIX = re.compile(r"_joint(?=(_deg|_rad)?$)")  # behind a joint's name in ROS, of some models too
 _JOINT_UNITS = ("", "_rad", "_deg")  # that may stand behind an arm's own name of a joint; ROS's has none, and means rad
 #: Numbers that are read of one table; half: half an hour of a run at 1 kHz is rejected, double: 800 MB.
 _MOST_NUMBERS = 50_000_000
@@ -114,6 +115,7 @@ def _of_ros(bare: Sequence[str], joint_names: Sequence[str], unit: str) -> list[
         for k, name in enumerate(joint_names, 1)
         for unit in _JOINT_UNITS
     }
+    links = {_SUFFIX.sub("", name): ours for name, ours in links.items()} | links
     recorded = _RECORDED | ({"timestamp": "t_s"} if any(name.startswith("actual_") for name in bare) else {})
     out = []
     for name, found in zip(bare, ros, strict=True):
@@ -121,7 +123,8 @@ def _of_ros(bare: Sequence[str], joint_names: Sequence[str], unit: str) -> list[
         if found and (found[1] or parts == set("xyzw")):
             out.append(f"{found[2]}_{unit}" if found[1] else f"q{found[2]}")
         else:
-            joint = links.get(re.sub(r"^.*/(?=[^/]+$)|_joint(?=(_deg|_rad)?$)", "", name.removesuffix("/position")))
+            whole = re.sub(r"^.*/(?=[^/]+$)", "", name.removesuffix("/position"))
+            joint = links.get(whole) or links.get(_SUFFIX.sub("", whole))
             out.append(joint or recorded.get(name, _THEIRS.get(axis, axis) + mark + rest))
     return out
 

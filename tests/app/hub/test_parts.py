@@ -305,6 +305,18 @@ def test_a_push_keeps_its_rate_however_fast_the_link_is(tmp_path, monkeypatch, l
     assert now == pytest.approx([took_s])
 
 
+def test_a_store_without_its_library_is_not_an_unknown_one(tmp_path, monkeypatch):
+    from fsspec.registry import known_implementations
+
+    store = {"class": "none_of_these.Store", "err": "Please install none_of_these"}
+    monkeypatch.setitem(known_implementations, "lonely", store)
+    with pytest.raises(InputError, match=r"^lonely://b: Please install none_of_these$"):
+        push(Cell("a", "lab"), tmp_path, "lonely://b", 1.0, lambda sent: None)
+    monkeypatch.delitem(known_implementations, "lonely")
+    with pytest.raises(InputError, match=r"not known: lonely; expected a folder, or such as s3://bucket$"):
+        push(Cell("a", "lab"), tmp_path, "lonely://b", 1.0, lambda sent: None)
+
+
 def test_a_push_makes_no_bucket(tmp_path, armsight):
     """As s3fs: makedirs below a bucket that is not there makes it."""
     import fsspec

@@ -283,10 +283,29 @@ def test_images_that_wait_are_bounded_by_their_memory_and_nothing_else_is_droppe
         waiting.put(ShotDatum(Shot(str(k), image, image, 0.1 * k), Missed("")))
         waiting.put(ShotDatum(Shot(f"{k} jpeg", None, None, 0.1 * k, None, (b"x" * 40, b"x" * 60)), Missed("")))
         waiting.put(NoteDatum(0.0, str(k)))
-    kept = [each.shot.name for each in waiting._queue if isinstance(each, ShotDatum) and sink._image_bytes(each)]
+    data = [each.datum for each in waiting._queue]
+    kept = [each.shot.name for each in data if isinstance(each, ShotDatum) and sink._image_bytes(each)]
     assert kept == ["2", "2 jpeg", "3", "3 jpeg"]
-    assert sum(map(sink._image_bytes, waiting._queue)) == waiting._bytes == 1000
+    assert sum(map(sink._image_bytes, data)) == waiting._bytes == 1000
     assert (len(waiting._queue), waiting.taken, waiting.dropped) == (12, 12, 4)
+
+
+@pytest.mark.parametrize("limit", [8, 400])
+def test_beyond_the_memory_a_datum_costs_the_same_and_is_counted_once(monkeypatch, limit):
+    from armsight.app.stream import sink
+
+    image_bytes, looks = sink._image_bytes, []
+    monkeypatch.setattr(sink, "_IMAGES_MB", 1e-3)
+    monkeypatch.setattr(sink, "_image_bytes", lambda datum: looks.append(0) or image_bytes(datum))
+    waiting, image = sink.Sink(limit), np.zeros((10, 20), np.uint8)
+    for k in range(200):
+        waiting.put(ShotDatum(Shot(str(k), image, image, 0.1 * k), Missed("")))
+        waiting.put(NoteDatum(0.0, str(k)))
+    kept = [bool(image_bytes(each.datum)) for each in waiting._queue if isinstance(each.datum, ShotDatum)]
+    assert kept == [False] * (min(limit, 400) // 2 - 2) + [True, True]
+    assert waiting._bytes == sum(image_bytes(each.datum) for each in waiting._queue) == 800
+    assert waiting.taken - waiting.dropped == min(limit, 400) - kept.count(False)  # whole ones that wait
+    assert len(looks) == 400  # one a datum
 
 
 def test_while_a_command_is_due_no_datum_is_begun_unless_many_wait():

@@ -58,7 +58,9 @@ def push(cell: Cell, folder: Path, store: str, rate_mb_s: float, advance: Callab
 
     try:
         fsspec.get_filesystem_class(fsspec.utils.get_protocol(store))
-    except (ImportError, ValueError) as error:
+    except ImportError as error:  # its words say what to install
+        raise InputError(f"{store}: {error}") from None
+    except ValueError as error:
         raise InputError(f"{store}: {error}; expected a folder, or such as s3://bucket") from None
     names = "run.mcap", "summary.json", "shots.csv"
     runs = sorted({path.parent for name in names for path in folder.glob(f"*/{name}")})

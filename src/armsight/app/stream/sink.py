@@ -9,7 +9,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from armsight.loop.running.data import Datum, ShotDatum
 
@@ -36,10 +36,19 @@ def _without_images(datum: Datum) -> Datum:
     return replace(datum, shot=replace(datum.shot, left=None, right=None, encoded=None))
 
 
+@dataclass(slots=True)
+class _Waiting:
+    """A datum in the queue, what its images take, bytes, and whether it is counted as dropped."""
+
+    datum: Datum
+    image_bytes: int
+    counted: bool = False
+
+
 class Sink:
     """A publisher with a thread. The oldest datum is dropped where more than ``limit`` wait: the latest win, counted.
 
-    Where the images that wait take too much memory, the oldest of these are dropped, and counted.
+    Where the images that wait take too much memory, the oldest of these are dropped, and their data counted, once each.
 
     Args:
         wakes: so many that wait wake the thread; fewer wait for at most ``TICK_S``. A thread that is woken for every datum
@@ -57,7 +66,8 @@ class Sink:
         self.cpu_s = 0.0
         self.problem: str | None = None
         self._limit, self._wakes, self._close_s = limit, wakes, close_s
-        self._queue: deque[Datum] = deque()
+        self._queue: deque[_Waiting] = deque()
+        self._pictured: deque[_Waiting] = deque()  # those of it that have images
         self._bytes = 0  # of the images in it; those that are being written wait no more
         self._changed = threading.Condition()
         self._closing = False
@@ -77,24 +87,22 @@ class Sink:
                 return
             self.taken += 1
             if len(self._queue) >= self._limit:
-                self._bytes -= _image_bytes(self._queue.popleft())
+                oldest = self._queue.popleft()
+                self.dropped += not oldest.counted
+                if oldest.image_bytes:
+                    self._bytes -= self._pictured.popleft().image_bytes
+            waiting = _Waiting(datum, _image_bytes(datum))
+            self._queue.append(waiting)
+            if waiting.image_bytes:
+                self._pictured.append(waiting)
+                self._bytes += waiting.image_bytes
+            while self._bytes > _IMAGES_MB * 1e6:
+                oldest = self._pictured.popleft()
+                self._bytes -= oldest.image_bytes
+                oldest.datum, oldest.image_bytes, oldest.counted = _without_images(oldest.datum), 0, True
                 self.dropped += 1
-            self._queue.append(datum)
-            self._bytes += _image_bytes(datum)
-            if self._bytes > _IMAGES_MB * 1e6:
-                self._drop_images()
             if len(self._queue) >= self._wakes:
                 self._changed.notify()
-
-    def _drop_images(self) -> None:
-        """Drop the images of the oldest data that have some, until few enough wait."""
-        for k, datum in enumerate(self._queue):
-            if self._bytes <= _IMAGES_MB * 1e6:
-                break
-            if size := _image_bytes(datum):
-                self._queue[k] = _without_images(datum)
-                self._bytes -= size
-                self.dropped += 1
 
     def pause(self) -> None:
         """Begin to write no other datum until :meth:`resume`, for ``TICK_S`` each at the most, unless much waits.
@@ -123,12 +131,12 @@ class Sink:
                 with self._changed:
                     if len(self._queue) < self._wakes and not self._closing:
                         self._changed.wait(TICK_S)
-                    waiting, self._queue, self._bytes = self._queue, deque(), 0
+                    waiting, self._queue, self._pictured, self._bytes = self._queue, deque(), deque(), 0
                     closing = self._closing
-                for n, datum in enumerate(waiting):
+                for n, each in enumerate(waiting):
                     if len(waiting) - n + len(self._queue) < _BEHIND * self._limit:
                         self._may_write.wait(TICK_S)
-                    self.write(datum)
+                    self.write(each.datum)
                 if time.monotonic() - ticked >= TICK_S:
                     self.tick()
                     ticked = time.monotonic()
