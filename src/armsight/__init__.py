@@ -61,7 +61,8 @@ if TYPE_CHECKING:
     from armsight.vision.follow.follower import Follower
     from armsight.vision.markers.board import open_board
     from armsight.vision.markers.targets import open_body, open_target
-    from armsight.vision.pose.measure import measure, measure_all
+    from armsight.vision.pose.measure import measure
+    from armsight.vision.pose.measure_all import measure_all
     from armsight.vision.rig import StereoRig
     from armsight.vision.sources import open_source
 
@@ -132,7 +133,7 @@ _HOME = {
     "open_board": "armsight.vision.markers.board",
     **dict.fromkeys(("open_body", "open_target"), "armsight.vision.markers.targets"),
     "measure": "armsight.vision.pose.measure",
-    "measure_all": "armsight.vision.pose.measure",
+    "measure_all": "armsight.vision.pose.measure_all",
     "StereoRig": "armsight.vision.rig",
     "open_source": "armsight.vision.sources",
 }

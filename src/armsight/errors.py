@@ -38,6 +38,15 @@ def require(call: str, name: str, value: object, fits: bool, expected: str) -> N
 
 
 @contextmanager
+def naming(where: object) -> Iterator[None]:
+    """Put the name of a file, or of a part of it, before any error about its content."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
+
+
+@contextmanager
 def noted(notes: Sequence[str]) -> Iterator[None]:
     """Add what was found while data were read to the errors of a block: it is often their cause."""
     try:

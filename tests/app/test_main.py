@@ -118,6 +118,14 @@ def test_an_optional_package_that_is_missing_is_named(armsight, monkeypatch, tmp
     assert os.listdir(tmp_path) == ["rig.json"]
 
 
+def test_an_optional_package_that_is_broken_is_named(armsight, monkeypatch, tmp_path):
+    (tmp_path / "mujoco.py").write_text("raise OSError('libGL.so.1: cannot open shared object file')")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "mujoco", raising=False)
+    said = armsight("demo", "--quick")
+    assert_rejected(said, "mujoco, which is installed and cannot be imported: libGL.so.1: cannot open")
+
+
 def test_help_needs_no_optional_package():
     code = (
         "import sys; sys.modules.update(dict.fromkeys(('mujoco', 'matplotlib', 'pyarrow', 'serial', 'unicorn', 'yaml')))\n"

@@ -124,7 +124,7 @@ def _checked(_: click.Context, __: click.Parameter, streams: tuple[str, ...]) ->
     return streams
 
 
-JSON = option("Print one JSON object, SI units.", "--json")
+JSON = option("Print JSON; units are in the keys, else SI.", "--json")
 STREAM = option(
     "Publish meanwhile: foxglove:PORT, json+tcp:PORT, json+udp:HOST:PORT, igtl:PORT or ros2:PORT; cell:NAME[@HUB] or "
     "cell:FILE.toml reports to the hub of the site; may be repeated (docs/howto/recordings.md, docs/howto/cells.md).",

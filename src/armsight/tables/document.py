@@ -26,7 +26,7 @@ from xml.etree import ElementTree
 import numpy as np
 import yaml
 
-from armsight.errors import InputError
+from armsight.errors import InputError, naming
 from armsight.files import DOCUMENT_MB, as_input_error, parsed_json, read_bytes, read_text
 from armsight.tables.lengths import number
 
@@ -71,7 +71,7 @@ def read_document(path: str | Path) -> dict[str, Foreign]:
     if not isinstance(document, Mapping):
         kind = "nothing" if document is None else f"a {'list' if isinstance(document, list) else 'single value'}"
         raise InputError(f"{path}: holds {kind}; expected names and values, as YAML, JSON, TOML or INI")
-    with as_input_error(str(path), InputError, why=True):
+    with naming(path):
         return {str(key): _with_matrices(str(key), value) for key, value in document.items()}
 
 

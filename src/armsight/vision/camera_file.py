@@ -11,16 +11,15 @@ vector, or k1, k2, ..), its model and the image size. They are found by all name
 
 from __future__ import annotations
 
-import contextlib
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from armsight.data import SIDES, Array
-from armsight.errors import InputError
+from armsight.errors import InputError, naming
 from armsight.geometry.check import checked
 from armsight.vision.camera import Camera
 
@@ -56,15 +55,6 @@ _PINHOLES = ("pinhole", "perspective", "opencv", "brown", "brownconrady", *FISHE
 #: The principal point is within the image, and nearer to its middle than this share of its sides.
 _FAR_OFF = 0.1  # half: good webcams are remarked; double: width and height exchanged at 4:3 are not
 _PARAMETERS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-
-
-@contextlib.contextmanager
-def naming(where: object) -> Iterator[None]:
-    """Put the name of a file, or of a part of it, before any error about its content."""
-    try:
-        yield
-    except InputError as error:
-        raise InputError(f"{where}: {error}") from None
 
 
 def plain(name: str) -> str:

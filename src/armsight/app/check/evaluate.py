@@ -22,8 +22,8 @@ from armsight.app.check.result import (
 from armsight.app.check.rows import SAME_M, TESTS, Attained, Reversal, Row, first_few, read_rows
 from armsight.app.check.run_folder import attained_in
 from armsight.data import Array
-from armsight.errors import InputError
-from armsight.files import as_input_error, natural_key
+from armsight.errors import InputError, naming
+from armsight.files import natural_key
 from armsight.loop.iso9283 import poses as iso9283
 from armsight.loop.iso9283.paths import PathMetrics, circle_metrics, path_metrics, plane_axes
 from armsight.loop.iso9283.statistic import Metric
@@ -179,7 +179,7 @@ def _path(name: str, rows: list[Row]) -> PathMetrics:
                 f"sequence; cycle {cycle or 'without a name'} ({len(group)} rows) differs from {first_cycle} ({len(first)})"
             )
     attained, cov = np.array([c.p for c in each.values()]), np.array([c.cov for c in each.values()])
-    with as_input_error(f"path {name}", InputError, why=True):
+    with naming(f"path {name}"):
         return path_metrics(attained, p_ref, cov, _stacked(rows).common)
 
 

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from armsight.app.dense.files import DenseSummary, write_png, write_result
 from armsight.data import Image, Shot
-from armsight.errors import InputError
-from armsight.files import as_input_error, made_folder
+from armsight.errors import InputError, naming
+from armsight.files import made_folder
 from armsight.vision.dense.method import NOTHING, Disparity, Method, Search
 from armsight.vision.dense.middlebury import read_pfm, read_tiff
 from armsight.vision.dense.rectified import match_pair, plain_grey
@@ -40,7 +40,7 @@ def _read_pixels(path: Path) -> Image:
         floats = read_tiff(path)
     if floats is None or floats.dtype.kind != "f":
         return read_image(path)
-    with as_input_error(str(path), InputError, why=True):
+    with naming(path):
         return plain_grey(floats, "the")
 
 

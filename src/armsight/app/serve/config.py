@@ -11,8 +11,8 @@ from typing import Any
 
 import click
 
-from armsight.errors import InputError
-from armsight.files import as_input_error, read_toml, unused
+from armsight.errors import InputError, naming
+from armsight.files import read_toml, unused
 
 #: Keys of the table ``serve`` that are texts, and numbers.
 _TEXTS, _NUMBERS = ("http", "log"), ("log_mb", "log_files", "stale_s", "retry_s")
@@ -68,7 +68,7 @@ def read_config(path: Path) -> ServeConfig:
         command.make_context("measure", list(arguments)).close()
     except click.UsageError as error:
         raise InputError(f"{path}: [measure]: {error.format_message()}") from None
-    with as_input_error(str(path), InputError, why=True), contextlib.chdir(folder):
+    with naming(path), contextlib.chdir(folder):
         _check(given, board)
     each_start = tuple(each for each in arguments if not each.startswith("--output="))
     return ServeConfig(each_start, folder, **service, output=str(given.get("output", "")))

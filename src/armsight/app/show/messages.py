@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
+import importlib
 import logging
 import os
 import sys
@@ -66,8 +66,15 @@ def weak(text: str) -> str:
 
 
 def require(what: str, extra: str, *modules: str) -> None:
-    """Check that packages are installed, and name all that are missing at once."""
-    missing = [name for name in modules if importlib.util.find_spec(name) is None]
+    """Check that packages can be imported, and name all that cannot at once."""
+    missing = list[str]()
+    for name in modules:
+        try:
+            importlib.import_module(name)
+        except ModuleNotFoundError as error:
+            missing.append(error.name or name)
+        except (ImportError, OSError, AttributeError) as error:  # a library beneath is missing, or of another version
+            raise InputError(f"{what} needs {name}, which is installed and cannot be imported: {error}") from None
     if missing:
         names, verb = " and ".join(missing), "is" if len(missing) == 1 else "are"
         raise InputError(f'{what} needs {names}, which {verb} not installed: pip install "armsight[{extra}]"')

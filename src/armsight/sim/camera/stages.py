@@ -11,8 +11,8 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Self
 
-from armsight.errors import InputError
-from armsight.files import as_input_error, read_toml
+from armsight.errors import InputError, naming
+from armsight.files import read_toml
 from armsight.sim.render.optics import Optics
 from armsight.sim.render.render import Shutter
 
@@ -295,7 +295,7 @@ class CameraPipeline:
             for name, values in tables.items()
             if not (values is False and name in STAGES)
         }
-        with as_input_error(str(path), InputError, why=True):
+        with naming(path):
             return cls(**stages)
 
     def shutter(self, height: int) -> Shutter:

@@ -20,10 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array, Body, Detections, Ids, Record
-from armsight.errors import InputError
+from armsight.errors import InputError, naming
 from armsight.files import read_toml, write_text
 from armsight.geometry.check import checked
-from armsight.vision.camera_file import naming
 from armsight.vision.markers.board import open_board
 from armsight.vision.markers.body_file import VERSION
 from armsight.vision.markers.marker import CalibrationBoard, Target

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +31,7 @@ from armsight.data import (
     PoseEstimate,
     Shot,
 )
-from armsight.errors import InputError, require
+from armsight.errors import require
 from armsight.geometry.pose import inverse
 from armsight.vision.camera import Camera
 from armsight.vision.detections import SeenShot
@@ -42,13 +41,10 @@ from armsight.vision.discs.identify import IdentifiedDiscs, identify
 from armsight.vision.image import darkness, grey
 from armsight.vision.markers.discs import DiscTarget
 from armsight.vision.markers.marker import Target
-from armsight.vision.markers.targets import open_target
 from armsight.vision.match import gate, join, match
 from armsight.vision.pose.assign import instances, plain
 from armsight.vision.pose.locate import locate
-from armsight.vision.pose.shot_pose import ShotPose, ShotPoses, shot_pose
 from armsight.vision.rig import StereoRig
-from armsight.vision.sources import Source, lent
 from armsight.vision.triangulate import triangulate
 
 #: Fewest common points with which exchanged cameras are distinguishable from bad detections.
@@ -85,41 +81,6 @@ def measure(rig: StereoRig, target: Target, shot: Shot) -> PoseEstimate | Missed
         return result
     dark = [f"{side}: {d}" for side, d in zip(SIDES, map(darkness, (left, right)), strict=True) if d]
     return replace(result, reason="; ".join([result.reason, *dark]))
-
-
-def measure_all(
-    rig: StereoRig | str | Path,
-    target: Target | str | Path,
-    source: Source | str | Path,
-    *,
-    progress: Callable[[int, int | None], None] = lambda done, total: None,
-) -> ShotPoses:
-    """Measure every shot by itself, until the source ends.
-
-    Args:
-        rig: the calibrated pair, or its file.
-        target: the body to find, or its text as the command line takes it.
-        source: the shots, or what :func:`~armsight.vision.sources.open_source` opens; a source that was open stays open.
-        progress: called after each shot with how many are done, and how many there are (None: not known).
-
-    Returns:
-        A row a shot, missed ones included, each with its reason.
-
-    Raises:
-        InputError: a file or text is wrong, an argument has another type, or all shots were read before.
-        DeviceError: a camera is gone.
-    """
-    rig = StereoRig.load(rig) if isinstance(rig, str | Path) else rig
-    target = open_target(target) if isinstance(target, str | Path) else target
-    poses = list[ShotPose]()
-    with lent(source) as shots:
-        require_arguments("measure_all(rig, target, source)", rig=rig, target=target, source=shots)
-        for shot in shots:
-            poses.append(shot_pose(shot.name, shot.t_s, target.body, measure(rig, target, shot)))
-            progress(len(poses), shots.count)
-    if not poses:
-        raise InputError("measure_all(rig, target, source): the source has no shot left: open it again")
-    return ShotPoses(tuple(poses))
 
 
 #: Argument -> whether a value is one, and what opens one.

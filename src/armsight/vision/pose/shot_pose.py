@@ -222,7 +222,7 @@ def csv_text(poses: Sequence[ShotPose]) -> str:
 
 @dataclass(frozen=True, repr=False)
 class ShotPoses:
-    """The poses of many shots, as :func:`~armsight.vision.pose.measure.measure_all` returns them.
+    """The poses of many shots, as :func:`~armsight.vision.pose.measure_all.measure_all` returns them.
 
     ``pandas.DataFrame(table.columns())`` and ``polars.DataFrame(table.columns())`` make a frame of it, as does whatever
     reads Arrow's interface where pyarrow is installed. The columns are those of ``armsight measure -o``.

@@ -19,12 +19,12 @@ import cv2
 import numpy as np
 
 from armsight.data import Array
-from armsight.errors import InputError
+from armsight.errors import InputError, naming
 from armsight.geometry.pose import inverse
 from armsight.geometry.rotation import exp_so3
 from armsight.tables.document import Foreign
 from armsight.tables.lengths import BASELINE, UNITS_M, metric
-from armsight.vision.camera_file import DISTORTION, MATRIX, SIZE, camera_of, described, found, naming, plain
+from armsight.vision.camera_file import DISTORTION, MATRIX, SIZE, camera_of, described, found, plain
 from armsight.vision.rig import StereoRig
 from armsight.vision.rigfiles.rigfile import (
     LOOSEST_ROTATION,

@@ -57,7 +57,7 @@ from pathlib import Path
 import numpy as np
 
 from armsight.data import SIDES, Array
-from armsight.errors import InputError
+from armsight.errors import InputError, naming
 from armsight.files import natural_key
 from armsight.geometry.check import checked
 from armsight.geometry.pose import inverse, pose
@@ -65,7 +65,7 @@ from armsight.geometry.rotation import exp_so3, from_quaternion_wxyz
 from armsight.tables.document import Foreign, dump_yaml
 from armsight.tables.lengths import UNITS_M
 from armsight.vision.camera import Camera
-from armsight.vision.camera_file import camera_of, found, is_camera, naming
+from armsight.vision.camera_file import camera_of, found, is_camera
 from armsight.vision.rig import StereoRig
 from armsight.vision.rigfiles.rigfile import (
     Document,

@@ -17,14 +17,14 @@ import cv2
 import numpy as np
 
 from armsight.data import Array
-from armsight.errors import InputError
+from armsight.errors import InputError, naming
 from armsight.files import replacing
 from armsight.geometry.check import checked
 from armsight.geometry.pose import inverse, mean_pose, pose
 from armsight.tables.document import Foreign
 from armsight.tables.lengths import BASELINE, check_length
 from armsight.vision.camera import Camera
-from armsight.vision.camera_file import camera_of, naming
+from armsight.vision.camera_file import camera_of
 from armsight.vision.rig import StereoRig
 from armsight.vision.rigfiles import ASSUMED_SIGMA_PX
 

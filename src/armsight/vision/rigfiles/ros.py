@@ -14,12 +14,12 @@ from pathlib import Path
 import numpy as np
 
 from armsight.data import Array
-from armsight.errors import InputError
+from armsight.errors import InputError, naming
 from armsight.geometry.check import checked
 from armsight.geometry.pose import inverse
 from armsight.tables.document import Foreign, dump_yaml
 from armsight.vision.camera import Camera
-from armsight.vision.camera_file import camera_of, described, focal_and_centre, found, is_camera, naming
+from armsight.vision.camera_file import camera_of, described, focal_and_centre, found, is_camera
 from armsight.vision.rig import StereoRig
 from armsight.vision.rigfiles.rigfile import (
     Document,
