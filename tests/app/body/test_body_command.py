@@ -252,7 +252,7 @@ def test_what_else_is_typed_wrongly_is_one_clear_line(armsight, tmp_path, body):
 
 
 def test_without_matplotlib_drawing_says_what_to_install(armsight, monkeypatch, tmp_path):
-    monkeypatch.setattr(body_draw.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
     assert_rejected(
         armsight("body", "draw", PLATE, "-o", tmp_path / "p.pdf"), "matplotlib", 'pip install "armsight[report]"'
     )

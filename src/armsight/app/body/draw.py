@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import importlib.util
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -19,6 +18,7 @@ from typing import IO, TYPE_CHECKING, Any
 import numpy as np
 
 from armsight.app.body import PAPERS
+from armsight.app.show.messages import require
 from armsight.app.show.plotting import drawing, plain
 from armsight.data import Array, Record
 from armsight.errors import InputError
@@ -258,8 +258,7 @@ def draw_body(
     suffix = Path(output).suffix.lower()
     if suffix not in _SAVERS:
         raise InputError(f"{output}: a drawing is a {', '.join(_SAVERS)} file, by its suffix")
-    if importlib.util.find_spec("matplotlib") is None:
-        raise InputError('drawing a body needs matplotlib, which is not installed: pip install "armsight[report]"')
+    require("drawing a body", "report", "matplotlib")
     planes, of, heads, notes = list[Page](), list[str](), list[tuple[str, str]](), list[str]()
     for path in paths:
         its_own, head, foot = _pages_of(path, notes)

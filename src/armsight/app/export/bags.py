@@ -6,6 +6,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+from armsight.app.show.messages import require
 from armsight.app.stream.ros import TO_ROS, ros_name
 from armsight.errors import InputError
 from armsight.files import opened, replacing
@@ -14,12 +15,11 @@ from armsight.vision.sources.bag import Bag
 
 def write_mcap(file: Path, output: Path) -> list[Path]:
     """Write the messages of an MCAP file compressed, with an index; return the file."""
-    try:
-        from mcap.records import Channel, Message, Metadata, Schema
-        from mcap.stream_reader import StreamReader
-        from mcap.writer import CompressionType, Writer
-    except ImportError:
-        raise InputError(f'{file}: MCAP needs mcap, which is not installed: pip install "armsight[record]"') from None
+    require(f"{file}: MCAP", "record", "mcap.writer")
+    from mcap.records import Channel, Message, Metadata, Schema
+    from mcap.stream_reader import StreamReader
+    from mcap.writer import CompressionType, Writer
+
     Bag(file)  # names what is wrong with it
     with replacing(output, "wb") as out, opened(file) as stream:
         writer = Writer(out, compression=CompressionType.ZSTD)
@@ -48,13 +48,10 @@ def write_mcap(file: Path, output: Path) -> list[Path]:
 
 def write_ros2(file: Path, output: Path) -> list[Path]:
     """Write a ROS 2 bag of MCAP; return its folder. Nothing is left behind where it fails."""
-    try:
-        from rosbags.rosbag2 import StoragePlugin, Writer
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError:
-        raise InputError(
-            f'{file}: ROS bags need rosbags, which is not installed: pip install "armsight[ros]"'
-        ) from None
+    require(f"{file}: a ROS bag", "ros", "rosbags")
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
     bag = Bag(file)
     topics = [topic.name for topic in bag.topics.values() if topic.kind in TO_ROS]
     if not topics:
