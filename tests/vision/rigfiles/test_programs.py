@@ -130,7 +130,7 @@ def test_a_fisheye_of_multical_is_known_by_the_shape_of_its_coefficients(tmp_pat
         ),
         (
             lambda cameras: cameras[0]["extrinsics"].update(toCameraSocket=1),
-            "not to the other camera: they were not calibrated",
+            "the extrinsics of CAM_B lead in a circle",
         ),
         (lambda cameras: cameras[1].update(cameraType=2), "cameraType 2"),
         (lambda cameras: cameras[1].pop("width"), "not as depthai writes it: KeyError('width')"),
@@ -144,11 +144,24 @@ def test_a_device_of_luxonis_that_cannot_be_read_is_named(tmp_path, change, said
         import_rig(None, write(tmp_path, {"calib.json": json.dumps(document)}))
 
 
+@pytest.mark.parametrize(
+    ("scale", "options"), [(1.0, {}), (1.0, {"unit_m": 0.01}), (0.01, {"unit_m": 1.0}), (10.0, {"unit_m": 1e-3})]
+)
+def test_lengths_of_luxonis_are_of_the_unit_given(tmp_path, scale, options):
+    document = depthai()
+    for _, camera in document["cameraData"]:
+        for axis in "xyz":
+            camera["extrinsics"]["translation"][axis] *= scale
+    rig = import_rig(None, write(tmp_path, {"calib.json": json.dumps(document)}), **options)
+    np.testing.assert_allclose(rig.T_left_right, inverse(T_RIGHT_LEFT), atol=1e-12)
+    assert sum("raw images" in note for note in rig.provenance["notes"]) == 1
+
+
 # --- what goes wrong -------------------------------------------------------------------------------------------------
 
 TITLES = {name: re.escape(open_format(name).title) for name in FORMATS}
 ONE_OF = ("stereo_calib", "mtxL", "ros files", "rostopic", "camchain", "openvins", "euroc", "basalt", "orbslam3", "caliscope",
-          "multical", "mrcal 5", "zed")  # fmt: skip
+          "multical", "mrcal 5", "zed", "depthai")  # fmt: skip
 #: Files of one program given as another's: the message says whose they are, and what to give instead.
 AS_ANOTHERS = [
     (
@@ -167,7 +180,7 @@ UNITS = [
     for name in ONE_OF
     for unit, right, number in (
         ((1.0, "mm", "0.001"), (1e-6, "mm", "0.001"))
-        if PROGRAMS[name][3].get("unit_m") or name == "zed"
+        if PROGRAMS[name][3].get("unit_m") or name in ("zed", "depthai")
         else ((1e-3, "m", "1"), (1e-6, "m", "1"))
     )
 ]

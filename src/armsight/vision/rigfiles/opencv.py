@@ -83,16 +83,16 @@ def read(documents: Sequence[Document], paths: Sequence[Path], options: ImportOp
         T_right_left, said = _between(flat)
         unit_m = _unit_m(flat, float(np.linalg.norm(T_right_left[:3, 3])), options)
     notes += [*said, f"translations read as multiples of {unit_m:g} m"]
-    if "distortion_model" not in flat and "the distortion model" not in " ".join(notes):
-        notes.append("the files name no distortion model; OpenCV's default, Brown-Conrady, was assumed")
-    if (
-        "distortion_model" not in flat
-    ):  # others' files; 4.14 measured it 0.13 % too long (findings/opencv_stereo_calibrate.sh)
-        notes.append(
-            "OpenCV 4's stereoCalibrate without CALIB_FIX_INTRINSIC stops before its minimum: if it made this, lengths may "
-            "be wrong by 0.1 %"
-        )
-    return imported(cameras, inverse(T_right_left), options, paths, list(dict.fromkeys(notes)), unit_m)
+    if "distortion_model" not in flat:  # armsight's own files say it
+        if "the distortion model" not in " ".join(notes):
+            notes.append("the files name no distortion model; OpenCV's default, Brown-Conrady, was assumed")
+        # Not of Bouguet or MATLAB; findings/opencv_stereo_calibrate.sh saw 0.13 %.
+        if not re.search("fc_left|OfCamera2", " ".join(flat)):
+            notes.append(
+                "OpenCV 4's stereoCalibrate without CALIB_FIX_INTRINSIC stops before its minimum: if it made this, lengths "
+                "may be wrong by 0.1 %"
+            )
+    return imported(cameras, inverse(T_right_left), options, paths, notes, unit_m)
 
 
 def _flat(documents: Sequence[Document]) -> Iterator[tuple[str, Foreign]]:

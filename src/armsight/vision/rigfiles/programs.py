@@ -215,7 +215,7 @@ _DEPTHAI_LENSES = {0: ("perspective", 14), 1: ("fisheye", 4)}
 
 
 def _depthai_entries(documents: Sequence[Document], paths: Sequence[Path]) -> Entries:
-    """Return the cameras, the left and the right one first, each with its step towards the reference, m."""
+    """Return the cameras, the left and the right one first, each with its step towards the reference, cm."""
     stereo = documents[0].get("stereoRectificationData")
     first = [stereo.get(f"{side}CameraSocket") for side in SIDES] if isinstance(stereo, Mapping) else []
     entries = dict[str, Mapping[str, Foreign]]()
@@ -231,7 +231,7 @@ def _depthai_entries(documents: Sequence[Document], paths: Sequence[Path]) -> En
                 "image_size": (camera["width"], camera["height"]),
                 "to": _socket(step["toCameraSocket"]),
                 "rotation": step["rotationMatrix"],
-                "translation_m": [0.01 * step["translation"][axis] for axis in "xyz"],
+                "translation": [step["translation"][axis] for axis in "xyz"],
             }
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"cameraData is not as depthai writes it: {error!r}") from None
@@ -240,12 +240,14 @@ def _depthai_entries(documents: Sequence[Document], paths: Sequence[Path]) -> En
 
 def _depthai_pose(entries: Entries, name: str) -> tuple[Array, list[str]]:
     """Return a camera's pose before the one that all lead to."""
-    T, at, notes = np.eye(4), name, ["raw images, not rectified ones; lengths read as cm"]
+    T, at, notes = np.eye(4), name, ["raw images, not rectified ones; cm without --unit-m"]
     for _ in entries:
         if (to := entries[at]["to"]) in entries:
-            step, said = rigid(entries[at]["rotation"], entries[at]["translation_m"], f"rotation of {at}")
+            step, said = rigid(entries[at]["rotation"], entries[at]["translation"], f"rotation of {at}")
             T, at, notes = step @ T, to, notes + said
-    if at != _reference(entries, next(iter(entries))) or entries[at]["to"] in entries:
+    if entries[at]["to"] in entries:
+        raise InputError(f"the extrinsics of {name} lead in a circle; depthai rejects it as well")
+    if at != _reference(entries, next(iter(entries))):
         raise InputError(f"the extrinsics of {name} lead to {at}, not to the other camera: they were not calibrated")
     return inverse(T), notes
 
@@ -523,6 +525,7 @@ FORMATS = {
         ((1,), "one file, of eepromToJsonFile"),
         lambda documents: any(isinstance(document.get("cameraData"), list) for document in documents),
         *(_depthai_entries, _depthai_pose),
+        unit_m=0.01,
     ),
     "stereolabs": RigFormat("a Stereolabs SN*.conf", _stereolabs_recognises, _stereolabs_read),
     "orbslam": RigFormat("ORB-SLAM's stereo settings", _orbslam_recognises, _orbslam_read),

@@ -91,6 +91,7 @@ def posed_format(
     entries: Callable[[Sequence[Document], Sequence[Path]], Entries],
     pose_of: PoseOf,
     write: Callable[[StereoRig, Sequence[Path]], tuple[str, ...]] | None = None,
+    unit_m: float = 1.0,
 ) -> RigFormat:
     """Return a format of files that hold each camera and its pose in a third frame, the world's or an IMU's.
 
@@ -101,13 +102,14 @@ def posed_format(
         entries: returns each camera's entry by its name, in the order of the files.
         pose_of: returns (4, 4) T_camera_reference of a camera of the entries, in the file's unit, and notes.
         write: see there.
+        unit_m: of the files, where the user gives none, m.
     """
 
     def read(documents: Sequence[Document], paths: Sequence[Path], options: ImportOptions) -> StereoRig:
         count_paths(paths, *files)
         with naming(paths[0]) if len(paths) == 1 else contextlib.nullcontext():
             found = entries(documents, paths)
-        return _posed_rig(found, pose_of, options, paths)
+        return _posed_rig(found, pose_of, options, paths, unit_m)
 
     return RigFormat(title, recognises, read, write)
 
@@ -118,7 +120,9 @@ def count_paths(paths: Sequence[Path], allowed: Sequence[int], names: str) -> No
         raise InputError(f"expected {names}, got {len(paths)} file(s): {', '.join(map(str, paths)) or 'none'}")
 
 
-def _posed_rig(entries: Entries, pose_of: PoseOf, options: ImportOptions, paths: Sequence[Path]) -> StereoRig:
+def _posed_rig(
+    entries: Entries, pose_of: PoseOf, options: ImportOptions, paths: Sequence[Path], unit_m: float
+) -> StereoRig:
     """Return the rig of two of several cameras whose poses in a third frame are known; ``options.pair`` chooses the two.
 
     InputError: fewer than two, an unknown name in ``pair``, or a camera that cannot be read.
@@ -151,7 +155,7 @@ def _posed_rig(entries: Entries, pose_of: PoseOf, options: ImportOptions, paths:
         notes.append(f"left behind: {', '.join(others)}; {left} is left, {right} right: --pair LEFT,RIGHT chooses")
     if keys := [key for key in _LEFT_BEHIND if any(key in entry for entry in entries.values())]:
         notes.append(f"left behind: {', '.join(keys)}")
-    return imported(cameras, Ts[0] @ inverse(Ts[1]), options, paths, notes)
+    return imported(cameras, Ts[0] @ inverse(Ts[1]), options, paths, notes, unit_m)
 
 
 def write_together(paths: Sequence[Path], texts: Sequence[str]) -> None:
@@ -216,7 +220,7 @@ def imported(
         InputError: both cameras at one position, or a baseline that cannot be.
     """
     left, right = cameras
-    notes = [*notes]
+    notes = list(dict.fromkeys(notes))
     unit_m = unit_m if options.unit_m is None else options.unit_m
     T_left_right = np.array(T_left_right)
     T_left_right[:3, 3] *= unit_m
