@@ -79,18 +79,30 @@ def test_images_in_the_dark_are_named():
     assert "left" not in missed.reason
 
 
-@pytest.mark.parametrize(("given_mm", "right"), [(38.0, True), (44.5, False)])
-def test_a_given_radius_of_discs_that_contradicts_the_images_names_both(given_mm, right):
-    rig, T = example_rig(SIZE, focal_px=300.0), pose(np.eye(3), np.array([-0.1, -0.1, 0.4]))
-    board = open_board(f"circles:4x3:90mm:radius={given_mm}mm")
+@pytest.mark.parametrize(
+    ("given_mm", "radius_px", "moved_px", "right"),
+    [
+        (38.0, 30.0, 0.0, True),
+        (44.5, 30.0, 0.0, False),
+        (48.0, 4.5, 0.0, False),
+        (52.0, 3.0, 0.0, False),
+        (40.0, 4.5, 0.65, True),  # a rim that blur and a tone curve moved
+        (40.0, 3.0, -0.65, True),
+    ],
+)
+def test_a_given_radius_of_discs_that_contradicts_the_images_names_both(given_mm, radius_px, moved_px, right):
+    """Discs of 40 mm, radius_px in the images."""
+    rig, T = example_rig(SIZE, focal_px=300.0), pose(np.eye(3), np.array([-0.1, -0.1, 12.0 / radius_px]))
+    board = open_board(f"circles:4x3:120mm:radius={given_mm}mm")
     points, seen = board.body.points, []
     for camera, T_camera in zip(rig.cameras, (T, inverse(rig.T_left_right) @ T), strict=True):
         normals = np.tile(T_camera[:3, 2], (len(points), 1))
         uv, shape, _, _ = project_discs(camera, transform(T_camera, points), normals, np.full(len(points), 0.04))
+        shape *= (1 + moved_px / radius_px) ** 2
         seen.append(Detections(np.arange(len(points)), uv, np.tile(1e-4 * np.eye(2), (len(points), 1, 1)), shape=shape))
     result = measure(rig, Scripted(board.body, *seen, radius_m=board.disc_radius_m), grey_shot())
     assert isinstance(result, PoseEstimate) is right
-    assert right or "a radius of 44.5 mm is given, and the images show 40" in result.reason
+    assert right or f"a radius of {given_mm:.4g} mm is given, and the images show 40" in result.reason
 
 
 def test_exchanged_cameras_are_reported():

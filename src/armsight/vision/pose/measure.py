@@ -49,9 +49,10 @@ from armsight.vision.triangulate import triangulate
 
 #: Fewest common points with which exchanged cameras are distinguishable from bad detections.
 _POINTS_MIN = 4
-#: A given radius of a board's discs that differs from the images' by more than this share, and by more than so many
-#: pixels (tone curves and saturation make discs larger by up to half a pixel), is a mistake.
-_RADIUS_SHARE, _RADIUS_PX = 0.1, 1.0
+#: A given radius of a board's discs that differs from the images' by more than this share, and by more than so many px (a
+#: rim blurred by 1.5 px moves by 0.7 with sRGB's tone curve, by 0.6 in saturation), is a mistake. Half: true radii of discs
+#: of 5 px are rejected; double: a radius 30 % wrong passes for discs of 4 px.
+_RADIUS_SHARE, _RADIUS_PX = 0.1, 0.7
 
 
 def measure(rig: StereoRig, target: Target, shot: Shot) -> PoseEstimate | Missed:
