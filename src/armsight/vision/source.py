@@ -6,6 +6,9 @@ To add a kind of source: write one file with a class that derives from :class:`S
 
 from __future__ import annotations
 
+import contextlib
+import itertools
+import threading
 from collections.abc import Callable, Generator, Iterator
 from typing import Protocol, Self
 
@@ -82,7 +85,8 @@ class PlayedSource(Source):
         notes: tuple[str, ...] = (),
         depth: BitDepth | None = None,
     ) -> None:
-        self.count, self._notes, self._shots = count, notes, shots(1)
+        self.count, self._notes, self._shots, self._done = count, notes, shots, 0
+        self._left, self._reading, self._closed = self._rest(), threading.Lock(), False
         every = max(1, -(-2 * count // DEPTH_IMAGES))  # from its whole length: it may begin in the dark
         self._depth = depth or BitDepth(lambda: images_of(shots(every)))
 
@@ -91,11 +95,30 @@ class PlayedSource(Source):
         """What was left out, or is odd, a line each."""
         return self._notes + self._depth.notes
 
+    def _rest(self) -> Generator[Shot]:
+        """Yield the shots that were not returned yet."""
+        with contextlib.closing(self._shots(1)) as shots:
+            yield from itertools.islice(shots, self._done, None)
+
     def read(self) -> Shot | None:
-        """Return the next shot, or None at the end."""
-        shot = next(self._shots, None)
-        return None if shot is None else self._depth.shot(shot)
+        """Return the next shot, or None at the end; one whose reading was interrupted is read by the next call."""
+        with self._reading:
+            try:
+                shot = None if self._closed else next(self._left, None)
+                shot = None if shot is None else self._depth.shot(shot)
+            except KeyboardInterrupt:  # it has ended the generator
+                self._left = self._rest()
+                raise
+            self._done += 1
+        if self._closed:
+            self.close()
+        return shot
 
     def close(self) -> None:
-        """Hand out no more shots, and close what is open."""
-        self._shots.close()
+        """Hand out no more shots, and close what is open; where another thread reads, its shot is the last."""
+        self._closed = True
+        if self._reading.acquire(blocking=False):
+            try:
+                self._left.close()
+            finally:
+                self._reading.release()

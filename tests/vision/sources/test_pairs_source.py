@@ -1,5 +1,6 @@
 """Pairs of image files by two globs, and folders of them."""
 
+import threading
 from pathlib import Path
 
 import cv2
@@ -8,8 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from armsight.data import Shot
 from armsight.errors import InputError
 from armsight.files import natural_key
+from armsight.vision.source import PlayedSource
 from armsight.vision.sources import FolderSource, PairsSource, open_source
 from armsight.vision.sources.pairs import match
 
@@ -214,3 +217,43 @@ def test_a_file_or_an_address_without_its_kind_is_given_one():
 def test_an_unknown_source_lists_the_known_ones(spec):
     with pytest.raises(InputError, match=r"not a source: known are folder:..., pairs:..., video:..., url:..., usb:..."):
         open_source(spec)
+
+
+def test_a_shot_whose_reading_was_interrupted_is_read_by_the_next_call():
+    interrupts = ["b"]
+
+    def read(every):
+        for name in "abcd"[::every]:
+            if name in interrupts:
+                interrupts.remove(name)
+                raise KeyboardInterrupt
+            yield Shot(name, None, None, None, "no image")
+
+    source = PlayedSource(read, 4)
+    assert source.read().name == "a"
+    with pytest.raises(KeyboardInterrupt):
+        source.read()
+    assert [shot.name for shot in shots(source)] == ["b", "c", "d"]
+
+
+def test_a_source_may_be_closed_while_another_thread_reads():
+    reading, go_on, found, ended = threading.Event(), threading.Event(), [], []
+
+    def read(every):
+        try:
+            reading.set()
+            assert go_on.wait(60)
+            yield from (Shot(name, None, None, None, "no image") for name in "ab")
+        finally:
+            ended.append(True)
+
+    source = PlayedSource(read, 2)
+    reader = threading.Thread(target=lambda: found.append(source.read()))
+    reader.start()
+    assert reading.wait(60)
+    source.close()
+    go_on.set()
+    reader.join(60)
+    assert [shot.name for shot in found] == ["a"]
+    assert source.read() is None
+    assert ended == [True]
