@@ -31,7 +31,7 @@ class Clock:
 class FakeCapture:
     """A camera that takes a frame every period once it streams; the driver queues four and then drops new ones."""
 
-    def __init__(self, clock, log, phase=0.0, period=PERIOD, stubborn=(), stamps=True, size=None):
+    def __init__(self, clock, log, phase=0.0, period=PERIOD, stubborn=(), stamps=True, size=None, auto=3.0):
         self.clock, self.log, self.phase, self.period = clock, log, phase, period
         self.stubborn, self.stamps, self.size = stubborn, stamps, size
         self.props = {
@@ -39,7 +39,7 @@ class FakeCapture:
             cv2.CAP_PROP_FRAME_HEIGHT: 480.0,
             cv2.CAP_PROP_FPS: 30.0,
             cv2.CAP_PROP_FOURCC: float(cv2.VideoWriter.fourcc(*"YUYV")),
-            cv2.CAP_PROP_AUTO_EXPOSURE: 3.0,
+            cv2.CAP_PROP_AUTO_EXPOSURE: auto,
             cv2.CAP_PROP_EXPOSURE: 156,
             cv2.CAP_PROP_GAIN: 0.0,
         }
@@ -181,11 +181,11 @@ def test_all_settings_arrive_at_both_cameras(usb_pair):
         assert {name: capture.props[getattr(cv2, f"CAP_PROP_{name}")] for name in expected} == expected
 
 
-@pytest.mark.parametrize("tail", ["", ",exposure=auto"])
-def test_what_is_not_asked_for_stays(usb_pair, tail):
-    usb_pair.open(tail)
+@pytest.mark.parametrize(("tail", "before", "after"), [("", 3, 3), ("", 1, 1), (",exposure=auto", 1, 3)])
+def test_what_is_not_asked_for_stays(usb_pair, tail, before, after):
+    usb_pair.open(tail, left={"auto": before})
     assert usb_pair.captures[0].props[cv2.CAP_PROP_EXPOSURE] == 156
-    assert usb_pair.captures[0].props[cv2.CAP_PROP_AUTO_EXPOSURE] == 3
+    assert usb_pair.captures[0].props[cv2.CAP_PROP_AUTO_EXPOSURE] == after
     assert usb_pair.captures[0].props[cv2.CAP_PROP_FRAME_WIDTH] == 640
 
 

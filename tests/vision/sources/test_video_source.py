@@ -103,10 +103,11 @@ def test_a_file_that_is_cut_short_says_so(film, picture):
     assert found[-1].problem == f"{path} is damaged or cut short: it ends at {(len(found) - 1) / 30:.3f} s of 0.667 s"
 
 
-def recorded(path, codec, kept, late=0, ticks=1, sound_s=0.0, live=False):
+def recorded(path, codec, kept, late=0, ticks=1, sound_s=0.0, live=False, right=0):
     """Write frames of 30 a second, each of which has its number as its grey level, without those that are not kept.
 
-    With ticks a frame the numbers need not be whole. A live file is Matroska without a duration.
+    With ticks a frame the numbers need not be whole; the right half is brighter by ``right``.
+    A live file is Matroska without a duration.
     """
     opened = {"format": "matroska", "options": {"live": "1"}} if live else {}
     with av.open(str(path), "w", **opened) as file:
@@ -115,7 +116,9 @@ def recorded(path, codec, kept, late=0, ticks=1, sound_s=0.0, live=False):
         stream.height, stream.width, stream.pix_fmt = 64, 128, "yuvj420p" if codec == "mjpeg" else "yuv420p"
         stream.codec_context.time_base = Fraction(1, 30 * ticks)
         for k in kept:
-            frame = av.VideoFrame.from_ndarray(np.full((64, 128, 3), 5 * round(k) % 255, np.uint8), format="bgr24")
+            grey = np.full((64, 128, 3), 5 * round(k) % 255, np.uint8)
+            grey[:, 64:] += right
+            frame = av.VideoFrame.from_ndarray(grey, format="bgr24")
             frame.pts, frame.time_base = round(k * ticks) + late, stream.codec_context.time_base
             file.mux(stream.encode(frame))
         file.mux(stream.encode())
@@ -244,12 +247,12 @@ def test_stamps_that_jitter_are_paired_up_to_half_a_frame_apart(tmp_path):
 @pytest.mark.parametrize("codec", ["libsvtav1", "libx264", "mpeg4", "libvpx-vp9", "mjpeg"])
 def test_what_cameras_and_datasets_write_is_read(tmp_path, codec):
     path = tmp_path / "both.mkv"
-    recorded(path, codec, range(0, 24, 2))
+    recorded(path, codec, range(0, 24, 2), right=5)
     found = shots(f"video:{path}")
     assert [shot.problem for shot in found] == [None] * 12
     assert [shot.t_s for shot in found] == pytest.approx([k / 15 for k in range(12)], abs=1e-3)
     greys = [[np.mean(image) for image in (shot.left, shot.right)] for shot in found]
-    np.testing.assert_allclose(greys, [[10 * k, 10 * k] for k in range(12)], atol=4)
+    np.testing.assert_allclose(greys, [[10 * k, 10 * k + 5] for k in range(12)], atol=4)
 
 
 def test_a_file_that_names_others_is_no_video(film, picture, tmp_path):
