@@ -266,6 +266,42 @@ def test_what_is_no_disc_is_rejected_with_its_reason():
         assert all(r.reason in REASONS.values() for r in found.rejected)
 
 
+@pytest.mark.parametrize("target", [BRIGHT, DARK])
+@pytest.mark.parametrize(
+    ("r", "ring"), [(5.0, 1.25), (6.0, 1.0), (8.0, 0.8), (8.0, 2.0), (12.0, 0.5), (15.0, 0.4), (40.0, 0.3)]
+)
+def test_discs_in_printed_rings_are_found(target, r, ring):
+    rng = np.random.default_rng(57)
+    size = 2 * int(r * (1 + ring) + 10)
+    true, rows = [], []
+    for j in range(2):
+        row = []
+        for i in range(3):
+            c, angle = size / 2 + rng.uniform(-1, 1, 2), rng.uniform(0, np.pi)
+            inner, outer = (share([outline(c, a, 0.9 * a, angle)], 0.7, np.zeros(2), size) for a in (r, r * (1 + ring)))
+            row.append(outer - inner)
+            true.append(c + size * np.array([i, j]))
+        rows.append(np.hstack(row))
+    light = np.vstack(rows)
+    found = target.find(grey(200 - 160 * light if target is BRIGHT else 40 + 160 * light, 1.5, rng))
+    off = np.linalg.norm(np.array(true)[:, None] - found.uv, axis=2)
+    assert off.shape[1] > 0
+    assert off.min(axis=1).max() < 0.1
+
+
+@pytest.mark.parametrize("gap", [2.0, 3.0])
+def test_a_disc_between_bright_squares_is_found(gap):
+    rng = np.random.default_rng(58)
+    size, r = 96, 14.0
+    c = np.array([47.6, 48.2])
+    beside = (r + gap) * np.sqrt(0.5) + 10
+    squares = [square(c + beside * np.array([i, j]), 10, 0) for i in (-1, 1) for j in (-1, 1)]
+    light = share([outline(c, r, r, 0)], 0.6, np.zeros(2), size)
+    light += sum(share([s], 0.6, np.zeros(2), size) for s in squares)
+    found = BRIGHT.find(grey(40 + 160 * light, 1.5, rng))
+    assert np.linalg.norm(found.uv - c, axis=1).min(initial=9.0) < 0.1
+
+
 def test_brightness_of_the_whole_does_not_matter():
     rng = np.random.default_rng(5)
     window = share([outline((31.2, 30.8), 9, 8, 0.2)], 0.9, np.zeros(2), 64)

@@ -715,9 +715,8 @@ LEAST_RATIO = 0.22
 _RIM_PX, _RIM_SHARE, _RIM_TEXTURE = 0.05, 0.005, 1.5
 #: Standard deviations of that beyond which it is significant.
 RIM_CHANCE = 4.0
-#: Largest residuals beyond the image's noise, as a share of the contrast; and after the first step, when a texture still
-#: counts. Half of the second: one disc in 30 before strong textures is lost; double: three times as many others are fitted.
-_MOST_RESIDUAL, _FIRST_RESIDUAL = 0.1, 0.25
+#: Largest residuals beyond the image's noise, as a share of the contrast.
+_MOST_RESIDUAL = 0.1
 #: A centre that a textured surround makes less certain than this is rejected, px.
 _MOST_SIGMA_PX = 0.2
 #: Largest variation of the inside beyond the image's noise, as a share of the contrast.
@@ -826,8 +825,6 @@ def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, 
     shift, square = _step(sample, theta, x0, y0, SURROUND, 0.0, work)
     if shift < 0.0 or _LEAST_SNR * square > sample * theta[6] * theta[6]:
         return 2
-    if square > sample * (noise_sigma * noise_sigma + (_FIRST_RESIDUAL * theta[6]) ** 2):
-        return NOT_UNIFORM
     square, texture = minimise(n, theta, x0, y0, SURROUND, noise_sigma, True, 0.0, work)
     if square < 0.0:
         return 2

@@ -270,18 +270,23 @@ def _hilly(image: Grey, noise: float, theta: Array) -> bool:
 
 @kernel
 def _box(image: Grey, x: int, y: int, half: int, across: int, down: int, sign: int) -> float:
-    """Return the contrast of a box with chords through its middle (x, y); 0 where one of its corners is not like a disc.
+    """Return the contrast of a box with chords through its middle (x, y); 0 where not all is like a disc up to its corners.
 
-    An ellipse p u^2 + 2 q u v + r v^2 = 1 with half chords a and b has a mean of 2 at the corners (+-a, +-b).
+    An ellipse p u^2 + 2 q u v + r v^2 = 1 with half chords a and b has a mean of 2 at the corners (+-a, +-b). What is
+    bright beside a disc, beyond a thin ring, is not joined to it: the diagonals' outer halves are followed.
     """
     if min(across, down) < _BOX_PX:
         return 0.0
     u, v, most = int(_CORNER * (across + 1) + 0.5), int(_CORNER * (down + 1) + 0.5), 0.0
-    for i, j in ((x - u, y - v), (x + u, y - v), (x - u, y + v), (x + u, y + v)):
-        gap = sign * (np.float64(image[j, i]) - half)
-        if gap <= 0.0:
-            return 0.0
-        most = max(most, gap)
+    steps = max(u, v)
+    for k in range(steps, steps // 2, -1):
+        i, j = u * k // steps, v * k // steps
+        for a, b in ((x - i, y - j), (x + i, y - j), (x - i, y + j), (x + i, y + j)):
+            gap = sign * (np.float64(image[b, a]) - half)
+            if gap <= 0.0:
+                return 0.0
+            if k == steps:
+                most = max(most, gap)
     return 2.0 * sign * min(most, sign * (np.float64(image[y, x]) - half))  # a disc may lie on it
 
 
