@@ -134,7 +134,7 @@ def test_a_weak_motor_is_named_and_its_joint_held(motors, library):
 def test_a_weak_motor_is_named_by_its_joint_and_held(motors, library):
     """Also of those whose reading is blamed first: the seeds from 500005 ran away by 1.3 to 2.2 rad."""
     far, right = [], []
-    for seed in (500005, 500018, 500041, 500113, 500124, 500190, *range(881000000, 881000034)):
+    for seed in (500005, 500018, 500041, 500113, 500124, 500190, *range(881000000, 881000150)):
         arm = motors.drawn_arm(library, seed)
         arm.enable()
         joint = int(arm.rng.integers(6))
@@ -148,10 +148,10 @@ def test_a_weak_motor_is_named_by_its_joint_and_held(motors, library):
         motor = int(arm.out[0]["joint_faults"][joint]) & 1  # MOTOR, 32, has bit 0
         right.append((arm.first[1] == joint, motor, arm.out[0]["drives_on"]))
     named, motor, driven = np.mean(right, axis=0)
-    assert named > 0.96
-    assert motor > 0.85
-    assert driven > 0.96
-    assert np.mean(np.array(far) < 0.1) > 0.8
+    assert named > 0.97
+    assert motor > 0.9
+    assert driven > 0.99
+    assert np.mean(np.array(far) < 0.1) > 0.92
     assert max(far) < 0.35
 
 

@@ -125,6 +125,28 @@ def test_a_tool_at_rest_shows_its_field_once_however_it_drifts():
     assert found.sigma_rad > 0.7 * heading_off(reference, readings, there).sigma_rad
 
 
+@pytest.mark.parametrize("angle", [0.0, 0.0625, 0.25, np.pi, 3 * np.pi / 2])
+def test_jitter_at_rest_is_one_attitude_wherever_it_is(angle):
+    """Also at pi, where rotation vectors jump, and beside another attitude, at the angle that divides them."""
+    rng = np.random.default_rng(13)
+    sensor = some(rng)
+
+    def found(*angles):
+        axis = np.array([0.6, 0.0, 0.8])
+        Rs = [exp_so3(each * axis) @ exp_so3(rng.normal(0, 0.3e-3, 3)) for each in angles for _ in range(100)]
+        there = lambda t: ToolMotion(pose(Rs[int(t)], np.zeros(3)))  # noqa: E731
+        drift = np.linspace(0.0, 2e-6, len(Rs))[:, None] * [1.0, -1.0, 0.5]
+        z = [sensor.expected(there(k), 0).z + drift[k] for k in range(len(Rs))]
+        return heading_off(
+            sensor, [Reading(float(k), 0, each, NOISE_T**2 * np.eye(3)) for k, each in enumerate(z)], there
+        )
+
+    assert found(angle).sigma_rad == np.inf
+    assert found(angle, angle + 0.2).sigma_rad < np.inf
+    beside, apart = found(angle, angle + 0.1), found(angle, angle + 0.1005)
+    assert beside.sigma_rad == pytest.approx(apart.sigma_rad, rel=0.5)
+
+
 def test_too_few_or_flat_attitudes_are_rejected():
     rng = np.random.default_rng(5)
     sensor = some(rng)

@@ -404,6 +404,34 @@ def test_a_unit_that_images_contradict_is_used_no_more(waits):
     assert np.linalg.norm(off(now.T_base_tool, Ts[-1])[:3]) < 4 * np.sqrt(np.trace(alone.cov[:3, :3]))
 
 
+def test_nothing_heard_before_a_state_is_restored_changes_what_comes_after():
+    """Neither images of a clock that jumped, nor a knock of the links; the first images afterwards are as wrong."""
+    q, _, looks, said, t_s, z = world(274, 2.1, 2.1)
+    late, knocked = (
+        [replace(look, t_s=look.t_s + 0.03) for look in looks],
+        np.where((t_s > 1.71) & (t_s < 1.73), 1e6, z.T),
+    )
+    came, outcomes = [], []
+    for disturbed in (False, True):
+        estimator = go(q[:1700], [look for look in looks if look.t_s < 1.55], said, t_s[t_s < 1.7], z[t_s < 1.7])
+        before, sensor = estimator.remembered(), estimator._unit.sensor
+        heard = [estimator.vision(look) for look in late if disturbed and 1.62 < look.t_s < 1.69]
+        for first in range(1700, 2100, 10):
+            t = np.arange(first, first + 10) * TICK_S
+            estimator.joints(states(t, q[first : first + 10]))
+            rows = (t_s >= t[0] - TICK_S / 2) & (t_s < t[-1] + TICK_S / 2)
+            estimator.take(sensor, Samples(t_s[rows], (knocked.T if disturbed and first < 1750 else z)[rows], DENSITY))
+            if first == 1740:
+                assert (np.isfinite(estimator._struck_s), len(estimator._offsets) > 1) == (disturbed, disturbed)
+                estimator.restore(before)
+            heard += [estimator.vision(look) for look in late if t[0] <= look.t_s < t[-1] and first > 1740]
+            now = estimator.estimate()
+            came += [np.vstack([now.T_base_tool[:, [0, 1, 2, 3, 3, 3]], now.cov])] * (first > 1740)
+        outcomes.append(heard)
+    assert Outcome.USED not in outcomes[1][:4]
+    np.testing.assert_array_equal(*np.split(np.array(came), 2))
+
+
 @pytest.mark.parametrize("seed", [297, 298])
 def test_a_cameras_clock_that_jumps_is_followed_with_a_unit(seed):
     q, Ts, looks, *imu = world(seed, 6.5, 6.5)

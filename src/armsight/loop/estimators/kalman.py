@@ -225,7 +225,8 @@ class KalmanEstimator:
             self.clock.restore(state.clock, self._forgets)
         P = P if self._unit is None else self._delay_apart(P)
         self._states = [newest._replace(x=x, P=P, taken=None, considered=NONE_CONSIDERED, beside=None)]
-        self._outliers, self._back, self._newest, self._here = [], [], None, None
+        self._outliers, self._offsets, self._against, self._struck_s = [], [], {}, -np.inf
+        self._back, self._newest, self._here = [], None, None
         self._doubt.drop()
         self._waiting, self._backlash_set = [], False
 

@@ -28,7 +28,7 @@ NOISE_T = 0.5e-6
 LEAST_T = 5e-6
 #: No field is larger, T, as ranges of chips end there; half, double: nothing.
 MOST_T = 5e-3
-#: Attitudes nearer to each other than about this, rad, show one field; half: an arm at rest counts often, double: nothing.
+#: Attitudes so near to each other, rad, show one field; half: an arm that creeps counts often, double: sweeps seldom.
 _NEAR_RAD = 0.1
 #: Fields are compared so far apart, s; half: a motor counts twice, double: sweeps are short of attitudes.
 FIELDS_S = 0.2
@@ -157,6 +157,15 @@ class HeadingOff(Record):
     disturbance_t: Array
 
 
+def _attitudes(R: Array) -> Array:
+    """Return which attitude each of the rotations (N, 3, 3) shows, from 0: the first that is near it, or a new one."""
+    of = np.full(len(R), -1)
+    while len(left := np.flatnonzero(of < 0)):
+        near = np.tensordot(R[left], R[left[0]]) > 1.0 + 2.0 * np.cos(_NEAR_RAD)  # the trace of one by the other
+        of[left[near]] = of.max() + 1
+    return of
+
+
 def heading_off(sensor: Magnetometer, readings: Sequence[Reading], motion: Callable[[float], ToolMotion]) -> HeadingOff:
     """Compare the heading of the arm with that of the field.
 
@@ -186,10 +195,9 @@ def heading_off(sensor: Magnetometer, readings: Sequence[Reading], motion: Calla
         by.append(across @ expected.by_parameters)
     squares = np.square(shown).mean(axis=1) / level**2
     # What drifts, as a chip that warms up, is no other field at an attitude where the arm rests: each counts once.
-    _, of, counts = np.unique(
-        np.round(log_so3(np.array(R)) / _NEAR_RAD), axis=0, return_inverse=True, return_counts=True
-    )
-    weights = 1.0 / (np.array(noise) + squares + np.median(squares)) / counts[of := of.ravel()]
+    of = _attitudes(np.array(R))
+    counts = np.bincount(of)
+    weights = 1.0 / (np.array(noise) + squares + np.median(squares)) / counts[of]
     weights /= weights.sum()
     begin = float(np.angle(weights @ np.exp(1j * np.array(angles))))
     apart = np.angle(np.exp(1j * (np.array(angles) - begin)))
