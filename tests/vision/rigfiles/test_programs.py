@@ -157,6 +157,14 @@ def test_lengths_of_luxonis_are_of_the_unit_given(tmp_path, scale, options):
     assert sum("raw images" in note for note in rig.provenance["notes"]) == 1
 
 
+@pytest.mark.parametrize(
+    ("name", "said"), [("stereo_calib", True), ("K_l", True), ("bouguet", False), ("multical", False)]
+)
+def test_files_that_opencv_may_have_calibrated_are_remarked(tmp_path, name, said):
+    rig = import_rig(None, write(tmp_path, PROGRAMS[name][2]), **PROGRAMS[name][3])
+    assert any("stereoCalibrate" in note for note in rig.provenance["notes"]) is said
+
+
 # --- what goes wrong -------------------------------------------------------------------------------------------------
 
 TITLES = {name: re.escape(open_format(name).title) for name in FORMATS}
