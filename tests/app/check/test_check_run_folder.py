@@ -330,7 +330,7 @@ def test_folders_that_cannot_be_evaluated(tmp_path, capsys):
     line(made, "open_loop", 1)
     whole = made.write()
     answer = said(capsys, whole, "--json")  # one cycle: of the poses nothing, of the circle all
-    assert set(answer.lines[0]) == {"circle", "notes"}
+    assert set(answer.lines[0]) == {"circle", "notes", "weak"}
     assert "left out: all poses, as none was attained 3 times" in answer.lines[0]["notes"]
     assert_rejected(said(capsys, whole, "--closed"), "no motions with the loop closed")
     (whole / "motion.toml").write_text("motion = 3")

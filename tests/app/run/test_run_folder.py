@@ -56,8 +56,8 @@ def test_what_is_not_known_is_null(tmp_path):
     assert summary["count"] == 3
     assert summary["said"] is True
     assert summary["ended_by"] is None
-    own = {"version", "notes", "health", "fixed_unseen", "rig_corrections", "rig_not_corrected", "wall_s", "ended_by"}
-    assert set(summary) == own | set(PROPERTIES)
+    own = {"version", "notes", "weak", "health", "fixed_unseen", "rig_corrections", "rig_not_corrected", "wall_s"}
+    assert set(summary) == own | {"ended_by"} | set(PROPERTIES)
 
 
 def test_nothing_measured_at_all_is_a_folder_all_the_same(tmp_path):
