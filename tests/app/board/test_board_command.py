@@ -3,6 +3,7 @@
 import os
 import shutil
 import stat
+from dataclasses import replace
 
 import pytest
 from firmware_build import board_image
@@ -11,6 +12,7 @@ from armsight.app.board import selftest as board_selftest
 from armsight.app.board.flash import FLASHED, PROGRAMMERS
 from armsight.app.board.selftest import DRIVEN
 from armsight.firmware import build, host_library
+from armsight.robot.boards.board import Board
 from armsight.robot.boards.codes import BoardState, Fault
 from armsight.robot.boards.emulators import EMULATORS, HostEmulator
 from cli_runs import assert_has, assert_rejected
@@ -87,6 +89,22 @@ def test_monitor_shows_faults(armsight, monkeypatch):
     said = armsight("board", "monitor", *HOST, "--seconds", "0.1", "--every", "0.1", "--json")
     assert said.lines[0]["faults"] == [{"fault": Fault.SUPPLY_LOW.name, "joint": None}]
     assert "SUPPLY_LOW" in armsight("board", "monitor", *HOST, "--seconds", "0.1", "--every", "0.1").out
+
+
+def test_monitor_names_joints_that_are_not_homed_whenever_they_change(armsight, monkeypatch):
+    bits, receive = iter([0, 0b10, 0b10, 0b1010, 0]), Board.receive
+
+    def losing(board, wait_s=0.0):
+        states = receive(board, wait_s)
+        if wait_s == 0.1:
+            board.status = replace(board.status, not_homed=next(bits))
+        return states
+
+    monkeypatch.setattr(Board, "receive", losing)
+    said = armsight("board", "monitor", *HOST, "--seconds", "0.5", "--every", "0.1", "--json").done()
+    assert [line["not_homed"] for line in said.lines] == [[], [2], [2], [2, 4], []]
+    notes = [line.split(": its")[0] for line in said.err.splitlines() if "homed" in line]
+    assert notes == ["note: joint 2: not homed", "note: joint 2, 4: not homed", "note: all joints are homed"]
 
 
 def test_gains_are_printed_and_changed(armsight):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from armsight.app.board import readings
+from armsight.app.board.command import NOT_HOMED
 from armsight.app.board.readings import BoardReadings
 from armsight.data import JointStates
 from armsight.errors import DeviceError, InputError
@@ -24,7 +25,7 @@ class FakeBoard:
     homed = True
 
     def __init__(self, faults=()):
-        self.status = SimpleNamespace(faults=faults)
+        self.status = SimpleNamespace(faults=faults, joints_not_homed=[])
         self.reads, self.closed = 0, False
 
     def receive(self, wait_s):
@@ -107,7 +108,7 @@ def test_an_arm_that_is_not_homed_gives_no_angles_until_it_is(monkeypatch):
     board.start(put, lines.append)
     assert again.wait(20)
     board.close()
-    unhomed = f"board: ar4:/dev/none: {readings.NOT_HOMED}; trying again"
+    unhomed = f"board: ar4:/dev/none: {NOT_HOMED}; trying again"
     assert "nothing answers" in lines[2]  # no model is set in a Teensy that begins
     assert lines == [unhomed, "board: connected", lines[2], unhomed]
     assert opened[:5] == [0, 0, 0, 0, 1]
@@ -134,7 +135,7 @@ def test_a_board_that_loses_its_zero_while_it_is_read_gives_no_more_angles(monke
     board.start(data.append, lines.append)
     assert said.wait(20)
     board.close()
-    assert lines == ["board: connected", f"board: feetech:/dev/none: {readings.NOT_HOMED}; trying again"]
+    assert lines == ["board: connected", f"board: feetech:/dev/none: {NOT_HOMED}; trying again"]
     assert sum(isinstance(each, JointsDatum) for each in data) == 1
 
 

@@ -53,7 +53,7 @@ def test_monitor_watches_a_servo_bus(armsight, so101):
 def test_an_ar4_is_homed_watched_and_cleared(armsight, teensy):
     name = f"ar4:{teensy.name}"
     assert_rejected(armsight("board", "home", "--board", "emulated:host"), "emulated:host has no limit switches")
-    assert "not homed since switched on" in armsight("board", "monitor", "--board", name, "--seconds", 0.05).err
+    assert "not homed: its readings" in armsight("board", "monitor", "--board", name, "--seconds", 0.05).err
     said = armsight("board", "home", "--board", name, "--yes", "--json").done()
     assert said.lines[0]["q_rad"] == pytest.approx([0.0] * 6, abs=1e-3)
     said = armsight("board", "monitor", "--board", name, "--seconds", 0.05, "--json").done()

@@ -64,6 +64,7 @@ class Encoded:
 def test_nothing_is_driven_before_the_zero_is_known_and_then_the_joints_follow():
     here = Encoded()
     assert here.board.status.not_homed == sum(1 << int(j) for j in np.flatnonzero(KIND == SensorKind.QUADRATURE))
+    assert here.board.status.joints_not_homed == [int(j) + 1 for j in np.flatnonzero(KIND == SensorKind.QUADRATURE)]
     assert not here.board.homed
     with pytest.raises(ArmsightError, match="an encoder does not know its zero"):
         here.board.enable()

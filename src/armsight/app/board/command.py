@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from armsight.robot.boards.contract import MotionBoard
 
 _FILE = argument()
-NOT_HOMED = "not homed since switched on: its readings are not the arm's angles (armsight board home)"
+NOT_HOMED = "not homed: its readings are not the arm's angles (armsight board home)"
 #: The steps of a bring-up, in their order, and what each finds of a joint (``found.JointFound``).
 STEPS = {
     "readings": "noise_counts",
@@ -77,6 +77,12 @@ def open_any(name: str) -> MotionBoard:
     from armsight.sim.joints import JointPlant
 
     return open_motion_board(name, None if is_real(name) else JointPlant())
+
+
+def not_homed(board: MotionBoard) -> str:
+    """Return that a board is not homed, with its joints where it names them; empty where it is."""
+    joints = ", ".join(map(str, board.status.joints_not_homed))
+    return "" if board.homed else f"joint {joints}: {NOT_HOMED}" if joints else NOT_HOMED
 
 
 @click.group("board")
@@ -156,12 +162,13 @@ def monitor(
         click.echo(f"note: no --board: this one is {name}, a program; --board serial:PORT is a board", err=True)
     with open_any(name) as board:
         click.echo(text.welcome_text(board), err=True)
-        if not board.homed:
-            click.echo(f"note: {NOT_HOMED}", err=True)
-        passed = 0.0
+        passed, said = 0.0, ""
         while seconds is None or passed < seconds - 1e-9:
             states = board.receive(every)
             passed += every
+            if (now := not_homed(board)) != said:
+                click.echo(f"note: {now or 'all joints are homed'}", err=True)
+                said = now
             if not is_real(name):
                 time.sleep(every)  # its time passes at once
             _show(as_json, text.status_json(board, states), text.status_text(board, states))

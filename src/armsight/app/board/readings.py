@@ -13,7 +13,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from armsight.app.board.command import NOT_HOMED, open_any
+from armsight.app.board.command import not_homed, open_any
 from armsight.app.options import BOARD
 from armsight.data import JointStates
 from armsight.errors import DeviceError, InputError
@@ -29,8 +29,8 @@ _PAUSE_S, _LONGEST_S = 0.25, 2.0
 
 
 def _check_homed(board: MotionBoard, name: str) -> None:
-    if not board.homed:
-        raise InputError(f"{name}: {NOT_HOMED}")
+    if missing := not_homed(board):
+        raise InputError(f"{name}: {missing}")
 
 
 class BoardReadings:

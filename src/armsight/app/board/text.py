@@ -63,6 +63,7 @@ def status_json(board: MotionBoard, states: JointStates) -> dict[str, Any]:
         "t_s": round(status.t_s, 3),
         "state": status.state.name,
         "faults": [{"fault": f.fault.name, "joint": None if f.joint is None else f.joint + 1} for f in status.faults],
+        "not_homed": status.joints_not_homed,
         "q_rad": [round(float(q), 5) for q in states.q[-1]] if len(states.q) else None,
         "duty": [round(float(duty), 4) for duty in board.joints.duty],
         "supply_v": None if math.isnan(status.supply_v) else round(status.supply_v, 3),

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from armsight.app.board.command import NOT_HOMED
+from armsight.app.board.command import not_homed
 from armsight.app.live.handeye import (
     HandEyeGuide,
     HandEyeState,
@@ -297,8 +297,8 @@ class ArmStep(PageStep[ArmState]):
             now = time.monotonic()
             qs = np.array([q for at, q in list(self._lately) if now - at < _REST_S])
             if not len(qs):
-                unhomed = self._board is not None and not self._board.homed
-                raise InputError(NOT_HOMED if unhomed else "no joints are read: connect the board first")
+                missing = "" if self._board is None else not_homed(self._board)
+                raise InputError(missing or "no joints are read: connect the board first")
             if np.ptp(qs, axis=0).max() > _REST_RAD:
                 raise InputError("a joint moves: take poses at rest")
             q = qs.mean(axis=0)
@@ -379,8 +379,8 @@ class ArmStep(PageStep[ArmState]):
             return f"{self.shared.options.board} commands no motion: another program moves the arm"
         if self._board is None:
             return "the board is not connected"
-        if not self._board.homed:
-            return NOT_HOMED
+        if missing := not_homed(self._board):
+            return missing
         if lacking := self._measuring.lacking:
             return lacking
         if not self._measuring.followed:

@@ -241,7 +241,7 @@ class Board(Closing):
 
     @property
     def homed(self) -> bool:
-        """Whether all encoders that count were homed since power-on; one that missed counts is not any more."""
+        """Whether all encoders that count know their zeros; one that missed counts does not any more."""
         return not self.status.not_homed
 
     @property

@@ -100,7 +100,7 @@ class MotionBoard(Closing, Protocol):
 
     @property
     def homed(self) -> bool:
-        """False where it is known that its readings are not the arm's angles: it was not homed since it was switched on."""
+        """False where it is known that its readings are not the arm's angles: it is not homed."""
 
     def soft_limits(self) -> tuple[Array, Array]:
         """Return the lower and the upper limits (n,) that it keeps the joints within, rad."""

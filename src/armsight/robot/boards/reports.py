@@ -76,7 +76,12 @@ class BoardStatus:
     stale_commands: int = 0  #: commands dropped because a newer one had come already
     lost_messages: int = 0  #: messages from the host that are missing in the count of the frames
     config_stored: int = 0  #: configurations stored since the start
-    not_homed: int = 0  #: joints whose encoder counts and was not homed since power-on, a bit each
+    not_homed: int = 0  #: joints whose encoder counts from an unknown zero, a bit each
+
+    @property
+    def joints_not_homed(self) -> list[int]:
+        """Those joints, from 1."""
+        return [k + 1 for k in range(self.not_homed.bit_length()) if self.not_homed >> k & 1]
 
     @property
     def drives_on(self) -> bool:
