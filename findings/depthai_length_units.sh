@@ -5,16 +5,19 @@
 # project3DPointTo(to, point) and remap3DPointTo(to, point) of the same class, whose documentation names no unit, add the
 # extrinsics in centimetres to the point: one in millimetres moves by a tenth of the baseline. The Extrinsics' lengthUnit is
 # respected there, but not by CalibrationHandler: it writes lengthUnit into the JSON of a calibration, reads it back, and
-# takes every translation for centimetres.
+# takes translations for centimetres, whichever the unit: in getCameraExtrinsics (both ways), getCameraTranslationVector and
+# getBaselineDistance, of the calibration and of the design.
 #
 # Seen: baseline 75 mm, f 800 px, a point at 1000 mm on the axis: projectPointTo moves it by 60 px, project3DPointTo by 6 px,
-# remap3DPointTo by 7.5; a calibration with -0.075 m (lengthUnit 0) has a baseline of 0.75 mm.
+# remap3DPointTo by 7.5; a calibration with -0.075 m (lengthUnit 0) has a baseline of 0.75 mm, one with -75 mm (2) 750 mm.
 set -e
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
 python3 -m venv "$folder/venv"
 "$folder/venv/bin/pip" install --quiet numpy==2.3.5 depthai==3.12.0
-"$folder/venv/bin/python" - 2> /dev/null <<'PYTHON'
+DEPTHAI_LEVEL=error "$folder/venv/bin/python" - <<'PYTHON'
+import re
+
 import depthai as dai
 import numpy as np
 
@@ -24,7 +27,7 @@ K = [[f, 0, 640], [0, f, 400], [0, 0, 1]]
 
 def extrinsics(x, unit, to):
     made = dai.Extrinsics()
-    made.rotationMatrix, made.translation = np.eye(3).tolist(), dai.Point3f(x, 0, 0)
+    made.rotationMatrix, made.translation, made.specTranslation = np.eye(3).tolist(), dai.Point3f(x, 0, 0), dai.Point3f(x, 0, 0)
     made.lengthUnit, made.toCameraSocket = unit, to
     return made
 
@@ -35,6 +38,8 @@ views = [
     for x, unit in ((-7.5, units.CENTIMETER), (-0.075, units.METER), (0.0, units.CENTIMETER))
 ]
 assert "(mm) Depth" in dai.ImgTransformation.projectPointTo.__doc__
+for each in (dai.ImgTransformation.project3DPointTo, dai.ImgTransformation.remap3DPointTo):
+    assert not re.search(r"\b(m|mm|cm|units?|(milli|centi)?met(er|re)s?)\b", each.__doc__, re.IGNORECASE), each.__doc__
 for view in views[:2]:  # the unit of the extrinsics is respected
     pixel = view.projectPointTo(views[2], dai.Point2f(640, 400), 1000.0).x
     point = dai.Point3f(0, 0, 1000)
@@ -42,15 +47,23 @@ for view in views[:2]:  # the unit of the extrinsics is respected
     print(f"{dai.__version__}: 1000 mm away: projectPointTo {pixel - 640:.1f} px, project3DPointTo {projected - 640:.1f} px, moved by {moved:.2f}")
     assert abs(pixel - 580) < 0.01 and abs(projected - 634) < 0.01 and abs(moved + 7.5) < 1e-3
 
-board, camera, other = dai.EepromData(), dai.CameraInfo(), dai.CameraInfo()
-for each in (camera, other):
-    each.width, each.height, each.intrinsicMatrix = 1280, 800, K
-camera.extrinsics = extrinsics(-0.075, units.METER, right)
-board.cameraData = {left: camera, right: other}
-for handler in (dai.CalibrationHandler(board), dai.CalibrationHandler.fromJson(dai.CalibrationHandler(board).eepromToJson())):
-    written = dict(handler.eepromToJson()["cameraData"])[1]["extrinsics"]["lengthUnit"]
-    mm = handler.getCameraExtrinsics(left, right, unit=units.MILLIMETER)[0][3]
-    print(f"lengthUnit {written} (metre), translation -0.075: read as {mm:.2f} mm, by Extrinsics itself as {camera.extrinsics.getTranslationVector(unit=units.MILLIMETER)[0]:.1f} mm")
-    assert written == int(units.METER.value) == 0
-    assert abs(mm + 0.75) < 1e-4
+for x, unit in ((-0.075, units.METER), (-75.0, units.MILLIMETER), (-7.5, units.CENTIMETER)):
+    board, camera, other = dai.EepromData(), dai.CameraInfo(), dai.CameraInfo()
+    for each in (camera, other):
+        each.width, each.height, each.intrinsicMatrix = 1280, 800, K
+    camera.extrinsics = extrinsics(x, unit, right)
+    board.cameraData = {left: camera, right: other}
+    own = camera.extrinsics.getTranslationVector(unit=units.MILLIMETER)[0]
+    for handler in (dai.CalibrationHandler(board), dai.CalibrationHandler.fromJson(dai.CalibrationHandler(board).eepromToJson())):
+        written = dict(handler.eepromToJson()["cameraData"])[1]["extrinsics"]["lengthUnit"]
+        mm = []
+        for spec in (False, True):
+            mm.append(handler.getCameraExtrinsics(left, right, spec, units.MILLIMETER)[0][3])
+            mm.append(-handler.getCameraExtrinsics(right, left, spec, units.MILLIMETER)[0][3])
+            mm.append(handler.getCameraTranslationVector(left, right, spec, units.MILLIMETER)[0])
+            mm.append(-handler.getBaselineDistance(left, right, spec, units.MILLIMETER))
+        print(f"lengthUnit {written} ({unit.name}), translation {x}: read as {mm[0]:.2f} mm, by Extrinsics itself as {own:.1f} mm")
+        assert written == int(unit.value)
+        assert abs(own + 75.0) < 1e-3
+        assert np.allclose(mm, 10 * x, rtol=1e-5), mm
 PYTHON

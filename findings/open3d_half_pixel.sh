@@ -4,8 +4,8 @@
 # RaycastingScene.create_rays_pinhole(K, ..) sends the ray of pixel (u, v) through (u + 0.5, v + 0.5): its K counts from the
 # corner of an image. PointCloud.create_from_depth_image(depth, K) puts the same pixel at (u, v): its K counts from the centre
 # of the first pixel, as OpenCV's does; so does the legacy class. With one K for both, points are displaced by z / (2 f) to
-# the left and upwards, and nothing says so: the documentation of the rays names no pixel. Rays by a K of OpenCV need 0.5 px
-# more in cx and cy.
+# the left and upwards. The docstring of the rays names neither the centre nor the corner of a pixel. Rays by a K of OpenCV
+# need 0.5 px more in cx and cy.
 #
 # Seen: f 50 px, a wall 1 m away: all points 10.00 mm left of and above where the rays hit it; 0.00 mm with 0.5 px more.
 set -e
@@ -14,9 +14,14 @@ trap 'rm -rf "$folder"' EXIT
 python3 -m venv "$folder/venv"
 "$folder/venv/bin/pip" install --quiet numpy==2.3.5 open3d-cpu==0.20.0
 "$folder/venv/bin/python" - <<'PYTHON'
+import re
+
 import numpy as np
 import open3d as o3d
 
+said = o3d.t.geometry.RaycastingScene.create_rays_pinhole.__doc__.partition("2. create_rays_pinhole(fov_deg")[0]
+assert "upper triangular intrinsic matrix" in said
+assert not re.search(r"\bpixel\b|0\.5|half|corner|cent(er|re)", said, re.IGNORECASE), said
 width, height, f = 64, 48, 50.0
 K = np.array([[f, 0, (width - 1) / 2], [0, f, (height - 1) / 2], [0, 0, 1]])
 wall = o3d.t.geometry.TriangleMesh.create_box(4.0, 4.0, 0.1)

@@ -112,7 +112,13 @@ def test_each_program_gives_the_same_poses_without_the_frames_that_lack_the_body
         (vicon("RX,RY,RZ"), "Vicon whose rotations are three numbers: export objects or segments with quaternions"),
         ("Trajectories\n100\n,,a,,\nFrame,Sub Frame,X,Y,Z\n,,mm,mm,mm\n1,0,1,2,3\n", "Vicon without the poses"),
         (vicon(unit="ells"), "lengths in 'ells'"),
-        (vicon().replace(f"{1e3 * P[1, 0]:.6f}", "12,5x"), "line 7"),
+        *(
+            (
+                vicon().replace("\n100\n", f"\n{rate}\n", 1),
+                f"a.csv: line 2: '{rate}' frames a second; expected a positive",
+            )
+            for rate in ("0", "-100", "nan", "inf", "fast", "")
+        ),
         (
             motive().partition("\n3,")[0].partition("\n0,")[0] + "\n0,0.0,1,2,3,,,,,,,,\n",
             "none of its 1 frames has a pose",
@@ -123,6 +129,38 @@ def test_what_an_export_leaves_open_is_rejected_with_the_export_to_choose(tmp_pa
     (tmp_path / "a.csv").write_text(text)
     with pytest.raises(InputError, match=said):
         read_pose_table(tmp_path / "a.csv")
+
+
+@pytest.mark.parametrize("program", [name for name in FILES if "two" not in name])
+@pytest.mark.parametrize("damage", ["garbage", "x", '"x', "9" * 140_000, ""])
+def test_a_damaged_line_is_named_and_left_out_and_those_beneath_are_read(tmp_path, program, damage):
+    """In place of a whole line, of the frame's number, and of the rotation's last number."""
+    name, text, begin_s = FILES[program]
+    mark = "\t" if name == "a.tsv" else ","
+    lines = text.split("\n")
+    first = next(k for k, line in enumerate(lines) if line.startswith(("Frame", '"Frame'))) + 1 + ("vicon" in program)
+    path = tmp_path / name
+    for cell in (None, 0, {"m": 8, "q": -2, "v": 5}[program[0]]):
+        for k in (0, 1):
+            cells = lines[first + k].split(mark)
+            if cell is not None:
+                cells[cell] = damage
+            path.write_text(
+                "\n".join([*lines[: first + k], damage if cell is None else mark.join(cells), *lines[first + k + 1 :]])
+            )
+            table = read_pose_table(path)
+            seen = [each for each in range(4) if each not in (LOST, k)]
+            np.testing.assert_allclose(table.Ts, pose(M, P)[seen], atol=2e-5)
+            np.testing.assert_allclose(table.t_s, begin_s + np.array(seen) / 100, atol=1e-9)
+            if damage or cell == 0:  # an empty line is none, an empty number a body that was not seen
+                assert table.notes[0].endswith(f"2 of 4 frames, the others are left out; damaged: line {first + k + 1}")
+
+
+def test_many_damaged_lines_are_counted(tmp_path):
+    head, rows = vicon().partition("\n1,0")[0], vicon().split("\n")[5:7]
+    (tmp_path / "a.csv").write_text("\n".join([head, *rows, *["?"] * 9, *rows]))
+    table = read_pose_table(tmp_path / "a.csv")
+    assert table.notes[0].endswith("4 of 13 frames, the others are left out; damaged: line 8, 9, 10, 11, 12 and 4 more")
 
 
 def test_a_table_of_ones_own_that_begins_with_frames_is_none_of_them(tmp_path):

@@ -7,10 +7,9 @@ whose they are and in which unit. Quaternions and matrices mean one thing alone,
 from __future__ import annotations
 
 import csv
-import io
-import itertools
+import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -32,30 +31,33 @@ _ADVICE = {
 #: Motive's names of units, and Vicon's.
 _UNITS_M = {"meters": 1.0, "centimeters": 0.01, "millimeters": 1e-3, "inches": 0.0254, "m": 1.0, "cm": 0.01, "mm": 1e-3}
 _NONE = ("", "null", "nan")  # a cell, in small letters, of a frame in which the body was not seen
+_LISTED = 5  # damaged lines that a note names; half: one more look at the file, double: a longer note
 _Bodies = dict[str, dict[str, int]]  # name of a body -> our name -> its column
 _Line = tuple[int, list[str]]  # its number and its cells
 
 
 class _Export(NamedTuple):
-    """What a file is: whose, the columns of its bodies, the unit of lengths, its lines from which on, frames a second."""
+    """What a file is: whose, the columns of its bodies, the unit of lengths, its frames, frames a second."""
 
     program: str
     bodies: _Bodies
     unit: str
-    lines: list[list[str]]
-    first_line: int
+    frames: list[_Line]
     rate_hz: float | None = None  # where the lines have the numbers of frames, and no times
 
 
 def capture_rows(path: Path, text: str, side: str, whose: str | None) -> ProgramPoints | None:
-    """Return the times and poses of a rigid body, without the frames that lack it; None where the text is no such export.
+    """Return the times and poses of a rigid body; None where the text is no such export.
+
+    Frames that lack it are left out, and so are lines that are damaged; a note names these.
 
     ``whose``: the name of the body; None: the only one. ``side``: "robot" or "seen", for the option in messages.
 
     Raises:
         InputError: no rigid body, rotations that are not unambiguous, or several bodies; the program and what to export.
+            Frames without a rate.
     """
-    if (export := _export(text)) is None:
+    if (export := _export(path, text)) is None:
         return None
     program, said = export.program, f"{path}: an export of {export.program}"
     bodies = {name: at for name, at in export.bodies.items() if {*_POSITION} <= set(at)}
@@ -71,49 +73,71 @@ def capture_rows(path: Path, text: str, side: str, whose: str | None) -> Program
         raise InputError(f"{said} whose rotations are three numbers: {_ADVICE[program]}")
     if (unit_m := _UNITS_M.get(export.unit.lower())) is None:
         raise InputError(f"{said} with lengths in {export.unit!r}; known are {', '.join(_UNITS_M)}")
-    lines = itertools.dropwhile(lambda line: not _is_frame(line), enumerate(export.lines, export.first_line))
-    frames = list(itertools.takewhile(_is_frame, lines))  # up to the empty one before what else was exported
-    rows = list(_rows(path, export, [at[name] for name in (*_POSITION, *rotation)], unit_m, frames))
+    columns = [at[name] for name in (*_POSITION, *rotation)]
+    read = [(line, _pose(row, columns, unit_m, export.rate_hz)) for line, row in export.frames]
+    rows = [(line, cells) for line, cells in read if cells]
     if not rows:
-        raise InputError(f"{said}: none of its {len(frames)} frames has a pose of the body")
+        raise InputError(f"{said}: none of its {len(read)} frames has a pose of the body")
     note = f"{path}: read as {program}'s, lengths in {export.unit}"
-    if len(rows) < len(frames):
-        note += f"; the body is in {len(rows)} of {len(frames)} frames, the others are left out"
+    if len(rows) < len(read):
+        note += f"; the body is in {len(rows)} of {len(read)} frames, the others are left out"
+    if damaged := [str(line) for line, cells in read if cells is None]:
+        more = f" and {len(damaged) - _LISTED} more" if len(damaged) > _LISTED else ""
+        note += f"; damaged: line {', '.join(damaged[:_LISTED])}{more}"
     return ProgramPoints(["t_s", *_POSITION, *rotation], rows, None, (note,))
 
 
-def _rows(path: Path, export: _Export, columns: list[int], unit_m: float, frames: list[_Line]) -> Iterator[_Line]:
-    """Yield the lines with a time, a position, m, and a rotation of those frames that have the body."""
-    for line, row in frames:
-        cells = [row[k].strip() if k < len(row) else "" for k in columns]
-        if any(cell.lower() in _NONE for cell in cells) or not any(number(cell) != 0 for cell in cells[3:]):
-            continue
-        p = [unit_m * value for cell in cells[:3] if (value := number(cell)) is not None]
-        if len(p) < 3:
-            raise InputError(f"{path}: line {line}: {' '.join(cells[:3])[:60]!r} is no position")
-        t_s = row[1].strip() if export.rate_hz is None else repr(float(row[0]) / export.rate_hz)
-        yield line, [t_s, *map(repr, p), *cells[3:]]
+def _pose(row: list[str], columns: list[int], unit_m: float, rate_hz: float | None) -> list[str] | None:
+    """Return a frame's time, position, m, and rotation; [] where the body was not seen, None where the line is damaged."""
+    cells = [row[k] if k < len(row) else "" for k in columns]
+    seen = [cell for cell in cells if cell.lower() not in _NONE]
+    found = [value for cell in (*row[:2], *seen) if (value := number(cell)) is not None and math.isfinite(value)]
+    if len(found) < 2 + len(seen):
+        return None
+    if len(seen) < len(cells) or not any(found[5:]):
+        return []
+    t_s = found[1] if rate_hz is None else found[0] / rate_hz
+    return [repr(t_s), *(repr(unit_m * value) for value in found[2:5]), *cells[3:]]
 
 
-def _export(text: str) -> _Export | None:
+def _export(path: Path, text: str) -> _Export | None:
     """Return what a text is; None where it is no such export."""
     found = _HEADER.search(text, 0, 200_000)
     end, mark = (found.end(), found[1]) if found is not None else (0, ",")
-    *above, head = list(csv.reader(io.StringIO(text[:end]), delimiter=mark)) or [[]]
-    lines = list(csv.reader(io.StringIO(text[end + 1 :]), delimiter=mark)) if found is not None else []
-    first_line = text.count("\n", 0, end) + 2
+    *above, head = [_cells(line, mark) for line in text[:end].split("\n")]
+    rows = text[end + 1 :].split("\n") if found is not None else []
+    below = [(line, _cells(row, mark)) for line, row in enumerate(rows, len(above) + 2)]
     if text.startswith("Format Version,"):
-        return _Export(_MOTIVE, *_of_motive(above, head), lines, first_line)
+        return _Export(_MOTIVE, *_of_motive(above, head), list(_frames(below)))
     if text.startswith("NO_OF_FRAMES\t"):
-        return _Export(_QTM, _of_qtm(above, head), "mm", lines, first_line)
+        return _Export(_QTM, _of_qtm(above, head), "mm", list(_frames(below)))
     if head[1:2] == ["Sub Frame"]:
-        rate_hz = number(above[1][0]) if len(above) > 1 and above[1] else None
-        return _Export(_VICON, *_of_vicon(above, head, lines), lines, first_line, rate_hz)
+        rate = above[1][0] if len(above) > 1 and above[1] else ""
+        if not 0 < (rate_hz := number(rate) or 0.0) < math.inf:
+            raise InputError(
+                f"{path}: line 2: {rate[:40]!r} frames a second; expected a positive number: export it again"
+            )
+        return _Export(_VICON, *_of_vicon(above, head, below[0][1]), list(_frames(below[1:])), rate_hz)
     return None
 
 
-def _is_frame(line: _Line) -> bool:
-    return bool(line[1]) and number(line[1][0]) is not None
+def _cells(line: str, mark: str) -> list[str]:
+    """Return the cells of a line; a quote that stays open ends with it."""
+    try:
+        return [cell.strip() for cell in next(csv.reader([line], delimiter=mark), [])]
+    except csv.Error:  # a cell longer than any
+        return [line[:40]]
+
+
+def _frames(lines: Iterable[_Line]) -> Iterator[_Line]:
+    """Yield the lines that are not empty, up to a title beneath an empty one, a word alone: of what else was exported."""
+    empty = False
+    for line, row in lines:
+        if empty and sum(map(bool, row)) == 1 and number(row[0]) is None:
+            return
+        empty = not any(row)
+        if not empty:
+            yield line, row
 
 
 def _of_motive(above: list[list[str]], head: list[str]) -> tuple[_Bodies, str]:
@@ -142,7 +166,7 @@ def _of_qtm(above: list[list[str]], head: list[str]) -> _Bodies:
     return bodies
 
 
-def _of_vicon(above: list[list[str]], head: list[str], below: list[list[str]]) -> tuple[_Bodies, str]:
+def _of_vicon(above: list[list[str]], head: list[str], below: list[str]) -> tuple[_Bodies, str]:
     """Return the objects and the unit of Vicon's CSV: names stand above an object's first column, units beneath all."""
     bodies: _Bodies = {}
     names, name = above[-1] if above else [], ""
@@ -151,5 +175,5 @@ def _of_vicon(above: list[list[str]], head: list[str], below: list[list[str]]) -
         name = (names[k] if k < len(names) else "") or name
         if cell in ours:
             bodies.setdefault(name, {})[ours[cell]] = k
-    units = [cell for row in below[:1] for cell, theirs in zip(row, head, strict=False) if theirs == "TX"]
+    units = [cell for cell, theirs in zip(below, head, strict=False) if theirs == "TX"]
     return bodies, units[0] if units else ""
