@@ -134,7 +134,7 @@ def test_what_an_export_leaves_open_is_rejected_with_the_export_to_choose(tmp_pa
 @pytest.mark.parametrize("program", [name for name in FILES if "two" not in name])
 @pytest.mark.parametrize("damage", ["garbage", "x", '"x', "9" * 140_000, ""])
 def test_a_damaged_line_is_named_and_left_out_and_those_beneath_are_read(tmp_path, program, damage):
-    """In place of a whole line, of the frame's number, and of the rotation's last number."""
+    """Instead of a whole line, of the frame's number, and of the rotation's last number."""
     name, text, begin_s = FILES[program]
     mark = "\t" if name == "a.tsv" else ","
     lines = text.split("\n")
