@@ -39,5 +39,5 @@ for added, expected in ((0.0, -10.0), (0.5, 0.0)):
     for points in (new.point.positions.numpy(), np.asarray(old.points)):
         off = 1e3 * (points - hits)
         print(f"{o3d.__version__}: {added} px more: points are off by x {off[:, 0].mean():.2f}, y {off[:, 1].mean():.2f}, z {off[:, 2].mean():.2f} mm")
-        assert np.allclose(off, [expected, expected, 0.0], atol=1e-3)
+        assert np.allclose(off, [expected, expected, 0.0], atol=0.01)  # single precision at 1 m
 PYTHON

@@ -78,13 +78,23 @@ def capture_rows(path: Path, text: str, side: str, whose: str | None) -> Program
     rows = [(line, cells) for line, cells in read if cells]
     if not rows:
         raise InputError(f"{said}: none of its {len(read)} frames has a pose of the body")
-    note = f"{path}: read as {program}'s, lengths in {export.unit}"
-    if len(rows) < len(read):
-        note += f"; the body is in {len(rows)} of {len(read)} frames, the others are left out"
-    if damaged := [str(line) for line, cells in read if cells is None]:
-        more = f" and {len(damaged) - _LISTED} more" if len(damaged) > _LISTED else ""
-        note += f"; damaged: line {', '.join(damaged[:_LISTED])}{more}"
+    note = f"{path}: read as {program}'s, lengths in {export.unit}{_left_out(read)}"
     return ProgramPoints(["t_s", *_POSITION, *rotation], rows, None, (note,))
+
+
+def _left_out(read: list[tuple[int, list[str] | None]]) -> str:
+    """Return how many frames lack the body, and which lines are damaged, for a note."""
+    seen, damaged, text = (
+        sum(bool(cells) for _, cells in read),
+        [str(line) for line, cells in read if cells is None],
+        "",
+    )
+    if seen < len(read):
+        text = f"; the body is in {seen} of {len(read)} frames, the others are left out"
+    if damaged:
+        more = f" and {len(damaged) - _LISTED} more" if len(damaged) > _LISTED else ""
+        text += f"; damaged: line {', '.join(damaged[:_LISTED])}{more}"
+    return text
 
 
 def _pose(row: list[str], columns: list[int], unit_m: float, rate_hz: float | None) -> list[str] | None:
