@@ -170,3 +170,9 @@ def test_joints_of_a_model_whose_names_end_in_joint(tmp_path):
     np.testing.assert_allclose(read(["pan", *whole[1:]], "shoulder_pan_joint=pan"), q)
     with pytest.raises(InputError, match=r"column 'shoulder_pan_jont' is not known: is it shoulder_pan_joint\?"):
         read(["shoulder_pan_jont", *whole[1:]])
+
+
+def test_a_long_run_of_digits_that_is_no_number_is_read_once():
+    # Where parts of a pattern may share digits, this takes an hour of processor time.
+    assert number("1" * 1_000_000 + "x") is None
+    assert [number(text) for text in ("12.", ".5", "1.5D-3", "\u22122")] == [12.0, 0.5, 0.0015, -2.0]

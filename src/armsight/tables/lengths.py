@@ -79,7 +79,7 @@ def metric(length_m: float) -> str:
 
 
 #: A number in a pattern; Fortran's 1D-3 and the minus of a typesetter among them.
-NUMBER = r"[+\-\u2212]?(?:\d+\.?\d*|\.\d+)(?:[eEdD][+\-\u2212]?\d+)?"
+NUMBER = r"[+\-\u2212]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eEdD][+\-\u2212]?\d+)?"
 _NUMBER = re.compile(NUMBER)
 
 
