@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 from armsight.errors import InputError
 from armsight.tables.lengths import number
+from armsight.tables.nested import PREFIX
 from armsight.tables.programs import ProgramPoints
 
 #: The line with the names of the columns.
@@ -49,7 +50,7 @@ class _Export(NamedTuple):
 def capture_rows(path: Path, text: str, side: str, whose: str | None) -> ProgramPoints | None:
     """Return the times and poses of a rigid body; None where the text is no such export.
 
-    Frames that lack it are left out, and so are lines that are damaged; a note names these.
+    Frames that lack it have a status, as the shots of ``armsight measure``; lines that are damaged are left out, and named.
 
     ``whose``: the name of the body; None: the only one. ``side``: "robot" or "seen", for the option in messages.
 
@@ -65,7 +66,7 @@ def capture_rows(path: Path, text: str, side: str, whose: str | None) -> Program
         raise InputError(f"{said} without the poses of a rigid body: {_ADVICE[program]}")
     first = next(iter(bodies))
     if (name := whose or (first if len(bodies) == 1 else "")) not in bodies:
-        option = f"--columns {'' if side == 'robot' else 'seen:'}pose={first}"
+        option = f"--columns {PREFIX[side]}pose={first}"
         raise InputError(f"{said} with the poses of {', '.join(bodies)}: say which, {option}")
     at = bodies[name]
     rotation = next((names for names in (_QUATERNION, _MATRIX) if set(names) <= set(at)), None)
@@ -75,22 +76,17 @@ def capture_rows(path: Path, text: str, side: str, whose: str | None) -> Program
         raise InputError(f"{said} with lengths in {export.unit!r}; known are {', '.join(_UNITS_M)}")
     columns = [at[name] for name in (*_POSITION, *rotation)]
     read = [(line, _pose(row, columns, unit_m, export.rate_hz)) for line, row in export.frames]
-    rows = [(line, cells) for line, cells in read if cells]
-    if not rows:
+    rows = [(line, [f"line {line}", *cells]) for line, cells in read if cells]
+    if not any("ok" in cells for _, cells in rows):
         raise InputError(f"{said}: none of its {len(read)} frames has a pose of the body")
     note = f"{path}: read as {program}'s, lengths in {export.unit}{_left_out(read)}"
-    return ProgramPoints(["t_s", *_POSITION, *rotation], rows, None, (note,))
+    return ProgramPoints(["shot", "status", "reason", "t_s", *_POSITION, *rotation], rows, None, (note,))
 
 
 def _left_out(read: list[tuple[int, list[str] | None]]) -> str:
-    """Return how many frames lack the body, and which lines are damaged, for a note."""
-    seen, damaged, text = (
-        sum(bool(cells) for _, cells in read),
-        [str(line) for line, cells in read if cells is None],
-        "",
-    )
-    if seen < len(read):
-        text = f"; the body is in {seen} of {len(read)} frames, the others are left out"
+    """Return in how many frames the body is, and which lines are damaged, for a note."""
+    seen, damaged = sum("ok" in (cells or ()) for _, cells in read), [str(line) for line, cells in read if not cells]
+    text = f"; the body is in {seen} of {len(read)} frames" if seen < len(read) else ""
     if damaged:
         more = f" and {len(damaged) - _LISTED} more" if len(damaged) > _LISTED else ""
         text += f"; damaged: line {', '.join(damaged[:_LISTED])}{more}"
@@ -98,16 +94,16 @@ def _left_out(read: list[tuple[int, list[str] | None]]) -> str:
 
 
 def _pose(row: list[str], columns: list[int], unit_m: float, rate_hz: float | None) -> list[str] | None:
-    """Return a frame's time, position, m, and rotation; [] where the body was not seen, None where the line is damaged."""
+    """Return a frame's status, reason, time, position, m, and rotation; None where the line is damaged."""
     cells = [row[k] if k < len(row) else "" for k in columns]
     seen = [cell for cell in cells if cell.lower() not in _NONE]
     found = [value for cell in (*row[:2], *seen) if (value := number(cell)) is not None and math.isfinite(value)]
     if len(found) < 2 + len(seen):
         return None
-    if len(seen) < len(cells) or not any(found[5:]):
-        return []
     t_s = found[1] if rate_hz is None else found[0] / rate_hz
-    return [repr(t_s), *(repr(unit_m * value) for value in found[2:5]), *cells[3:]]
+    if len(seen) < len(cells) or not any(found[5:]):
+        return ["missed", "the body was not seen", repr(t_s), *[""] * len(cells)]
+    return ["ok", "", repr(t_s), *(repr(unit_m * value) for value in found[2:5]), *cells[3:]]
 
 
 def _export(path: Path, text: str) -> _Export | None:

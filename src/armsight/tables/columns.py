@@ -11,6 +11,7 @@ import itertools
 import math
 import re
 import sys
+from collections import Counter
 from collections.abc import Container, Generator, Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
@@ -367,13 +368,16 @@ class Columns:
             return None
         self.used.add(key)
         found = tuple(row[self.at[key]] for _, row in self.rows)
-        twice = next((name for name in found if found.count(name) > 1), None)
+        twice = next((name for name, count in Counter(found).items() if count > 1), None)
         if twice is not None:
             raise InputError(f"{self.path}: {key} {twice!r} names two rows; a row belongs to one image")
         return found
 
-    def rotations(self, rotation: str | None) -> tuple[Array, Array, str, Array]:
-        """Return the rotations (N, 3, 3), the numbers they come from, degrees, their convention, and them as written."""
+    def rotations(self, rotation: str | None, prefix: str = "") -> tuple[Array, Array, str, Array]:
+        """Return the rotations (N, 3, 3), the numbers they come from, degrees, their convention, and them as written.
+
+        ``prefix``: what stands before what ``--columns`` says of this table: "" or "seen:".
+        """
         if "r11" in self.at:
             R = self.numbers([f"r{i}{j}" for i in "123" for j in "123"]).reshape(-1, 3, 3)
             return self._checked(R), np.zeros((len(R), 0)), "", np.zeros((len(R), 0))
@@ -381,18 +385,18 @@ class Columns:
             found = written = self.numbers(["qw", "qx", "qy", "qz"])
             convention = "wxyz"
         elif "n4" in self.at:
-            found, convention = self._quaternions(rotation)
+            found, convention = self._quaternions(rotation, prefix)
             written = found
         else:
-            found, convention, written = self._angles(rotation)
+            found, convention, written = self._angles(rotation, prefix)
         return self._checked(rotations_by(found, convention, self.path)), found, convention, written
 
-    def _quaternions(self, rotation: str | None) -> tuple[Array, str]:
+    def _quaternions(self, rotation: str | None, prefix: str) -> tuple[Array, str]:
         """Return four numbers (N, 4) without names, and their convention; reject those that stand before the position."""
         if rotation not in ("wxyz", "xyzw"):
             raise InputError(
                 f"{self.path}: which of the four numbers of a quaternion is w? "
-                "give --columns rotation=wxyz or rotation=xyzw"
+                f"give --columns {prefix}rotation=wxyz or {prefix}rotation=xyzw"
             )
         last, first = self.numbers(["n1", "n2", "n3", "n4"]), self.numbers([*"xyz", "n1"])
         off, other = (float(np.abs(np.linalg.norm(four, axis=1) - 1).max()) for four in (last, first))
@@ -403,7 +407,7 @@ class Columns:
             )
         return last, rotation
 
-    def _angles(self, rotation: str | None) -> tuple[Array, str, Array]:
+    def _angles(self, rotation: str | None, prefix: str) -> tuple[Array, str, Array]:
         """Return three numbers of a rotation (N, 3), degrees, their convention, and them as written."""
         unit = next((u for u in ("_rad", "_deg", "") if f"rx{u}" in self.at), None)
         names = ["n1", "n2", "n3"] if "n1" in self.at else [f"r{axis}{unit}" for axis in "xyz"]
@@ -416,8 +420,8 @@ class Columns:
         convention = rotation or ("rotvec" if unit == "_rad" else None)
         if convention is None or convention in ("wxyz", "xyzw"):
             raise InputError(
-                f"{self.path}: what do the three numbers of a rotation mean? give --columns rotation=rotvec, or the order "
-                "of the angles: xyz (about fixed axes), XYZ (about the rotated axes), zyx ..."
+                f"{self.path}: what do the three numbers of a rotation mean? give --columns {prefix}rotation=rotvec, or "
+                "the order of the angles: xyz (about fixed axes), XYZ (about the rotated axes), zyx ..."
             )
         if unit == "_rad" and np.abs(found).max() > MOST_RAD:
             row, column = np.unravel_index(int(np.abs(found).argmax()), found.shape)

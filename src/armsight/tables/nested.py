@@ -22,6 +22,7 @@ from armsight.tables.document import documents_in, matrix_of
 
 Record: TypeAlias = dict[str, str]
 #: Words in the names of poses that say whose they are.
+PREFIX = {"robot": "", "seen": "seen:"}  #: what stands before what ``--columns`` says of a side
 SIDES = {
     "robot": re.compile("robot|hand|gripper|effector|eef|flange|tcp|arm|wrist|o_t_ee|end"),
     "seen": re.compile("track|target|marker|object|board|optical|sensor|camera|cam|tag|pattern|calib"),
@@ -314,8 +315,7 @@ def _chosen(path: Path, names: list[str], side: str, whose: str | None) -> str:
     best = [name for name in names if scores[name] == max(scores.values())]
     if (len(best) == 1 and scores[best[0]] > 0) or (len(names) == 2 and len(best) == 1):
         return best[0]
-    option = "--columns pose=" if side == "robot" else "--columns seen:pose="
-    raise InputError(f"{path}: holds poses of {', '.join(names)}: say which, {option}{names[0]}")
+    raise InputError(f"{path}: holds poses of {', '.join(names)}: say which, --columns {PREFIX[side]}pose={names[0]}")
 
 
 def _score(name: str, side: str) -> int:

@@ -25,6 +25,7 @@ from armsight.geometry.pose import pose
 from armsight.tables.cells import Cells, Renames, Rows, read_cells, read_columns
 from armsight.tables.columns import COLUMNS, UNITLESS, Columns, degree_columns, joint_columns, understood
 from armsight.tables.lengths import REACH, UNITS_M
+from armsight.tables.nested import PREFIX
 from armsight.tables.rotations import CONVENTIONS
 
 #: Lengths beyond this, m, are no robot's: they are mm; below the other, all of them, they are m taken for mm.
@@ -84,6 +85,7 @@ def read_pose_table(
     arm: ArmJoints | None = None,
     only_joints: bool = False,
     side: str = "robot",
+    keep_missed: bool = False,
 ) -> PoseTable:
     """Read a table of poses.
 
@@ -98,12 +100,14 @@ def read_pose_table(
         arm: the model whose joints the table has.
         only_joints: whether positions are passed over: the poses are then those of the joints.
         side: "robot" or "seen": whose poses are read where a file holds both.
+        keep_missed: whether rows without a pose stay, marked by ``missed``, so that rows of another table fit; else they
+            are left out, with a note.
 
     Raises:
         InputError: the file, the line and what was expected.
     """
     path = Path(path)
-    table, rotation, notes, missed = _table(path, rotation, unit, columns, arm, side)
+    table, rotation, notes, missed = _table(path, rotation, unit, columns, arm, side, keep_missed)
     names = table.joint_names(*((len(arm.joint_names), arm.name) if arm is not None else (None, "")))
     q = table.joints(names) if names else None
     if only_joints and q is None:
@@ -115,7 +119,7 @@ def read_pose_table(
     if q is None or (table.at.keys() & {"x", "x_m", "x_mm"} and not (only_joints and arm is not None)):
         p, unit_m, found_out = _positions(table, unit, detect_units, side)
         notes = (*notes, *found_out)
-        R, numbers, convention, written = table.rotations(rotation)
+        R, numbers, convention, written = table.rotations(rotation, PREFIX[side])
         written = np.hstack([p / unit_m, written]) if written.shape[1] else written
         Ts = pose(R, p)
     elif arm is None:
@@ -139,7 +143,13 @@ def read_pose_table(
 
 
 def _table(
-    path: Path, rotation: str | None, unit: str | None, columns: Renames | None, arm: ArmJoints | None, side: str
+    path: Path,
+    rotation: str | None,
+    unit: str | None,
+    columns: Renames | None,
+    arm: ArmJoints | None,
+    side: str,
+    keep_missed: bool,
 ) -> tuple[Columns, str | None, tuple[str, ...], tuple[str, ...]]:
     """Return the columns of a file, the convention of its rotations, notes, and why rows of it have no pose."""
     if rotation is not None and rotation not in CONVENTIONS:
@@ -154,7 +164,13 @@ def _table(
     if not set(table.at) >= _MEASURED:
         return table, rotation, notes, ("",) * len(table.rows)
     rows, missed = _shown(path, table.head, table.rows)
-    return Columns(path, table.head, rows, table.links, table.given), rotation, notes, missed
+    if not keep_missed and any(missed):
+        notes = (*notes, f"{path}: {sum(map(bool, missed))} of {len(rows)} rows have no pose, and are left out")
+        rows = [row for row, why in zip(rows, missed, strict=True) if not why]
+        missed = ("",) * len(rows)
+    table = Columns(path, table.head, rows, table.links, table.given)
+    table.used |= {"status", "reason"}
+    return table, rotation, notes, missed
 
 
 def columns_in(
@@ -199,7 +215,7 @@ def _notes_of_lists(
 
 def _positions(table: Columns, unit: str | None, detect: bool, side: str) -> tuple[Array, float, tuple[str, ...]]:
     """Return positions (N, 3), m, the unit they were read in, and notes."""
-    suffix, option = _suffix(table), f"--columns {'' if side == 'robot' else 'seen:'}"
+    suffix, option = _suffix(table), f"--columns {PREFIX[side]}"
     p = table.numbers([f"{axis}{suffix}" for axis in "xyz"])
     given = suffix[1:] or unit
     unit_m = 1e-3 if given == "mm" else 1.0
@@ -252,5 +268,5 @@ def _or_else(table: Columns, far: float, side: str) -> str:
         return said
     if not NEAR_M < np.linalg.norm(table.numbers(["n1", "n2", "n3"]), axis=1).max() < FAR_M:
         return said
-    option = f"--columns {'' if side == 'robot' else 'seen:'}rx,ry,rz,x,y,z"
+    option = f"--columns {PREFIX[side]}rx,ry,rz,x,y,z"
     return f"{said}; or are they degrees, and the rotation comes before the position? then {option}"

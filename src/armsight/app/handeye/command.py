@@ -175,6 +175,7 @@ def _table(options: Options, side: str, arm: Arm | None = None) -> PoseTable:
         columns=said.columns,
         arm=arm,
         side=side,
+        keep_missed=side == "seen",
     )
 
 
