@@ -11,6 +11,8 @@ from armsight.app.live.body import scaled_spec
 from armsight.app.live.server import LiveServer
 from armsight.app.live.session import LiveSession
 from armsight.app.live.step import SessionOptions
+from armsight.app.show.page import html_page
+from armsight.app.show.table import TextTable, html_table
 from armsight.errors import InputError
 from armsight.files import read_table
 from armsight.sim.workcell import person
@@ -249,3 +251,21 @@ def test_the_arm_is_held_when_the_page_that_commands_is_closed(session, server, 
     assert "--board emulated:unicorn --rig" in session.arm.state.command  # as it can be typed
     until(lambda: (session.folder / "run" / "summary.json").exists())
     assert (session.folder / "run" / "run.mcap").stat().st_size > 10000
+
+
+def test_no_table_of_a_report_is_cut_on_a_phone(browsers, tmp_path):
+    columns = ("cause", "mm", "95 %, from to", "left by the remedy, mm", "remedy")
+    cells = ("a cause of many words", "1480.45 \u00b1 3.56", "0.510 to 17.729", "not determined", "a remedy in words")
+    html = html_table(TextTable("a table", columns, (cells,) * 3))
+    (tmp_path / "report.html").write_text(html_page("a page", "a page", "", {"a": ("a", html)}), encoding="utf-8")
+    page = browsers("about:blank")
+    for width, named in ((390, f'"{columns[1]}"'), (1280, "none")):
+        size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": True}
+        page.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+        page.get(f"file://{tmp_path}/report.html")
+        cells = "return [...document.querySelectorAll('table, td, th')]"
+        wide = cells + ".filter(e => e.scrollWidth > e.clientWidth + 1).length"
+        shown = "return getComputedStyle(document.querySelector('td'), '::before').content"
+        assert page.execute_script(wide) == 0
+        assert page.execute_script("return document.documentElement.scrollWidth") <= width
+        assert page.execute_script(shown) == named

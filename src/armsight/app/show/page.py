@@ -53,22 +53,17 @@ summary { cursor: pointer; color: var(--link); margin: .6rem 0; }
 figure { margin: 0 0 1rem; } figure img { width: 100%; height: auto; display: block; background: #fff; }
 figcaption { background: var(--soft); padding: .6rem 1.1rem; margin-top: .6rem; font-size: .95rem; }
 figcaption p { margin: .3rem 0; }
-@media screen and (max-width: 48rem) { table { display: block; overflow-x: auto; font-size: .85rem;
-    background: linear-gradient(to left, var(--back) 50%, transparent) right / 2rem 100% no-repeat local,
-    linear-gradient(to left, var(--line), transparent) right / .8rem 100% no-repeat scroll; }  /* more to the right */
-  th, td { overflow-wrap: break-word; padding-right: .7rem; } td:not(.number) { min-width: 7rem; }
-  thead th:not(:empty) { min-width: 5rem; }
-  td:last-child:not(.number):not(:empty) { min-width: 20rem; }
-  table.provenance td { min-width: 0 !important; overflow-wrap: anywhere; } table.headline { font-size: .78rem; }
-  table.headline tr { display: flex; flex-wrap: wrap; } table.headline tr > * { border: 0; flex: 1; min-width: 0;
-    overflow-wrap: normal; } table.headline tr > :first-child { flex: 1.4; }
-  table.headline tbody tr { border-bottom: 1px solid var(--line); } table.headline td:last-child { flex-basis: 100%; }
-  table.headline thead th:last-child { display: none; }
+@media screen and (max-width: 48rem) {  /* a row is a card: its name, and below it each value under its column's */
+  thead { display: none; } table, tbody { display: block; } table, table.headline { font-size: .85rem; }
+  tr { display: grid; grid-template-columns: repeat(auto-fill, minmax(6.2rem, 1fr)); gap: .2rem .7rem; padding: .45rem 0;
+    align-items: end; border-bottom: 1px solid var(--line); }
+  tr > * { border: 0; padding: 0; min-width: 0 !important; white-space: normal !important; } td:empty { display: none; }
+  td::before { content: attr(data-column); display: block; color: var(--muted); font-size: .78rem; }
+  tbody th, td:last-child:not(.number) { grid-column: 1 / -1; }
   figure::before { content: "Swipe it: it is wider than the screen."; position: sticky; left: 0; font-size: .85rem;
     color: var(--muted); }
   figure { overflow-x: auto; } figure img { width: 46rem; max-width: none; }  /* its letters stay readable: it scrolls */
-  .zoom { width: 46rem; touch-action: pan-x pan-y !important; } figcaption { position: sticky; left: 0; }
-  table.numbers tbody th, table.headline th { white-space: normal; } }
+  .zoom { width: 46rem; touch-action: pan-x pan-y !important; } figcaption { position: sticky; left: 0; } }
 @media print { body { max-width: none; padding: 0; } nav { display: none; }
   table, table.headline { font-size: .7rem; } table.headline th { white-space: normal; overflow-wrap: normal; }
   th, td { padding: .25rem .5rem .25rem 0; } figure { break-inside: avoid; }
@@ -82,17 +77,18 @@ def text(value: object) -> str:
     return html.escape(plain(str(value), most=2000))
 
 
-def _cell(content: str) -> str:
-    """Return a cell; a number, with its sigma perhaps, stays in one line."""
-    if _NUMBER.fullmatch(content):
-        return f'<td class="number">{content}</td>'
-    return f"<td>{content.replace(PLUS_MINUS, NEVER_APART)}</td>"
+def _cell(column: str, content: str) -> str:
+    """Return a cell of a column; a number, with its sigma perhaps, stays in one line where there is room."""
+    kind = ' class="number"' if _NUMBER.fullmatch(content) else ""
+    return f'<td data-column="{column}"{kind}>{content.replace(PLUS_MINUS, NEVER_APART)}</td>'
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "") -> str:
-    """Return an HTML table."""
+    """Return an HTML table; ``head`` is plain text, escaped."""
     top = "".join(f'<th scope="col">{cell}</th>' for cell in head)
-    body = "".join(f'<tr><th scope="row">{first}</th>' + "".join(map(_cell, rest)) + "</tr>\n" for first, *rest in rows)
+    body = "".join(
+        f'<tr><th scope="row">{first}</th>' + "".join(map(_cell, head[1:], rest)) + "</tr>\n" for first, *rest in rows
+    )
     return f'<table class="{kind}"><thead><tr>{top}</tr></thead>\n<tbody>\n{body}</tbody></table>\n'
 
 
