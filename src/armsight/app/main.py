@@ -38,7 +38,7 @@ SECTIONS: dict[str, dict[str, str]] = {
         "body": "Check a body file's geometry before the body is built, and print its markers to scale.",
         "replay": "Measure and estimate again what was recorded, also with another rig, body, arm or estimator.",
         "export": "Write the tables of a run or a recording in another form: CSV, Parquet, MCAP, TUM or a ROS 2 bag.",
-        "references": "Check and calibrate inertial units and magnetometers, named in a file references.toml.",
+        "references": "Check and calibrate inertial units, magnetometers and ranges, named in a file references.toml.",
         "batch": "Measure many recordings, on all cores or on a cluster; started again it goes on where it was.",
         "serve": "Keep `armsight measure` going for days.",
         "hub": "Show many cells on one page, first the one that needs a look; keep their events and history.",

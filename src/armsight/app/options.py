@@ -133,7 +133,7 @@ STREAM = option(
     callback=_checked,
 )
 REFERENCES = option(
-    "Fuse an inertial unit, or compare a magnetometer (docs/howto/references.md).", metavar="REFERENCES.toml"
+    "Fuse an inertial unit or a range, or compare a magnetometer (docs/howto/references.md).", metavar="REFERENCES.toml"
 )
 FIXED = option(
     "A body in view that does not move; may be repeated. It shows cameras that move.", "--fixed", metavar="BODY"

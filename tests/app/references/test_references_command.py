@@ -17,6 +17,7 @@ from armsight.loop.references.heading import Magnetometer
 from armsight.loop.references.inertial import Inertial
 from armsight.loop.references.reference import ToolMotion
 from armsight.robot.arm_file import open_arm
+from armsight.sim.references.distance import DrawWire
 from armsight.sim.references.heading import MagneticUnit
 from cli_runs import hold_keys, run, said_of
 
@@ -116,7 +117,7 @@ def test_a_sweep_that_rotates_the_tool_little_is_said(sweep, capsys, monkeypatch
 @pytest.mark.parametrize(
     ("toml", "change", "said"),
     [
-        ("[imu]\nkind = 'compass'", None, r"\[imu\]: kind is 'compass'; known are inertial, magnetometer"),
+        ("[imu]\nkind = 'compass'", None, r"\[imu\]: kind is 'compass'; known are inertial, magnetometer, range"),
         ("[imu]\nkind = 'inertial'\nrate = 3", None, r"\[imu\]: unknown key 'rate'; known are kind, source"),
         ("[imu]\nkind = 'inertial'\nclass = 'best'", None, "no class of inertial units 'best'; there are icm-42688"),
         ("[m]\nkind = 'magnetometer'\nclass = 'phone'", None, r"\[m\]: class is of an inertial unit"),
@@ -212,7 +213,7 @@ def test_a_magnetometer_is_checked_and_calibrated_and_other_units_are_named(caps
     assert "as if in uT" in said.err
     said = said_of(capsys, "references", "gravity", tmp_path / "out.toml", "--model", "six_r", "--joints", "none.csv")
     assert said.code == 2
-    assert "out.toml: [m]: is a magnetometer" in said.err
+    assert "out.toml: [m]: is no inertial unit" in said.err
     rest = np.column_stack([t_s, np.mean(z, axis=0) + rng.normal(0.0, 4e-7, z.shape) + 1e-7 * t_s[:, None]])
     np.savetxt(tmp_path / "field.csv", rest, "%.9g", ",", header=head, comments="")
     said = said_of(capsys, "references", "check", tmp_path / "field.toml", "--json", kind="magnetometer").lines[0]
@@ -220,3 +221,57 @@ def test_a_magnetometer_is_checked_and_calibrated_and_other_units_are_named(caps
     assert found["noise_t"] == pytest.approx([4e-7] * 3, rel=0.1)  # not what it drifts by in 30 s
     assert found["drift_t"] == pytest.approx([2.25e-6] * 3, rel=0.1)
     assert "it drifts by 2.3 uT at rest" in said["weak"][0]
+
+
+def test_a_range_is_checked_and_calibrated_and_what_is_wrong_with_it_is_named(capsys, tmp_path):
+    """A draw-wire 80 mm beside the tool's origin, which hangs and hooks, on an eccentric drum."""
+    t, rng = np.arange(0.0, 30.0, 0.02), np.random.default_rng(131)
+    Ts = np.array([pose(at) for at in t])
+    carried = Ts.copy()
+    carried[:, :3, 3] += Ts[:, :3, :3] @ [0.0, 0.05, 0.06]
+    wires = [DrawWire(rng, 50.0) for _ in range(2)]
+    (t_s, z), (_, other) = (wire.read(t, carried) for wire in wires)
+    still = z.copy()
+    still[500:900] = z[500]
+    hooked = z + np.where((t_s > 12.0) & (t_s < 14.0), 0.005, 0.0)[:, None]
+    tables = {"wire": z, "other": other, "mm": 1e3 * z, "still": still, "hooked": hooked, "falls": 2.0 - z}
+    for name, values in tables.items():
+        rows = np.column_stack([t_s, values])
+        np.savetxt(tmp_path / f"{name}.csv", rows, "%.9g", ",", header="t_s,range_m", comments="")
+        (tmp_path / f"{name}.toml").write_text(f'[{name}]\nkind = "range"\nsource = "{name}.csv"\nrate_hz = 50.0\n')
+    for name, flat in (("poses", 1.0), ("plane", 0.0)):
+        rows = np.column_stack([t, Ts[:, :3, 3] * [1.0, 1.0, flat], quaternion_wxyz(Ts[:, :3, :3])])
+        head = "t_s,x_m,y_m,z_m,qw,qx,qy,qz"
+        np.savetxt(tmp_path / f"{name}.csv", rows, "%.9f", ",", header=head, comments="")
+
+    def calibrate(name, poses="poses", **others):
+        given = "--poses", tmp_path / f"{poses}.csv", *(part for each in others.items() for part in each)
+        return said_of(capsys, "references", "calibrate", tmp_path / f"{name}.toml", *given, "--json", kind="range")
+
+    assert said_of(capsys, "references", "check", tmp_path / "wire.toml", "--json", kind="range").code == 0
+    for name in ("wire", "other"):
+        said = calibrate(name, **{"-o": tmp_path / f"{name}_found.toml"}).done()
+        (found,) = said.lines[0]["references"]
+        assert found["left_out_rms"]["range_m"] < 2e-4
+        assert found["left_out_over_sigma"] == pytest.approx(1.0, abs=0.3)
+        (entry,) = read_references(tmp_path / f"{name}_found.toml")
+        assert 8e-5 < entry.noise_m < 3e-4
+        off = entry.reference.anchors[0] - wires[name == "other"]._anchor
+        assert np.linalg.norm(off) < 2e-3
+    assert run("references", "check", tmp_path / "wire_found.toml") == 0
+    both = "".join((tmp_path / f"{name}_found.toml").read_text() for name in ("wire", "other"))
+    swapped = both.replace("wire.csv", "that.csv").replace("other.csv", "wire.csv").replace("that.csv", "other.csv")
+    (tmp_path / "swapped.toml").write_text(swapped)
+    assert "12.1 to 13.9 s" in calibrate("hooked").done().lines[0]["weak"][0]
+    for given, text in (
+        (("swapped",), "[wire]: its readings fit the anchor of"),
+        (("mm",), "while the tool moves by 0.92 m: give m, not mm"),
+        (("still",), "stands still from 10.10 to 17.90 s"),
+        (("falls",), "fall as the tool moves away"),
+        (("wire", "plane"), "wire: the tool moves in a plane"),
+    ):
+        said = calibrate(*given)
+        assert said.code == 2
+        assert text in said.err
+    said = said_of(capsys, "references", "check", tmp_path / "mm.toml")
+    assert (said.code, "as if in mm; give m" in said.err) == (2, True)

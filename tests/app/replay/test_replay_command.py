@@ -271,6 +271,39 @@ def test_a_magnetometer_is_recorded_and_compared_and_says_nothing_where_it_canno
         assert_rejected(beside(scale * z), "[compass]", "give T, not uT, mG or gauss")
 
 
+def test_a_range_is_fused_and_recorded_and_said_to_agree_or_not(armsight, run, tmp_path):
+    from armsight.loop.references.distance import Distance
+    from armsight.loop.references.file import Entry, read_recording, written
+    from armsight.loop.references.reference import ToolMotion
+    from armsight.vision.sources.bag import Bag
+
+    t_s, rng = 0.02 * np.arange(1, 36), np.random.default_rng(3)
+    known = replace(Distance.of("wire").moved(np.r_[0, 0, 0.1, 0.5, 0.4, 1.0, 0.02, 0]), cov=np.diag(np.full(8, 1e-10)))
+    Ts = ARM.forward(ARM.home + 0.3 * np.sin(t_s)[:, None] * np.linspace(0.5, 1, 6))
+    z = np.array([known.expected(ToolMotion(T), 0).z for T in Ts]) + rng.normal(0.0, 1e-4, (len(t_s), 1))
+    table, file = tmp_path / "wire.csv", tmp_path / "references.toml"
+    text = written(Entry(known, "mpu-6050", table, None, None, True, noise_m=1e-4), tmp_path)
+    file.write_text(text)
+    made(tmp_path, text, (t_s, z))
+    assert armsight("replay", tmp_path, "--json").done().lines[0]["same"] is True
+    (message, *_) = Bag(tmp_path / "run.mcap").messages(["/range"])
+    assert message.decode().range == np.float32(z[0, 0])
+    values = read_recording(tmp_path / "run.mcap", Distance)[1]
+    np.testing.assert_allclose(values, z[: len(values)], atol=1e-6)
+
+    def beside(ranges):
+        np.savetxt(table, np.column_stack([t_s, ranges]), delimiter=",", header="t_s,range_m", comments="")
+        return armsight("replay", run, "--references", file, "--json", kind="range")
+
+    answer = beside(z).lines[0]["reference"]
+    assert answer["agrees"] is True
+    assert answer["sigma_rms_m"] < answer["sigma_without_rms_m"]
+    assert beside(z + 0.05).lines[0]["reference"]["agrees"] is False
+    answer = beside(z[np.minimum(np.arange(len(z)), 12)]).lines[0]["reference"]
+    assert "stood still while the tool moved" in answer["losses"][0]
+    assert_rejected(beside(1e3 * z), "[wire]", "give m, not mm")
+
+
 def test_what_a_run_does_not_hold_is_named(armsight, run, tmp_path):
     assert_rejected(armsight("replay", run, "--rig", "r.json"), "needs the images of every shot")
     assert_rejected(armsight("replay", tmp_path), "give --target")

@@ -32,20 +32,25 @@ SMALL_DEG = 60.0
 DELAY_S = 0.5
 #: Errors left out over their sigma up to which it is good; half: chance is a fault, double: looseness is none.
 HONEST = 1.5
-#: A field that drifts by more at rest, T, is said: 3 degrees of heading in Europe; half, double: so much of it.
-DRIFT_T = 1e-6
+#: What is said of others at rest, unit and its scale, and what drifts by more: a field, T, by 3 degrees of heading in
+#: Europe, a range, m; half, double: so much of it.
+RESTS = {"field": ("uT", 1e6, 1e-6, "motors near"), "range": ("mm", 1e3, 5e-4, "a wire that slips")}
+#: Times that are off are so many at most in a line.
+SPELLS = 5
+#: Readings that are off by less than this share with another's anchor are its; half: swapped anchors that are near pass.
+SWAPPED = 0.3
 #: Units of the Allan deviation's coefficients, in keys of JSON.
 ALLAN = {
     "gyro": ("rad", "rad_per_sqrt_s", "rad_s", "rad_s_per_sqrt_s", "rad_s2"),
     "accelerometer": ("m_s", "m_s_per_sqrt_s", "m_s2", "m_s2_per_sqrt_s", "m_s3"),
 }
 #: Channels: their unit, and the least noise of a mean in it, below any chip's; half, double: nothing.
-CHANNELS = {"gyro": ("rad/s", 1e-6), "accelerometer": ("m/s2", 1e-6), "field": ("T", 1e-8)}
+CHANNELS = {"gyro": ("rad/s", 1e-6), "accelerometer": ("m/s2", 1e-6), "field": ("T", 1e-8), "range": ("m", 1e-6)}
 
 
 @click.group("references")
 def command() -> None:
-    """Check and calibrate inertial units and magnetometers, named in a file references.toml."""
+    """Check and calibrate inertial units, magnetometers and ranges, named in a file references.toml."""
 
 
 @command.command()
@@ -65,7 +70,7 @@ def calibrate(
     output: Path | None = out("OUT.toml", "Where to write the result."),
     as_json: bool = JSON,
 ) -> None:
-    """Find mounting, biases, scales, iron and delay from one sweep with poses by vision or by the arm."""
+    """Find mounting, biases, scales, iron, anchor and delay from one sweep with poses by vision or by the arm."""
     from armsight.files import check_writable, write_text
     from armsight.loop.references.file import read_references, written
 
@@ -107,7 +112,7 @@ def _gravity(entry: Entry, model: str, joints: Path) -> Report:
     from armsight.tables.poses import read_pose_table
 
     if not isinstance(unit := entry.reference, Inertial):
-        raise InputError(f"{entry.where}: is a magnetometer; gravity is felt by an inertial unit")
+        raise InputError(f"{entry.where}: is no inertial unit, which alone feels gravity")
     arm = open_arm(model)
     table = read_pose_table(joints, arm=arm, only_joints=True)
     if table.t_s is None or table.q is None:
@@ -205,8 +210,9 @@ def _check(entry: Entry) -> tuple[dict[str, Any], list[str], list[str]]:
     import numpy as np
 
     from armsight.errors import InputError
+    from armsight.loop.references.distance import MOST_M, Distance
     from armsight.loop.references.file import COLUMNS
-    from armsight.loop.references.heading import check_unit
+    from armsight.loop.references.heading import Magnetometer, check_unit
     from armsight.loop.references.inertial import Inertial
     from armsight.loop.references.reference import STANDARD_GRAVITY_M_S2
     from armsight.loop.references.stream import allan, check_stream, settling
@@ -224,8 +230,10 @@ def _check(entry: Entry) -> tuple[dict[str, Any], list[str], list[str]]:
         if entry.rate_hz is not None and abs(stream.rate_hz * scale / entry.rate_hz - 1) <= RATE:
             raise InputError(f"{source}: the rate is {stream.rate_hz:.4g} Hz, as if t_s were in {unit}; give s")
     weak = _weak_stream(entry, stream, values["saturated"])
-    if not isinstance(entry.reference, Inertial):
+    if isinstance(entry.reference, Magnetometer):
         check_unit(str(source), z)
+    if isinstance(entry.reference, Distance) and not np.median(np.abs(z)) < MOST_M:
+        raise InputError(f"{source}: ranges are {np.median(np.abs(z)):.3g}, as if in mm; give m")
     rest = z[stream.rest]
     values["rest_s"] = len(rest) / stream.rate_hz
     if not len(rest):
@@ -234,13 +242,13 @@ def _check(entry: Entry) -> tuple[dict[str, Any], list[str], list[str]]:
     if not isinstance(entry.reference, Inertial):
         _, variance, _ = allan(rest, 1.0 / stream.rate_hz)  # of single readings: without what drifts
         drifts = np.abs(rest[-len(rest) // 4 :].mean(axis=0) - rest[: len(rest) // 4].mean(axis=0))
-        values |= {"noise_t": np.sqrt(variance[0]), "drift_t": drifts}
-        drifted = f"{1e6 * drifts.max():.2g} uT at rest"
-        lines.append(
-            f"{name}: noise {1e6 * values['noise_t'].max():.2g} uT, drift {drifted} for {values['rest_s']:.1f} s"
-        )
-        if drifts.max() > DRIFT_T:
-            weak.append(f"{name}: it drifts by {drifted}: motors near, or it warms up")
+        noise, (channel,) = np.sqrt(variance[0]), entry.reference.channels
+        (unit, scale, most, why), key = RESTS[channel], CHANNELS[channel][0].lower()
+        values |= {f"noise_{key}": noise, f"drift_{key}": drifts}
+        drifted = f"{scale * drifts.max():.2g} {unit} at rest"
+        lines.append(f"{name}: noise {scale * noise.max():.2g} {unit}, drift {drifted} for {values['rest_s']:.1f} s")
+        if drifts.max() > most:
+            weak.append(f"{name}: it drifts by {drifted}: {why}, or it warms up")
         return values, lines, weak
     force = float(np.linalg.norm(rest[:, 3:].mean(axis=0)))
     if abs(force - 1.0) < UNIT:
@@ -301,6 +309,8 @@ def _calibrated(entries: list[Entry], poses: Path) -> tuple[Report, list[Entry]]
     from armsight.geometry.rotation import log_so3
     from armsight.loop.references.calibrate import PosePath
     from armsight.loop.references.calibrate import calibrate as fit
+    from armsight.loop.references.distance import Distance
+    from armsight.loop.references.heading import Magnetometer
     from armsight.loop.references.inertial import Inertial
     from armsight.tables.poses import read_pose_table
 
@@ -314,16 +324,38 @@ def _calibrated(entries: list[Entry], poses: Path) -> tuple[Report, list[Entry]]
     far = int(np.argmax(np.linalg.norm(log_so3(R[0].T @ R), axis=1)))  # from the first pose; and from there
     angle_deg = float(np.degrees(np.linalg.norm(log_so3(R[far].T @ R), axis=1).max()))
     if angle_deg < SMALL_DEG:
-        what = "lever" if any(isinstance(entry.reference, Inertial) for entry in entries) else "iron"
+        what = {Inertial: "lever", Magnetometer: "iron", Distance: "tool's point"}[type(entries[0].reference)]
         text = f"{poses}: the tool rotates by {angle_deg:.0f} deg: the {what} may be off by more than its sigma"
         notes.append(Note("weak", f"{text}; rotate it by {SMALL_DEG:.0f} deg and more, about two axes"))
     for entry in entries:
         readings = _averaged(entry, path)
         click.echo(f"{entry.reference.name}: fitting its parameters to {len(readings)} readings", err=True)
+        if isinstance(entry.reference, Distance) and entry.calibrated:
+            fits = {
+                other.where: np.median(
+                    [abs(float(z.z[0] - other.reference.expected(path(z.t_s), 0).z[0])) for z in readings]
+                )
+                for other in entries
+                if isinstance(other.reference, Distance) and other.calibrated
+            }
+            if fits[best := min(fits, key=lambda where: fits[where])] < SWAPPED * fits[entry.where]:
+                raise InputError(f"{entry.where}: its readings fit the anchor of {best}: swap their sources")
         began = entry.reference if entry.calibrated else entry.reference.begun(readings, path)
         result = fit(began, readings, path, fit_delay=True)
-        done.append(replace(entry, reference=result.reference, calibrated=True))
+        noise = max(result.noise.values()) * float(np.sqrt(np.median([each.cov[0, 0] for each in readings])))
+        done.append(replace(entry, reference=result.reference, calibrated=True, noise_m=noise))
         values, parts = _said(result)
+        if isinstance(entry.reference, Distance):
+            off = [readings[k].t_s for k in np.flatnonzero(~result.used)]
+            spells = np.split(off, np.flatnonzero(np.diff(off) > DELAY_S) + 1) if off else []
+            times = ", ".join(f"{each[0]:.1f} to {each[-1]:.1f}" for each in spells[:SPELLS])
+            if times:
+                notes.append(
+                    Note("weak", f"{entry.where}: ranges are off at {times} s: a wire that hooks, a thing between?")
+                )
+            if (most := values["noise_factor"]["range"]) > NOISY:
+                said = f"it is off by {1e3 * noise:.2g} mm, {most:.2g} times its noise"
+                notes.append(Note("weak", f"{entry.where}: {said}: a wire that hangs through, or poses that are off"))
         found.append(values)
         blocks += parts
     sections = {"references": ("References", blocks)}
@@ -350,7 +382,7 @@ def _averaged(entry: Entry, path: Any) -> list[Any]:  # noqa: ANN401 - imported 
     count = len(t_s) // size
     times = t_s[: count * size].reshape(count, size).mean(axis=1)
     channels = len(entry.reference.channels)
-    means = z[: count * size].reshape(count, size, channels, 3).mean(axis=1)
+    means = z[: count * size].reshape(count, size, channels, -1).mean(axis=1)
     within = np.flatnonzero([path.covers(t - entry.reference.delay_s, DELAY_S) for t in times])
     if len(within) < 20:
         raise InputError(

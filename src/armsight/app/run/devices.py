@@ -20,6 +20,7 @@ import numpy as np
 from armsight.app.options import SIM
 from armsight.data import Array
 from armsight.errors import DeviceError, InputError
+from armsight.loop.references.distance import Distance
 from armsight.loop.references.file import COLUMNS, Entry
 from armsight.loop.references.inertial import INERTIAL_CLASSES, Inertial
 from armsight.loop.running.setup import Fused, HostClock, LiveShots, Setup, fused
@@ -28,6 +29,7 @@ from armsight.robot.boards.board import Board
 from armsight.robot.boards.contract import MotionBoard
 from armsight.robot.boards.serial import BAUD
 from armsight.robot.kinematics.arm import Arm
+from armsight.sim.references.distance import DrawWire
 from armsight.sim.references.heading import MagneticUnit
 from armsight.sim.references.inertial import InertialErrors, InertialUnit
 from armsight.vision.markers.targets import Composite
@@ -195,7 +197,8 @@ def simulated_unit(workcell: Workcell, entry: Entry, seed: int) -> Fused:
     """Return a sensor on the workcell's tool, a unit as its class is, with errors beyond what its calibration knows."""
     rng = np.random.default_rng([seed, 77])
     if not isinstance(entry.reference, Inertial):
-        return fused(entry, workcell.carry(MagneticUnit(rng, entry.rate_hz or _FIELDS_HZ)))
+        simulated = DrawWire if isinstance(entry.reference, Distance) else MagneticUnit
+        return fused(entry, workcell.carry(simulated(rng, entry.rate_hz or _FIELDS_HZ)))
     c = INERTIAL_CLASSES[entry.sensor_class]
     drawn = (c.gyro_noise, c.noise), (c.gyro_bias, c.bias), c.scale, c.g_sensitivity, rng
     errors = InertialErrors.typical(*drawn, good=entry.sensor_class == "icm-42688", rate_hz=entry.rate_hz or _UNIT_HZ)

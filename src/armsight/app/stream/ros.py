@@ -7,6 +7,7 @@ scenes have no counterpart. And readings of an inertial unit as ``sensor_msgs/ms
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Callable, Iterator
 from typing import Any, TypeAlias
@@ -129,12 +130,20 @@ float64[9] linear_acceleration_covariance"""
 _FIELD = """std_msgs/Header header
 geometry_msgs/Vector3 magnetic_field
 float64[9] magnetic_field_covariance"""
+_RANGE = """std_msgs/Header header
+uint8 radiation_type
+float32 field_of_view
+float32 min_range
+float32 max_range
+float32 range
+float32 variance"""
 #: Numbers of a run's readings -> their topic, type, and what encoding "ros2msg" has: the type, and those it is made of.
 READINGS = {
     count: (topic, kind, fields + "".join(f"\n{'=' * 80}\nMSG: {name}\n{text}" for name, text in _PARTS.items()))
     for count, topic, kind, fields in (
         (6, "/imu", "sensor_msgs/msg/Imu", _IMU),
         (3, "/magnetic_field", "sensor_msgs/msg/MagneticField", _FIELD),
+        (1, "/range", "sensor_msgs/msg/Range", _RANGE),
     )
 }
 #: Orientation, which is not measured (its covariance begins with -1), then the rest; covariances are not known.
@@ -145,8 +154,14 @@ def reading_messages(name: str, samples: Samples) -> Iterator[tuple[int, bytes]]
     """Yield the time, ns, and the bytes of the message of each sample; ``name`` is its frame."""
     frame = name.encode() + b"\0"
     frame = struct.pack("<I", len(frame)) + frame
-    frame += b"\0" * (-(8 + len(frame)) % 8)  # numbers stand at multiples of their size, from the stamp on
+    infrared = (
+        frame + b"\1" + b"\0" * (-(9 + len(frame)) % 4)
+    )  # numbers stand at multiples of their size from the stamp on
+    frame += b"\0" * (-(8 + len(frame)) % 8)
     for t_ns, z in zip(np.round(1e9 * samples.t_s).astype(np.int64).tolist(), samples.z.tolist(), strict=True):
         stamp = struct.pack("<4siI", b"\0\1\0\0", *divmod(t_ns, 1_000_000_000))
+        if len(z) == 1:  # field of view, least and greatest range and variance are not known
+            yield t_ns, stamp + infrared + struct.pack("<5f", 0.0, 0.0, math.inf, *z, 0.0)
+            continue
         numbers = (*z, *_ZERO) if len(z) == 3 else (*_BEFORE, *z[:3], *_ZERO, *z[3:], *_ZERO)
         yield t_ns, stamp + frame + struct.pack(f"<{len(numbers)}d", *numbers)

@@ -131,8 +131,8 @@ def calibrate(
     used, variances = np.ones(len(readings), np.bool_), np.ones(len(fit.names))
     for _ in range(ROUNDS):
         at, linear = fit.solved(at, linear, variances, used)
-        before, factors = used, _factors(linear, variances)
-        used = _plausible(linear, factors, fit.channel)
+        before, factors = used, _factors(linear, variances, used)
+        used = _plausible(linear, factors, used, fit.channel)
         variances = restricted(linear.rows(np.flatnonzero(used)), factors, LEAST, MOST)
         if (used == before).all():
             break
@@ -220,25 +220,41 @@ def _cost(linear: Linear, s: Solved) -> float:
     return float(np.einsum("ni,nij,nj->", linear.e, s.W, linear.e) + (linear.known * linear.at**2).sum())
 
 
-def _factors(linear: Linear, variances: Array) -> Array:
+def _apart(linear: Linear, variances: Array, used: NDArray[np.bool_]) -> Array:
+    """Return the squared Mahalanobis distance (N,) of each reading from what the other used ones predict."""
+    s, squares = solve(linear.rows(np.flatnonzero(used)), variances), np.empty(len(used))
+    squares[used] = squares_of(*left_out(s))
+    if not used.all():
+        squares[~used] = squares_of(*_predicted(s, linear.rows(np.flatnonzero(~used)), variances))
+    return squares
+
+
+def _predicted(s: Solved, out: Linear, variances: Array) -> tuple[Array, Array]:
+    """Return errors (N, m) and covariances (N, m, m) of readings that a solution has not seen."""
+    JR = out.J @ s.root[: out.J.shape[2]]
+    own = np.linalg.inv(solve(out, variances).W)
+    return -(out.e + out.J @ s.x[: out.J.shape[2]]), own + JR @ np.swapaxes(JR, 1, 2)
+
+
+def _factors(linear: Linear, variances: Array, used: NDArray[np.bool_]) -> Array:
     """Return variances (K,) to begin at that a few blunders cannot raise: from the medians of the squares left out."""
     from scipy.special import chdtri
 
-    errors, covs = left_out(solve(linear, variances))
-    squares = squares_of(errors, covs)
-    median = chdtri(errors.shape[1], 0.5)
+    squares = _apart(linear, variances, used)
+    median = chdtri(linear.e.shape[1], 0.5)
     mine = [np.abs(M).sum(axis=(1, 2)) > 0.0 for M in linear.own.values()]
     each = [v * np.median(squares[rows]) / median for v, rows in zip(variances, mine, strict=True)]
     return np.asarray(np.clip(each, LEAST**2, MOST**2))
 
 
-def _plausible(linear: Linear, variances: Array, channel: NDArray[np.int64]) -> NDArray[np.bool_]:
+def _plausible(
+    linear: Linear, variances: Array, used: NDArray[np.bool_], channel: NDArray[np.int64]
+) -> NDArray[np.bool_]:
     """Return which readings (N,) chance explains, among those of their channel."""
-    errors, covs = left_out(solve(linear, variances))
-    squares = squares_of(errors, covs)
+    squares = _apart(linear, variances, used)
     out = np.ones(len(squares), np.bool_)
     for k in np.unique(channel):
-        out[channel == k] = by_chance(squares[channel == k], errors.shape[1], CHANCE)
+        out[channel == k] = by_chance(squares[channel == k], linear.e.shape[1], CHANCE)
     return out
 
 
@@ -248,13 +264,8 @@ def _held_out(linear: Linear, variances: Array, used: NDArray[np.bool_]) -> tupl
     errors, squares = np.empty((count, m)), np.empty(count)
     for block in np.array_split(np.arange(count), min(BLOCKS, count)):
         others = np.setdiff1d(np.flatnonzero(used), block)
-        s, out = solve(linear.rows(others), variances), linear.rows(block)
-        own = np.linalg.inv(solve(out, variances).W)
-        error = -(out.e + out.J @ s.x[: out.J.shape[2]])
-        JR = out.J @ s.root[: out.J.shape[2]]
-        cov = own + JR @ np.swapaxes(JR, 1, 2)
-        errors[block] = error
-        squares[block] = squares_of(error, cov) / m
+        errors[block], covs = _predicted(solve(linear.rows(others), variances), linear.rows(block), variances)
+        squares[block] = squares_of(errors[block], covs) / m
     return errors, squares
 
 

@@ -13,6 +13,7 @@ given. An iterated extended Kalman smoother (Bell, SIAM J. Optimization 4, 1994)
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple, Self
 
@@ -20,10 +21,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array, Record
+from armsight.errors import InputError
 from armsight.geometry.rotation import skew
-from armsight.loop.references.reference import ExpectedReading, Reference, ToolMotion
+from armsight.loop.references.reference import ExpectedReading, Reading, Reference, ToolMotion
 
 EACH = ("x_m", "y_m", "z_m", "offset_m", "scale")  # parameters of an anchor
+#: One sigma before a calibration: the tool's point, an anchor and its offset, m; scale. Half, double: nothing.
+_POINT_M, _ANCHOR_M, _OFFSET_M, _SCALE = 0.2, 3.0, 1.0, 0.02
+#: Positions whose extents, least over greatest, are below this are in a plane; half: 10 mm of a sweep pass for a space.
+_SPANS = 0.02
+#: A tool that moves so far, m, changes a range; half: a step of 10 mm is a frozen value, double: short ones are blunders.
+STILL_M = 0.2
+#: Singular values below this share of the greatest are noise; half, double: nothing.
+_LEAST = 1e-4
+#: No range is longer, m; half, double: wires of 50 or 200 mm, given in mm, are found by a sweep alone.
+MOST_M = 100.0
+#: Readings change by so many times the tool's travel where their unit is wrong; half: tools with long levers are, too.
+_TRAVELS = 5.0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -35,6 +49,47 @@ class Distance(Reference):
     offset: Array  #: (A,) what each range reads beyond the scaled distance, m
     scale: Array  #: (A,) of each range, 1 where it is right
     names: tuple[str, ...] = ()
+
+    @staticmethod
+    def of(name: str) -> Distance:
+        """Return one with one anchor, of which nothing is known."""
+        cov = np.diag(np.repeat([_POINT_M, _ANCHOR_M, _OFFSET_M, _SCALE], [3, 3, 1, 1]) ** 2)
+        zeros = np.zeros((3, 3))
+        where = Distance(name=name, cov=cov, anchors=zeros[:1], p_tool=zeros[0], offset=zeros[0, :1], scale=np.ones(1))
+        return replace(where, names=("range",), sigma_delay_s=0.02)
+
+    def begun(self, readings: Sequence[Reading], motion: Callable[[float], ToolMotion]) -> Self:
+        """Return one of one anchor with that near the truth, in closed form, for ``calibrate``.
+
+        With an offset b and the tool's point c squares z^2 - |p|^2 = 2 b z - 2 a p + 2 c R^T p - 2 a R c + const are linear
+        in a, b, c, the products of a and c, and the rest; the sigmas of a, b and c before a calibration bound them.
+
+        Raises:
+            InputError: positions in a plane; a range that is in another unit, stands still or falls as it grows.
+        """
+        t_s, z = np.array([each.t_s for each in readings]), np.array([each.z[0] for each in readings])
+        T = np.array([motion(t - self.delay_s).T_base_tool for t in t_s])
+        R, p = T[:, :3, :3], T[:, :3, 3]
+        low, high = np.quantile(z, [0.05, 0.95])
+        if high - low > _TRAVELS * (travel := float(np.linalg.norm(np.ptp(p, axis=0)))) + 2 * _POINT_M:
+            said = f"its readings change by {high - low:.3g} while the tool moves by {travel:.2g} m"
+            raise InputError(f"{self.name}: {said}: give m, not mm")
+        for rows in np.split(np.arange(len(z)), np.flatnonzero(np.abs(np.diff(z)) > 1e-9) + 1):
+            if (moved := float(np.linalg.norm(np.ptp(p[rows], axis=0)))) > STILL_M:
+                said = f"its value stands still from {t_s[rows[0]]:.2f} to {t_s[rows[-1]]:.2f} s, while the tool moves"
+                raise InputError(f"{self.name}: {said} by {moved:.2g} m: is the sensor alive, the wire fast?")
+        spread = np.linalg.svd(p - p.mean(axis=0), compute_uv=False)
+        if spread[-1] < _SPANS * spread[0]:
+            raise InputError(
+                f"{self.name}: the tool moves in a plane, whose mirror image fits as well: move it across, too"
+            )
+        by = [-2.0 * p, 2.0 * np.einsum("nij,ni->nj", R, p), 2.0 * z[:, None], -2.0 * R.reshape(-1, 9)]
+        linear = np.column_stack([*by, np.ones(len(z))])
+        size = np.repeat([_ANCHOR_M, _POINT_M, _OFFSET_M, _ANCHOR_M * _POINT_M, _ANCHOR_M**2], [3, 3, 1, 9, 1])
+        found = size * np.linalg.lstsq(linear * size, z**2 - (p**2).sum(axis=1), rcond=_LEAST)[0]
+        if np.median(z) < found[6]:
+            raise InputError(f"{self.name}: its readings fall as the tool moves away: give their negative")
+        return replace(self, anchors=found[None, :3], p_tool=found[3:6], offset=found[6:7])
 
     @property
     def channels(self) -> tuple[str, ...]:

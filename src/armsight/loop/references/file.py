@@ -1,13 +1,14 @@
 """``references.toml``: a table a reference, and the recordings that it names.
 
 [imu]
-kind = "inertial"           # or "magnetometer"
+kind = "inertial"           # or "magnetometer", "range": a wire, bar, laser or radio to one anchor
 source = "imu.csv"          # CSV or JSON lines: t_s and its columns, such as gyro_x_rad_s; a bag of ROS, a run
 live = "udp:5005"           # where `armsight run` reads it, JSON lines of the same keys; or serial:PORT
 class = "mpu-6050"          # of an inertial unit; what is not known is left out
 rate_hz = 100.0
 delay_s = 0.004
 sigma_delay_s = 0.001
+noise_m = 0.0005            # of a range
 parameters = { rotation_x_rad = 0.01, .. }   # as `armsight references calibrate` writes them
 covariance = [[..], ..]
 """
@@ -17,7 +18,7 @@ from __future__ import annotations
 import json
 import os
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -29,25 +30,32 @@ from armsight.data import Array, Record
 from armsight.errors import InputError
 from armsight.files import read_text, read_toml
 from armsight.geometry.check import checked
+from armsight.loop.references.distance import Distance
 from armsight.loop.references.heading import Magnetometer
 from armsight.loop.references.inertial import Inertial
 from armsight.tables.columns import Columns
 from armsight.vision.sources.bag.reader import S_NS, SUFFIXES, Bag, BagMessage
 
 #: Keys of a reference's table.
-_KEYS = ("kind", "source", "live", "class", "rate_hz", "delay_s", "sigma_delay_s", "parameters", "covariance")
+_NUMBERS_LEAST = {"rate_hz": 1e-3, "delay_s": -np.inf, "sigma_delay_s": 0.0, "noise_m": 1e-7}
+_KEYS = ("kind", "source", "live", "class", *_NUMBERS_LEAST, "parameters", "covariance")
 _MOST_MB = 200  # of a recording
-Sensor = Inertial | Magnetometer  #: what a file can name
+Sensor = Inertial | Magnetometer | Distance  #: what a file can name
 #: Their kinds in it, and the columns of their recordings.
-KINDS: dict[type[Sensor], str] = {Inertial: "inertial", Magnetometer: "magnetometer"}
+KINDS: dict[type[Sensor], str] = {Inertial: "inertial", Magnetometer: "magnetometer", Distance: "range"}
 COLUMNS: dict[type[Sensor], tuple[str, ...]] = {
     Inertial: tuple(f"gyro_{a}_rad_s" for a in "xyz") + tuple(f"accelerometer_{a}_m_s2" for a in "xyz"),
     Magnetometer: tuple(f"field_{a}_t" for a in "xyz"),
+    Distance: ("range_m",),
 }
 #: Messages of ROS that have them; bytes of the numbers at the end of these, and where among them a reading stands.
-MESSAGES: dict[type[Sensor], str] = {Inertial: "sensor_msgs/Imu", Magnetometer: "sensor_msgs/MagneticField"}
-_NUMBERS = {MESSAGES[Inertial]: (37 * 8, np.r_[13:16, 25:28]), MESSAGES[Magnetometer]: (12 * 8, np.r_[0:3])}
 RANGE = "sensor_msgs/Range"
+MESSAGES: dict[type[Sensor], str] = {
+    Inertial: "sensor_msgs/Imu",
+    Magnetometer: "sensor_msgs/MagneticField",
+    Distance: RANGE,
+}
+_NUMBERS = {MESSAGES[Inertial]: (37 * 8, np.r_[13:16, 25:28]), MESSAGES[Magnetometer]: (12 * 8, np.r_[0:3])}
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +68,7 @@ class Entry(Record):
         rate_hz: readings a second, as the file says; None where it does not.
         calibrated: whether the file has its parameters.
         where: the file and the name of its table, for messages.
+        noise_m: of a range.
     """
 
     reference: Sensor
@@ -69,6 +78,7 @@ class Entry(Record):
     rate_hz: float | None
     calibrated: bool
     where: str = ""
+    noise_m: float = 1e-3
 
 
 def read_references(path: Path) -> list[Entry]:
@@ -94,26 +104,28 @@ def _entry(path: Path, name: str, table: dict[str, Any]) -> Entry:
         raise InputError(f"{where}: unknown key {unknown[0]!r}; known are {', '.join(_KEYS)}")
     if (kind := table.get("kind")) not in KINDS.values():
         raise InputError(f"{where}: kind is {kind!r}; known are {', '.join(KINDS.values())}")
-    for key in ("rate_hz", "delay_s", "sigma_delay_s"):
+    for key, least in _NUMBERS_LEAST.items():
         value = table.get(key, 1.0)
         if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
             raise InputError(f"{where}: {key} is {value!r}; expected a number")
         # The poses' clock may be the later one: then a delay is below zero.
-        if value < {"rate_hz": 1e-3, "delay_s": -np.inf, "sigma_delay_s": 0.0}[key]:
+        if value < least:
             raise InputError(f"{where}: {key} is {value:g}; expected more")
     for key in ("source", "live", "class"):
         if not isinstance(table.get(key, ""), str):
             raise InputError(f"{where}: {key} is {table[key]!r}; expected a text")
-    if kind == KINDS[Magnetometer] and "class" in table:
-        raise InputError(f"{where}: class is of an inertial unit; a magnetometer has none: leave it out")
+    if kind != KINDS[Inertial] and "class" in table:
+        raise InputError(f"{where}: class is of an inertial unit; a {kind} has none: leave it out")
     like = table.get("class", "mpu-6050")
-    sensor: Sensor = Inertial.of(name, like) if kind == KINDS[Inertial] else Magnetometer.of(name)
+    of: dict[str, Callable[[str], Sensor]] = {KINDS[each]: each.of for each in (Magnetometer, Distance)}
+    sensor = of[kind](name) if kind in of else Inertial.of(name, like)
     late = table.get("delay_s", 0.0), table.get("sigma_delay_s", sensor.sigma_delay_s)
     sensor = replace(sensor, delay_s=float(late[0]), sigma_delay_s=float(late[1]))
     if "parameters" in table:
         sensor = _known(where, sensor, table["parameters"], table.get("covariance"))
     source = path.parent / table["source"] if "source" in table else None
-    return Entry(sensor, like, source, table.get("live"), table.get("rate_hz"), "parameters" in table, where)
+    given = table.get("live"), table.get("rate_hz"), "parameters" in table, where, table.get("noise_m", Entry.noise_m)
+    return Entry(sensor, like, source, *given)
 
 
 def _known(where: str, sensor: Sensor, given: object, covariance: object) -> Sensor:
@@ -142,6 +154,8 @@ def written(entry: Entry, folder: Path) -> str:
         lines.append(f"live = {json.dumps(entry.live)}")
     if isinstance(sensor, Inertial):
         lines.append(f'class = "{entry.sensor_class}"')
+    if isinstance(sensor, Distance):
+        lines.append(f"noise_m = {entry.noise_m:.6g}")
     if entry.rate_hz is not None:
         lines.append(f"rate_hz = {entry.rate_hz:g}")
     lines += [f"delay_s = {sensor.delay_s:.9g}", f"sigma_delay_s = {sensor.sigma_delay_s:.9g}"]
@@ -157,6 +171,11 @@ def read_recording(path: Path, kind: type[Sensor] = Inertial) -> tuple[Array, Ar
         InputError: the file, the line and what was expected.
     """
     if path.is_dir() or path.suffix.lower() in SUFFIXES:
+        if kind is Distance:
+            topics, t_s, _, z = read_ranges(path)
+            if len(topics) > 1:
+                raise InputError(f"{path}: expected one topic of {RANGE}; there are {len(topics)}: {', '.join(topics)}")
+            return t_s, z[:, None]
         return _of_bag(Bag(path), MESSAGES[kind])
     lines = path.suffix.lower() in (".jsonl", ".ndjson")
     columns = _json_lines(path, COLUMNS[kind]) if lines else Columns.of_csv(path)
@@ -200,11 +219,13 @@ def _time_s(message: BagMessage) -> float:
 
 
 def reading_of(message: BagMessage) -> tuple[float, Array]:
-    """Return the time, s, and the reading of a message: (6,), rad/s and m/s2, or of a field (3,), T.
+    """Return the time, s, and the reading of a message: (6,), rad/s and m/s2, of a field (3,), T, or a range (1,), m.
 
     Raises:
         InputError: it is too short.
     """
+    if message.kind == RANGE:
+        return _time_s(message), np.array([message.decode().range], float)
     size, rows = _NUMBERS[message.kind]
     if len(message.data) < size:
         raise InputError(f"{message.topic}: message {message.index + 1} is cut short: {len(message.data)} bytes")

@@ -21,6 +21,7 @@ from armsight.errors import ArmsightError, DeviceError, InputError
 from armsight.estimate.chance import squares_of
 from armsight.loop.estimators.estimator import Estimator, Innovation, Outcome
 from armsight.loop.estimators.kalman import KalmanEstimator
+from armsight.loop.references.distance import MOST_M, Distance
 from armsight.loop.references.file import Entry, read_recording
 from armsight.loop.references.heading import FIELDS_S, LEAST_T, MOST_T, NOISE_T, Magnetometer, heading_off
 from armsight.loop.references.inertial import INERTIAL_CLASSES, Inertial
@@ -126,6 +127,8 @@ _SAID = 5  # impacts in a line
 #: Sigmas below which a heading agrees, and the sigma, rad, above which it then says nothing. Half: chance disagrees, few
 #: magnetometers say anything; double: a base that was rotated by 15 degrees agrees.
 AGREES, SAYS_RAD = 3.0, math.radians(3.0)
+#: A range that stands still while it should change by so many sigma, and by so much, m; half: a coarse step is one.
+STILL, LEAST_M = 8.0, 1e-3
 #: Returns times (N,), s, and readings (N, 6) up to a time, s, that were not returned before.
 ReadingsSource = Callable[[float], tuple[Array, Array]]
 
@@ -163,7 +166,7 @@ class FusedRow:
         return (
             f"with {self.name} from {self.begin_s:.1f} s on: {moved}sigma {1e3 * self.sigma_rms_m:.3f} mm{without}; it "
             f"{found} with joints and vision: residuals {self.residual_over_sigma:.2f} of their sigma, {self.outliers} of "
-            f"{self.windows} windows are outliers{dropped}"
+            f"{self.windows} are outliers{dropped}"
         )
 
 
@@ -202,6 +205,8 @@ class Fused:
         begin_s: time of the first window, s.
         rejected_s: when images contradicted it so that it was used no more, s; None where they did not.
     """
+
+    honest = HONEST
 
     def __init__(
         self,
@@ -257,7 +262,7 @@ class Fused:
         self.windows += 1
         self.outliers += innovation.outcome is Outcome.OUTLIER
         if innovation.outcome is Outcome.OUTLIER:
-            if innovation.t_s > self._impact_s + APART_S:
+            if innovation.t_s > self._impact_s + APART_S and isinstance(self.entry.reference, Inertial):
                 self.impacts.append(innovation.t_s)
             self._impact_s = innovation.t_s
         else:
@@ -275,7 +280,10 @@ class Fused:
             raise InputError("; ".join((f"{self.entry.where}: {self._unused()}", *self.losses)))
         ratio = float(np.sqrt(self._squares / max(self.windows - self.outliers, 1)))
         agrees = (
-            self.outliers < OUTLIERS * self.windows and self.rejected_s is None and ratio < HONEST and not self._off
+            self.outliers < OUTLIERS * self.windows
+            and self.rejected_s is None
+            and ratio < self.honest
+            and not self._off
         )
         sigma = float(np.sqrt(np.einsum("nii->ni", covs)[:, :3].sum(axis=1).mean()))
         moved, without = (None, None) if before is None else before
@@ -352,9 +360,40 @@ class Witness(Fused):
         )
 
 
+class Ranged(Fused):
+    """A range to an anchor: of readings ``FIELDS_S`` apart, as errors of a drum and of a wire last, each is fused.
+
+    One that is longer than any range, or stands still while the tool moves away from where it came, is left out.
+    """
+
+    #: Residuals over their sigma below which it agrees; half: chance disagrees, double: a wire that hangs by a mm agrees.
+    honest = 1.5
+    _looked_s, _since_s, _value = -np.inf, -np.inf, np.nan
+
+    def _take(self, estimator: KalmanEstimator, samples: Samples) -> None:
+        estimator.on_reading = self._heard
+        sensor, noise_m = self.entry.reference, self.entry.noise_m
+        # Single precision, as the message of ROS has it: so a run is replayed to the last digit.
+        for t, z in zip(samples.t_s.tolist(), samples.z[:, 0].astype(np.float32).tolist(), strict=True):
+            if z != self._value:
+                self._value, self._since_s = z, t
+            if t - self._looked_s < FIELDS_S:
+                continue
+            self._looked_s = t
+            if not abs(z) < MOST_M:
+                self._losses[f"a range above {MOST_M:g} m was left out: give m, not mm"] += 1
+                continue
+            at = np.clip(np.array([self._since_s, t]) - sensor.delay_s, *estimator.span_s)
+            first, now = (sensor.expected(ToolMotion(T), 0).z for T in estimator.track(at).Ts_base_tool)
+            if np.abs(now - first) > max(STILL * noise_m, LEAST_M):
+                self._losses["its value stood still while the tool moved"] += 1
+                continue
+            estimator.take(sensor, Reading(t, 0, np.array([z]), noise_m**2 * np.eye(1)))
+
+
 def fused(entry: Entry, source: ReadingsSource | None = None, losses: Counter[str] | None = None) -> Fused:
     """Return what takes a reference's readings into a run."""
-    kind = Fused if isinstance(entry.reference, Inertial) else Witness
+    kind = {Inertial: Fused, Magnetometer: Witness, Distance: Ranged}[type(entry.reference)]
     return kind(entry, losses=losses) if source is None else kind(entry, source, losses)
 
 

@@ -39,6 +39,7 @@ from armsight.robot.boards.link import TICK_S
 from armsight.robot.kinematics.arm import Arm
 from armsight.sim.camera.stages import CameraPipeline
 from armsight.sim.example_rig import board_poses
+from armsight.sim.references.distance import DrawWire
 from armsight.sim.references.heading import MagneticUnit
 from armsight.sim.references.inertial import InertialUnit
 from armsight.sim.render.optics import Sensor
@@ -398,7 +399,7 @@ class Workcell(Closing):
         """(5, n) the joint angles of the workcell's five poses, rad, as the nominal table has them; body in view."""
         return workcell_poses(self.model, default=self._default)
 
-    def carry(self, unit: InertialUnit | MagneticUnit) -> Callable[[float], tuple[Array, Array]]:
+    def carry(self, unit: InertialUnit | MagneticUnit | DrawWire) -> Callable[[float], tuple[Array, Array]]:
         """Return what reads a sensor on the tool: stamps (N,) up to a time, s, and readings (N, m), each once."""
         at = self.plant.travelled.ticks
 
