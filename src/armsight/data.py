@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -152,8 +152,7 @@ class Detections(Record):
         return Detections(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 2, 2)), problem)
 
 
-@dataclass(frozen=True)
-class Rejected:
+class Rejected(NamedTuple):
     """A position in an image that looked like a marker and is none, and why.
 
     Attributes:

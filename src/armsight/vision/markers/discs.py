@@ -96,14 +96,14 @@ class DiscTarget(Record):
         words, (bright, dark) = image.view(np.uint64), self._kinds
         theta, codes, signs, cov, shape, shared, room, work = _room()
         buffers = theta, codes, signs, cov, shape, room, work
-        good, n, large = search.find(image, words, bright, dark, 0, 0, 0, *buffers)
+        good, n, large, noise = search.find(image, words, bright, dark, 0, 0, 0, *buffers)
         if large and good < len(self.radii_m):
             larger, kinds = _larger(image, bright, dark)
             if (k := min(len(larger), _MOST_CANDIDATES - n)) > 0:
                 more = slice(n, n + k)
                 theta[more], codes[more], signs[more] = larger[:k], 0, kinds[:k]
-                good, n, _ = search.find(image, words, bright, dark, good, n, n + k, *buffers)
-        search.correct_all(image, good, theta, cov, shared, work)
+                good, n, _, _ = search.find(image, words, bright, dark, good, n, n + k, *buffers)
+        search.correct_all(image, noise, good, theta, cov, shared, work)
         rejected = _rejected(theta[good:n], codes[good:n]) if n > good else ()
         if n == _MOST_CANDIDATES:  # rows are searched from the top
             row = float(min(np.nanmax(theta[:n, 1]), len(image) - 1))

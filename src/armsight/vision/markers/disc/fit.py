@@ -58,7 +58,8 @@ Floats = NDArray[np.float32]
 
 @kernel_types(
     "f4[::1], f4[::1], f4[::1], f4[:, ::1], f4[::1], f4[::1], f4[::1], f8[:, ::1], f8[::1], f8[:, ::1], "
-    "f8[::1], f8[::1], f4[::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[:, ::1]"
+    "f8[::1], f8[::1], f4[::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], "
+    "f8[:, ::1]"
 )
 class FitBuffers(NamedTuple):
     """The buffers of a fit; one set for each thread.
@@ -82,6 +83,7 @@ class FitBuffers(NamedTuple):
         trial: (10,) trial parameters.
         start: (10,) parameters at the start.
         products: (2, 13) of a gradient inside.
+        solved: (2, 10) solutions of :func:`solve_two`.
         sums: (12, 12) products of the rows of J.
         shown: (SHOWN,) what the last fit shows of noise and light: its rim (power, see :func:`rim_power`; mean
             square of the sectors' deviations beyond white noise, px^2; 1 / power of white noise), a gradient inside
@@ -109,6 +111,7 @@ class FitBuffers(NamedTuple):
     trial: Array
     start: Array
     products: Array
+    solved: Array
     sums: Array
     shown: Array
     discs: Array
@@ -129,8 +132,8 @@ def workspace() -> FitBuffers:
     return FitBuffers(
         px, py, level, J, J[n], left, inside,
         np.empty((n, n)), np.empty(n), np.empty((n, n)), np.empty(n), np.empty(n), np.empty(n, np.float32),
-        np.empty((4, 5)), np.empty((2, 16)), np.empty(n), np.empty(n), np.empty((2, 13)), np.empty((n + 2, n + 2)),
-        np.empty(SHOWN), np.empty((MOST_DISCS, SHOWN)),
+        np.empty((4, 5)), np.empty((2, 16)), np.empty(n), np.empty(n), np.empty((2, 13)), np.empty((2, n)),
+        np.empty((n + 2, n + 2)), np.empty(SHOWN), np.empty((MOST_DISCS, SHOWN)),
     )  # fmt: skip
 
 
@@ -246,6 +249,27 @@ def solve(L: Array, scale: Array, g: Array, x: Array) -> None:
         x[a] = total * L[a, a]
     for a in range(n):
         x[a] *= scale[a]
+
+
+@kernel
+def solve_two(L: Array, scale: Array, g: Array, x: Array) -> None:
+    """Solve as :func:`solve` does for two right sides, the first columns of g (2, .), at once: x (2, n)."""
+    n = len(scale)
+    for a in range(n):
+        p, q = g[0, a] * scale[a], g[1, a] * scale[a]
+        for k in range(a):
+            p -= L[a, k] * x[0, k]
+            q -= L[a, k] * x[1, k]
+        x[0, a], x[1, a] = p * L[a, a], q * L[a, a]
+    for a in range(n - 1, -1, -1):
+        p, q = x[0, a], x[1, a]
+        for k in range(a + 1, n):
+            p -= L[k, a] * x[0, k]
+            q -= L[k, a] * x[1, k]
+        x[0, a], x[1, a] = p * L[a, a], q * L[a, a]
+    for a in range(n):
+        x[0, a] *= scale[a]
+        x[1, a] *= scale[a]
 
 
 #: Distance from the rim, in blurs, within which pixels depend on it; width, px, of a ring beyond that shows the
@@ -501,13 +525,11 @@ def texture_factor(n: int, blur: float, texture: float, work: FitBuffers) -> flo
 
 @kernel
 def of_centre(work: FitBuffers, cov: Array) -> None:
-    """Fill the centre's (2, 2) block of H^-1."""
-    g, L, scale, x = work.g, work.L, work.scale, work.x
-    for a in range(2):
-        g[:] = 0.0
-        g[a] = 1.0
-        solve(L, scale, g, x)
-        cov[a, 0], cov[a, 1] = x[0], x[1]
+    """Fill the centre's (2, 2) block of H^-1; its rows are in ``work.solved``."""
+    work.products[:] = 0.0
+    work.products[0, 0], work.products[1, 1] = 1.0, 1.0
+    solve_two(work.L, work.scale, work.products, work.solved)
+    cov[:, :] = work.solved[:, :2]
 
 
 @kernel(fastmath=True)
@@ -548,16 +570,10 @@ def slope_inside(n: int, theta: Array, x0: float, y0: float, variance: float, wo
     One step of the twelve unknowns, in which the model is nearly linear (Schur complement of the two that are new).
     ``work.shown`` is filled from 3 on: the gradient over the disc's level, 1/px (2); its information, px^2, as
     elements 00, 01, 11 (3); by how much the fitted centre is off for each of it, px^2 (2, 2). Without information: zeros.
-
-    Args:
-        n: pixels.
-        theta: (10,) the converged parameters.
-        x0: the pixels' origin.
-        y0: see x0.
-        variance: of the noise, as the residuals have it.
-        work: the pixels, linearised, with the last step in ``work.x``.
+    ``theta``: (10,) converged; (x0, y0): the pixels' origin; ``variance``: of the noise, as the residuals have it;
+    ``work``: the n pixels, linearised, with the last step in ``work.x``.
     """
-    g, L, scale, x, out, shown = work.g, work.L, work.scale, work.x, work.products, work.shown
+    x, solved, out, shown = work.x, work.solved, work.products, work.shown
     _inside_products(n, F(theta[0] - x0), F(theta[1] - y0), work, out)
     s0, s1 = out[0, 10], out[1, 10]
     k00, k01, k11 = out[0, 11], out[0, 12], out[1, 12]
@@ -566,17 +582,17 @@ def slope_inside(n: int, theta: Array, x0: float, y0: float, variance: float, wo
         s0 -= out[0, a] * x[a]
         s1 -= out[1, a] * x[a]
     level = max(theta[6] + theta[7], _LEAST_LEVEL)
-    g[:] = out[0, :UNKNOWNS]
-    solve(L, scale, g, x)
-    shown[8], shown[9] = level * x[0], level * x[1]
+    solve_two(work.L, work.scale, out, solved)
+    shown[8], shown[9], shown[10], shown[11] = (
+        level * solved[0, 0],
+        level * solved[0, 1],
+        level * solved[1, 0],
+        level * solved[1, 1],
+    )
     for a in range(UNKNOWNS):
-        k00 -= out[0, a] * x[a]
-        k01 -= out[1, a] * x[a]
-    g[:] = out[1, :UNKNOWNS]
-    solve(L, scale, g, x)
-    shown[10], shown[11] = level * x[0], level * x[1]
-    for a in range(UNKNOWNS):
-        k11 -= out[1, a] * x[a]
+        k00 -= out[0, a] * solved[0, a]
+        k01 -= out[1, a] * solved[0, a]
+        k11 -= out[1, a] * solved[1, a]
     det = k00 * k11 - k01 * k01
     if not det > 0.0:
         shown[3:12] = 0.0
@@ -623,24 +639,20 @@ def skewed_edge(n: int, variance: float, work: FitBuffers) -> None:
     normal. One step of the twelve unknowns, as in :func:`slope_inside`. ``work.shown`` is filled from SKEWED on: the
     centre's shift, px (2); by how much chi-square falls, in the noise's variance.
     """
-    g, L, scale, x, out, shown = work.g, work.L, work.scale, work.x, work.products, work.shown
+    x, out, shown = work.solved, work.products, work.shown
     _skew_products(n, work)
     s0, s1, k00, k01, k11 = out[0, 10], out[1, 10], out[0, 11], out[0, 12], out[1, 12]
-    g[:] = out[0, :UNKNOWNS]
-    solve(L, scale, g, x)
-    u0, v0 = x[0], x[1]
+    solve_two(work.L, work.scale, out, x)
     for a in range(UNKNOWNS):
-        k00 -= out[0, a] * x[a]
-        k01 -= out[1, a] * x[a]
-    g[:] = out[1, :UNKNOWNS]
-    solve(L, scale, g, x)
-    for a in range(UNKNOWNS):
-        k11 -= out[1, a] * x[a]
+        k00 -= out[0, a] * x[0, a]
+        k01 -= out[1, a] * x[0, a]
+        k11 -= out[1, a] * x[1, a]
     det = k00 * k11 - k01 * k01
     shown[SKEWED:] = 0.0
     if det > 0.0:
         along, across = (k11 * s0 - k01 * s1) / det, (k00 * s1 - k01 * s0) / det
-        shown[SKEWED], shown[SKEWED + 1] = -(u0 * along + x[0] * across), -(v0 * along + x[1] * across)
+        for a in range(2):
+            shown[SKEWED + a] = -(x[0, a] * along + x[1, a] * across)
         shown[SKEWED + 2] = (along * s0 + across * s1) / variance
 
 
@@ -650,27 +662,17 @@ def levelled(theta: Array, variance: float, work: FitBuffers) -> None:
 
     Centre and gradient have errors in common, V_cg: the centre of the eight other unknowns alone is c - V_cg V_gg^-1 g.
     ``work.shown`` is filled from LEVELLED on: chi-square of g in the noise's variance; V_cg V_gg^-1 g, px (2); by how much
-    the centre's covariance falls, V_cg V_gg^-1 V_gc, px^2, as elements 00, 01, 11 (3).
-
-    Args:
-        theta: (10,) the converged parameters.
-        variance: of the noise, grey levels^2.
-        work: buffers, with the factor of the normal matrix.
+    the centre's covariance falls, V_cg V_gg^-1 V_gc, px^2, as elements 00, 01, 11 (3). ``theta``: (10,) converged;
+    ``variance``: of the noise, grey levels^2; ``work``: as :func:`of_centre` leaves it.
     """
-    g, L, scale, x, out = work.g, work.L, work.scale, work.x, work.shown[LEVELLED:]
+    L, scale, x, out = work.L, work.scale, work.solved, work.shown[LEVELLED:]
     # The last corner of the factor is that of the last two unknowns' information, the others marginalised.
     a, b = theta[8] / scale[8], theta[9] / scale[9]
     p, q = a / L[8, 8] + b * L[9, 8], b / L[9, 9]
     out[0] = (p * p + q * q) / variance
-    g[:] = 0.0
-    g[0] = 1.0
-    solve(L, scale, g, x)
-    u8, u9 = x[8] / scale[8], x[9] / scale[9]
+    u8, u9 = x[0, 8] / scale[8], x[0, 9] / scale[9]
     u8, u9 = u8 / L[8, 8] + u9 * L[9, 8], u9 / L[9, 9]
-    g[:] = 0.0
-    g[1] = 1.0
-    solve(L, scale, g, x)
-    v8, v9 = x[8] / scale[8], x[9] / scale[9]
+    v8, v9 = x[1, 8] / scale[8], x[1, 9] / scale[9]
     v8, v9 = v8 / L[8, 8] + v9 * L[9, 8], v9 / L[9, 9]
     out[1], out[2] = u8 * p + u9 * q, v8 * p + v9 * q
     out[3], out[4], out[5] = (
