@@ -235,6 +235,7 @@ def test_a_range_is_checked_and_calibrated_and_what_is_wrong_with_it_is_named(ca
     still[500:900] = z[500]
     hooked = z + np.where((t_s > 12.0) & (t_s < 14.0), 0.005, 0.0)[:, None]
     tables = {"wire": z, "other": other, "mm": 1e3 * z, "still": still, "hooked": hooked, "falls": 2.0 - z}
+    tables["coarse"] = np.round(np.append(z[:1000], np.full((500, 1), 1.0)) + rng.normal(0.0, 0.05, 1500), 2)[:, None]
     for name, values in tables.items():
         rows = np.column_stack([t_s, values])
         np.savetxt(tmp_path / f"{name}.csv", rows, "%.9g", ",", header="t_s,range_m", comments="")
@@ -273,5 +274,8 @@ def test_a_range_is_checked_and_calibrated_and_what_is_wrong_with_it_is_named(ca
         said = calibrate(*given)
         assert said.code == 2
         assert text in said.err
+    said = said_of(capsys, "references", "check", tmp_path / "coarse.toml", "--json", kind="range").lines[0]
+    assert said["weak"] == []  # at rest a step of 10 mm repeats, and a noise of 50 mm is no drift
+    assert said["references"][0]["drift_m"][0] > command.RESTS["range"][2]
     said = said_of(capsys, "references", "check", tmp_path / "mm.toml")
     assert (said.code, "as if in mm; give m" in said.err) == (2, True)

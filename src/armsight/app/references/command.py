@@ -196,13 +196,18 @@ def _checked(entries: list[Entry]) -> Report:
 
 def _weak_stream(entry: Entry, stream: StreamCheck, saturated: list[str]) -> list[str]:
     """Return what is weak in how readings came, whatever they are."""
+    from armsight.loop.references.file import COLUMNS
+
     name, weak = entry.reference.name, []
     if entry.rate_hz is not None and abs(stream.rate_hz / entry.rate_hz - 1) > RATE:
         weak.append(f"{name}: the rate is {stream.rate_hz:.4g} Hz, not {entry.rate_hz:g} as the file says")
-    if stream.doubled > RATE:
-        weak.append(f"{name}: {100 * stream.doubled:.0f} % of the readings repeat the one before: it is read too often")
-    if stream.frozen_s:
-        weak.append(f"{name}: no value changes for {stream.frozen_s:.2f} s")
+    if len(COLUMNS[type(entry.reference)]) > 1:  # one number repeats where its step is above the noise
+        if stream.doubled > RATE:
+            weak.append(
+                f"{name}: {100 * stream.doubled:.0f} % of the readings repeat the one before: it is read too often"
+            )
+        if stream.frozen_s:
+            weak.append(f"{name}: no value changes for {stream.frozen_s:.2f} s")
     return weak + [f"{name}: {axis} stands at the end of its range: that is too small" for axis in saturated]
 
 
@@ -247,7 +252,8 @@ def _check(entry: Entry) -> tuple[dict[str, Any], list[str], list[str]]:
         values |= {f"noise_{key}": noise, f"drift_{key}": drifts}
         drifted = f"{scale * drifts.max():.2g} {unit} at rest"
         lines.append(f"{name}: noise {scale * noise.max():.2g} {unit}, drift {drifted} for {values['rest_s']:.1f} s")
-        if drifts.max() > most:
+        chance = NOISY * noise * np.sqrt(8.0 / len(rest))  # of two means of a quarter each
+        if (drifts > np.maximum(most, chance)).any():
             weak.append(f"{name}: it drifts by {drifted}: {why}, or it warms up")
         return values, lines, weak
     force = float(np.linalg.norm(rest[:, 3:].mean(axis=0)))
