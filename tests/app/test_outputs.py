@@ -117,6 +117,23 @@ def test_a_folder_that_cannot_be_written_is_reported_at_once(here, armsight, nam
     assert sorted(os.listdir(here)) == before
 
 
+@pytest.mark.parametrize("name", FOLDER_WRITERS)
+def test_results_of_another_command_are_not_written_over(here, armsight, name):
+    (here / "their").mkdir()
+    for file in ("report.html", "summary.json"):
+        (here / "their" / file).write_text("<title>armsight: other</title>")
+        if (file, name) != ("summary.json", "demo"):  # which replaces its own
+            assert_rejected(call(armsight, name, FOLDER_WRITERS[name], "their"), "their: holds", "another folder")
+        (here / "their" / file).unlink()
+
+
+def test_what_is_replaced_is_said(here, armsight):
+    for expected in ([], ["note: replaced: print.pdf"]):
+        answer = armsight("body", "draw", "chessboard:9x6:20mm", "-o", "print.pdf")
+        assert answer.code == 0
+        assert [line for line in answer.err.splitlines() if "replaced" in line] == expected
+
+
 @pytest.mark.parametrize(
     "name", [name for name in FOLDER_WRITERS if name not in ("measure --view", "batch")]
 )  # the first draws what was missed, the second has a row for what failed

@@ -11,15 +11,20 @@ many commands have, and the kinds of sources and boards that commands open thems
 
 from __future__ import annotations
 
+import contextlib
+import os
+import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass
-from functools import wraps
+from functools import partial, wraps
 from inspect import signature
 from pathlib import Path
 from types import UnionType
 from typing import Any, get_args, get_type_hints
 
 import click
+
+from armsight.errors import InputError
 
 #: A file or a folder.
 PATH = click.Path(path_type=Path)
@@ -34,6 +39,7 @@ BOARD = "board: "
 #: What a cell is called among the streams.
 CELL = "cell:"
 _TYPES = {Path: PATH, int: click.INT, float: click.FLOAT}  # others are texts
+_KINDS = {int: "N", float: "X"}  #: in help; a file or a text is called as its option, where no better is declared
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +63,8 @@ class Declaration:
         if self.is_argument:
             return click.Argument([name], **{"nargs": -1 if many else 1, **given})
         names = [name, *(self.names or (f"--{name.replace('_', '-')}",))]
+        if single is not bool and not isinstance(given["type"], click.Choice):
+            given["metavar"] = given.get("metavar") or _KINDS.get(single) or names[-1].strip("-").upper()
         if single is bool:
             return _Option(self, names, is_flag=True, help=given["help"])
         needed = not (isinstance(kind, UnionType) or many or "default" in given)
@@ -82,9 +90,35 @@ def argument(metavar: str | None = None, **attributes: Any) -> Any:  # noqa: ANN
     return Declaration((), {"metavar": metavar, **attributes}, True)
 
 
-def out(metavar: str, text: str, **attributes: Any) -> Any:  # noqa: ANN401 - as above
-    """Declare ``-o``: what is written, and what its help says."""
-    return option(text, "-o", "--output", metavar=metavar, **attributes)
+def out(metavar: str, text: str, *names: str, **attributes: Any) -> Any:  # noqa: ANN401 - as above
+    """Declare what is written, and what its help says: ``-o``, or the option of another name."""
+    return option(text, *(names or ("-o", "--output")), metavar=metavar, callback=_kept, **attributes)
+
+
+def _kept(context: click.Context, _: click.Parameter, given: Any) -> Any:  # noqa: ANN401 - a path, some, or None
+    """Reject a folder of another command's results; say at the end which file, or report in a folder, was replaced."""
+    own = {"demo": "run"}.get(command := context.command_path.removeprefix("armsight "), command)
+    for path in given if isinstance(given, tuple) else [given] if given is not None else []:
+        file = os.path.expanduser(path)
+        if os.path.isdir(file):
+            folder, file = file, os.path.join(file, "report.html")
+            theirs = "run" if os.path.isfile(os.path.join(folder, "summary.json")) else ""
+            with contextlib.suppress(OSError), open(file, encoding="utf-8", errors="replace") as report:
+                title = re.search(r"<title>armsight: ([^<]*)", report.read(500))
+                theirs = theirs or (title[1] if title else "another program")
+            if theirs not in ("", own):
+                raise InputError(
+                    f"{path}: holds a report of {theirs}, which would be written over; choose another folder"
+                )
+        if os.path.isfile(file):
+            context.call_on_close(partial(_say_replaced, file, os.stat(file)))
+    return given
+
+
+def _say_replaced(file: str, before: os.stat_result) -> None:
+    with contextlib.suppress(FileNotFoundError):
+        if (now := os.stat(file)).st_ino != before.st_ino or now.st_mtime_ns != before.st_mtime_ns:
+            click.echo(f"note: replaced: {file}", err=True)
 
 
 def _parameters(of: Any) -> Iterator[click.Parameter]:  # noqa: ANN401 - a function or a class

@@ -217,7 +217,7 @@ def test_another_reports_page_is_not_written_over(tmp_path, capsys):
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "report.html").write_text("another's")
     file = file_of(tmp_path / "c.csv", rows_of())
-    assert_rejected(said(capsys, file, "-o", tmp_path / "other"), "another command's report.html", "another folder")
+    assert_rejected(said(capsys, file, "-o", tmp_path / "other"), "a report of another program", "another folder")
     assert (tmp_path / "other" / "report.html").read_text() == "another's"
 
 

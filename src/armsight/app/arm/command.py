@@ -266,10 +266,7 @@ def report(
 
     if output is not None:
         require_matplotlib()
-        check_folder(output, problem="no report can be written here")
-        if (output / "summary.json").exists():
-            raise InputError(f"{output}: holds a run, whose report would be written over; choose another folder")
-        check_folder(output, holding=FILES, apart_from=(run, *compare))
+        check_folder(output, holding=FILES, apart_from=(run, *compare), problem="no report can be written here")
     arm = nominal_arm(run, arm_name)
     others = {path.parent.name or path.stem: read_report(path) for path in compare}
     with steps() as progress:

@@ -191,7 +191,7 @@ def arm_report(report: ArmReport, others: Mapping[str, dict[str, Any]]) -> Repor
         "notes": ("Notes", [Lines(remarks(report))]),
         "plots": ("Figures", plots),
     }
-    return Report(report.arm, heading, sub, "", sections, values=report.to_json(), assessed=assess(report))
+    return Report("arm report", heading, sub, "", sections, values=report.to_json(), assessed=assess(report))
 
 
 def assess(report: ArmReport) -> tuple[Grade, str]:

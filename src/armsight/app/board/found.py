@@ -400,7 +400,7 @@ def report(found: Found, gains: Array) -> Report:
         "problems": ("Problems on the way", [Lines(problems)]),
     }
     sub = f"board {found.board}, {found.supply_v:g} V, {found.arm_time_s:.0f} s of the board's time"
-    return Report("bring-up", "Bring-up of the arm's board", sub, "", sections)
+    return Report("board bringup", "Bring-up of the arm's board", sub, "", sections)
 
 
 def _figure(found: Found) -> Figure | None:

@@ -7,7 +7,7 @@ import json
 import click
 
 from armsight.app.body import PAPERS
-from armsight.app.options import JSON, argument, declared, option
+from armsight.app.options import JSON, argument, declared, option, out
 from armsight.errors import InputError
 from armsight.files import check_writable
 
@@ -57,7 +57,7 @@ def check(
 @declared
 def draw(
     paths: tuple[str, ...] = argument("BODY.toml|BOARD...", required=True),
-    output: str = option("The drawing: .pdf, .svg or .png.", "-o", "--output", metavar="OUT"),
+    output: str = out("OUT", "The drawing: .pdf, .svg or .png."),
     paper: str = option("", default="a4", type=click.Choice(list(PAPERS), case_sensitive=False)),
     split: bool = option("Split a drawing larger than the paper into several overlapping sheets."),
     dpi: int = option("Resolution of a .png, pixels per inch.", default=600, min=72, max=2400),

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from armsight.app.options import JSON, argument, declared, option
+from armsight.app.options import JSON, argument, declared, option, out
 from armsight.errors import InputError
 
 if TYPE_CHECKING:
@@ -36,9 +36,7 @@ def command(
     options: PlanOptions,
     plan: tuple[str, ...] = argument("[PLAN.toml] [KEY=VALUE]..."),
     optimise: bool = option("Choose what is left out, for each class of cameras.", "--best"),
-    output: str | None = option(
-        "Write report.html, budget.json, the rig and the body to print.", "-o", "--output", metavar="DIR"
-    ),
+    output: str | None = out("DIR", "Write report.html, budget.json, the rig and the body to print."),
     as_json: bool = JSON,
 ) -> int:
     """Say before a rig is bought what it will measure, what limits it, and what would make it better.

@@ -35,10 +35,10 @@ class CalibrateOptions:
     lens_model: str | None = option("Distortion model; by default the held-out error chooses.", choices=MODELS)
     flat_target: bool = option("Do not estimate the target's deviation from its drawing.")
     cameras: Path | None = option("Intrinsics of both cameras, with detections.", metavar="CAMERAS.json")
-    refine_body: Path | None = option("Estimate the body's points too, and write them here.", metavar="OUT.csv")
+    refine_body: Path | None = out("OUT.csv", "Estimate the body's points too, and write them here.", "--refine-body")
     folds: int = option("Parts for the held-out errors.", min=2, default=FOLDS)
     output: Path = out("RIG.json", "The rig to write.")
-    report: Path | None = option("Write an HTML report with figures; needs armsight[report].", metavar="DIR")
+    report: Path | None = out("DIR", "Write an HTML report with figures; needs armsight[report].", "--report")
     as_json: bool = JSON
 
 

@@ -352,7 +352,7 @@ def calibration_report(
     }
     what = f"{c.body.name} · {used} · {size} · baseline {1e3 * c.rig.baseline_m:.1f} mm"
     return Report(
-        "calibration report",
+        "calibrate",
         "Calibration of two cameras",
         what,
         found.meaning,

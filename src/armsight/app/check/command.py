@@ -75,20 +75,13 @@ def evaluated(
     from armsight.app.check.report import REPORT_FILES, check_report
     from armsight.app.check.result import check_limits, metric_lines, read_limits
     from armsight.app.check.rows import rows_csv
-    from armsight.app.check.run_folder import is_run
-    from armsight.app.show.page import PAGE
     from armsight.app.show.plotting import require_matplotlib
 
     if output is not None:
         require_matplotlib()
-        check_folder(output, problem="no report can be written here")
-        if output.is_dir() and is_run(output):
-            raise InputError(f"{output}: holds a run, whose report would be written over; choose another folder")
-        if (output / PAGE).exists() and not (output / "check.json").exists():
-            raise InputError(
-                f"{output}: holds another command's {PAGE}, which would be written over; choose another folder"
-            )
-        check_folder(output, holding=REPORT_FILES, apart_from=(data, data / "check.csv"))
+        check_folder(
+            output, holding=REPORT_FILES, apart_from=(data, data / "check.csv"), problem="no report can be written here"
+        )
     limits = read_limits(limit_texts)
     attained = read_check(data, closed=closed, columns=columns)
     result = evaluate(attained)

@@ -99,7 +99,7 @@ def handeye_report(run: HandEyeAnswer) -> Report:
     if run.plan is not None:
         sections["plan"] = ("Poses to take next", _plan(run.plan, names_, found.structure))
     return Report(
-        "hand-eye calibration",
+        "handeye",
         "Hand-eye calibration",
         f"{run.recording.robot.path.name} · {len(found.used)} poses · eye {found.eye.replace('_', ' ')}",
         headline,

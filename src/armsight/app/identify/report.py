@@ -215,7 +215,7 @@ def identify_report(run: Identification, *, everything: bool = False) -> Report:
         *([] if everything else [Text(_in_short(backlashes, len(pairs)))]),
     ]
     return Report(
-        "identification of an arm",
+        "identify",
         "Kinematic identification",
         f"{run.arm.name} · {len(run.measured)} poses · {fitted} parameters fitted",
         headline(run),

@@ -26,8 +26,8 @@ class LiveOptions:
     source: str | None = option(
         "The cameras, such as usb:0,1 (see armsight record -h); sim: is the simulated workcell."
     )
-    rig: Path | None = option("A calibrated rig; begins with measuring.")
-    target: str | None = option("The body that is measured: a body file or a board.")
+    rig: Path | None = option("A calibrated rig; begins with measuring.", metavar="RIG.json")
+    target: str | None = option("The body that is measured: a body file or a board.", metavar="SPEC|BODY")
     calibration_board: str | None = option("The calibration board, such as chessboard:9x6:25mm.", metavar="SPEC")
     board: str | None = option(
         "The arm's controller: serial:PORT, feetech:PORT,LEROBOT.json, ar4:PORT; poses:FILE where another program moves "
@@ -35,9 +35,9 @@ class LiveOptions:
     )
     arm: str = ARM
     servo_calibration: Path | None = option(
-        "LeRobot's calibration file of a servo bus, whose port the page finds.", "--calibration"
+        "LeRobot's calibration file of a servo bus, whose port the page finds.", "--calibration", metavar="FILE.json"
     )
-    motion: Path | None = option("The motions (TOML, docs/howto/run.md).")
+    motion: Path | None = option("The motions (docs/howto/run.md).", metavar="MOTION.toml")
     folder: Path = out("DIR", "Folder of the session.", default="live")
     follow_rig: bool = FOLLOW_RIG
     seed: int = SEED

@@ -31,15 +31,17 @@ class MeasureOptions:
     readout: str | None = option(
         "Rolling shutters: from the first row to the last, such as 14ms, or find.", metavar="TIME"
     )
-    save_rig: Path | None = option(
-        "Write the rig with the skew and readout found, and the noise of a moved body's discs.", metavar="RIG2.json"
+    save_rig: Path | None = out(
+        "RIG2.json",
+        "Write the rig with the skew and readout found, and the noise of a moved body's discs.",
+        "--save-rig",
     )
     output: Path | None = out("POSES.csv", "Write the poses as CSV.")
     stream: tuple[str, ...] = STREAM
     board: str | None = option(
         "Publish this board's joint readings, too: serial:, feetech: or ar4:PORT, emulated:.", metavar="BOARD"
     )
-    view_dir: Path | None = option("Write annotated pictures.", "--view", metavar="DIR")
+    view_dir: Path | None = out("DIR", "Write annotated pictures.", "--view")
     as_json: bool = option("Print one JSON object per shot.", "--json")
 
     @property

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from armsight.app.options import JSON, argument, declared, option
+from armsight.app.options import JSON, argument, declared, option, out
 from armsight.errors import InputError
 from armsight.files import check_outputs, check_writable
 from armsight.vision.rigfiles import ASSUMED_SIGMA_PX, EXPORTED, FORMATS, export_rig, import_rig, open_format
@@ -44,7 +44,7 @@ def show(path: str = argument("RIG.json"), as_json: bool = JSON) -> None:
 @declared
 def import_(
     files: tuple[str, ...] = argument(required=True),
-    output: str = option("The rig file to write.", "-o", "--output", metavar="RIG.json"),
+    output: str = out("RIG.json", "The rig file to write."),
     name: str | None = option("The other program; by default found by content.", "--format", choices=FORMATS),
     unit_m: float | None = option("Length of the file's unit of translation, m; OpenCV files need it."),
     pair: str | None = option(
@@ -75,7 +75,7 @@ def import_(
 def export(
     path: str = argument("RIG.json"),
     more: tuple[str, ...] = argument("[OUT]..."),
-    output: tuple[str, ...] = option("File to write; may be repeated.", "-o", "--output", metavar="OUT", required=True),
+    output: tuple[str, ...] = out("OUT", "File to write; may be repeated.", required=True),
     name: str = option("The other program.", "--format", choices=EXPORTED),
     as_json: bool = JSON,
 ) -> None:
@@ -106,12 +106,12 @@ def export(
 @declared
 def update_(
     run: Path = argument(),
-    output: str = option("The rig file to write.", "-o", "--output", metavar="RIG.json"),
+    output: str = out("RIG.json", "The rig file to write."),
     since: float | None = option(
         "Use shots from this time on, board's clock, s; by default from when the run found that the cameras had moved.",
         metavar="S",
     ),
-    report: Path | None = option("Folder for a page: old rig beside new.", metavar="DIR"),
+    report: Path | None = out("DIR", "Folder for a page: old rig beside new.", "--report"),
     as_json: bool = JSON,
 ) -> None:
     """Estimate the relative pose of a run's cameras again, from the body that the run saw: without a board.

@@ -34,13 +34,14 @@ def command(
         " poses:FILE where another program moves the arm and logs its angles.",
         "--board",
     ),
-    rig_path: Path = option("The calibrated rig, rig.json.", "--rig"),
-    target_spec: str = option("The body on the tool: a body file of discs.", "--target"),
+    rig_path: Path = option("The calibrated rig.", "--rig", metavar="RIG.json"),
+    target_spec: str = option("The body on the tool: a body file of discs.", "--target", metavar="BODY"),
     fixed: tuple[str, ...] = FIXED,
     arm_spec: str = ARM,
     motion: Path | None = option(
         "The motions (TOML, docs/howto/run.md). Without: of six_r five poses, a line and a circle, of others five poses "
-        "three times in the largest cube within reach (armsight check plan)."
+        "three times in the largest cube within reach (armsight check plan).",
+        metavar="MOTION.toml",
     ),
     sync_ms: float = option(
         "Sigma of the time between the exposures of a shot before a sweep of the arm finds it, ms; sim: knows its own.",
