@@ -64,6 +64,11 @@ def nees(found, Z, X):
     return float(e @ np.linalg.solve(found.cov, e))
 
 
+def nees_held(found, X):
+    e = log_se3(inverse(found.T_flange_held) @ X)
+    return float(e @ np.linalg.solve(found.cov[6:, 6:], e))
+
+
 @pytest.mark.parametrize("in_hand", [False, True])
 def test_the_covariance_holds_the_error_of_arm_and_camera(in_hand):
     squares = []
@@ -103,8 +108,7 @@ def test_what_an_arms_lengths_do_in_all_poses_alike_is_allowed_for():
         )
         for quick, squares in ((False, off), (True, claimed)):
             found = calibrate_poses(poses, quick=quick)
-            e = log_se3(inverse(found.T_flange_held) @ X)
-            squares.append(float(e @ np.linalg.solve(found.cov[6:, 6:], e)))
+            squares.append(nees_held(found, X))
     assert sum(off) < 0.25 * sum(claimed)
 
 
@@ -116,8 +120,7 @@ def test_an_arms_smooth_error_is_found_where_the_poses_are_near_each_other(seed)
     )
     found = calibrate_poses(poses)
     assert "drift_m" in found.sigmas
-    e = log_se3(inverse(found.T_flange_held) @ X)
-    assert float(e @ np.linalg.solve(found.cov[6:, 6:], e)) < chi2.isf(1e-3, 6)  # 446 to 751 without the drift
+    assert nees_held(found, X) < chi2.isf(1e-3, 6)  # 446 to 751 without the drift
     assert found.held_out_geometry is not None
     assert found.held_out_geometry.rms()[0] < 0.75 * found.held_out_nominal.rms()[0]
 
@@ -129,8 +132,7 @@ def test_lengths_of_links_that_no_residual_shows_are_allowed_for():
             seed, n=20, in_hand=True, flange=(5e-4, 1e-3), camera=(1e-3, 3e-3, 2e-3), links=(1e-3, 2e-4)
         )
         found = calibrate_poses(poses, links=links)
-        e = log_se3(inverse(found.T_flange_held) @ X)
-        squares.append(float(e @ np.linalg.solve(found.cov[6:, 6:], e)))
+        squares.append(nees_held(found, X))
     assert sum(squares) < chi2.isf(1e-3, 36)
 
 
@@ -173,8 +175,7 @@ def test_a_scale_that_walks_is_recognised_and_the_covariance_allows_for_it(steps
         found, before = (calibrate_poses(poses, t_s=t_s, scale=True) for t_s in (np.arange(40.0), None))
         assert ("camera walking" in found.structure) == any(steps)
         assert found.sigmas["scale_walk"] == pytest.approx(4e-3 * np.sqrt(39), rel=0.4)
-        e = log_se3(inverse(found.T_flange_held) @ X)
-        squares.append(float(e @ np.linalg.solve(found.cov[6:, 6:], e)))
+        squares.append(nees_held(found, X))
         off.append([np.linalg.norm(each.T_flange_held[:3, 3] - X[:3, 3]) for each in (found, before)])
     assert sum(squares) < chi2.isf(1e-3, 6)
     assert sum(found for found, _ in off) < 0.5 * sum(before for _, before in off)

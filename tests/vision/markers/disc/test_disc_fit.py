@@ -60,6 +60,23 @@ def test_centre_reaches_the_bound(a, b, blur, contrast, noise):
     assert 1 - 4 * 0.065 < np.mean(normed) < 1 + 4 * 0.065 + 0.1
 
 
+def nine_discs(rng, size, at, radius, blur):
+    """A dark image of nine bright discs from a corner on, one about the middle of each square, and their centres."""
+    light, true = np.full((336, 480), 45.0), []
+    for x, y in [(at[0] + size * column, at[1] + size * row) for column in range(3) for row in range(3)]:
+        c = size / 2 + rng.uniform(-0.5, 0.5, 2)
+        light[y : y + size, x : x + size] += 130 * share([outline(c, radius, radius, 0)], blur, np.zeros(2), size)
+        true.append(c + np.array([x, y]))
+    return light, np.array(true)
+
+
+def in_order(found, true):
+    """Which found disc is each true one, errors (N, 2) and squares (N,) of their sizes in sigmas, of two directions."""
+    order = [int(np.argmin(np.linalg.norm(found.uv - c, axis=1))) for c in true]
+    e = found.uv[order] - true
+    return order, e, np.einsum("ni,nij,nj->n", e, np.linalg.inv(found.cov_uv[order]), e) / 2
+
+
 def test_an_uneven_surround_and_uneven_light_do_not_pull():
     rng = np.random.default_rng(2)
     size, c, b = 64, np.array([31.3, 31.7]), 1.0
@@ -78,23 +95,19 @@ def test_an_uneven_surround_and_uneven_light_do_not_pull():
 
 def test_vignetting_that_no_single_disc_shows_does_not_pull_all_of_them():
     rng = np.random.default_rng(8)
-    size, width, height, corner = 48, 480, 336, 0.05
+    width, height, corner = 480, 336, 0.05
     v, u = np.mgrid[:height, :width].astype(float)
     shade = 1 - corner * ((u - (width - 1) / 2) ** 2 + (v - (height - 1) / 2) ** 2) / ((width**2 + height**2) / 4)
-    light, true = np.full((height, width), 45.0), []
-    for x, y in [(x, y) for x in (330, 378, 426) for y in (190, 238, 286)]:
-        c = size / 2 + rng.uniform(-0.5, 0.5, 2)
-        light[y : y + size, x : x + size] += 130 * share([outline(c, 12, 12, 0)], 0.8, np.zeros(2), size)
-        true.append(c + np.array([x, y]))
+    light, true = nine_discs(rng, 48, (330, 190), 12, 0.8)
     errors, normed, along = [], [], []
-    p = np.array(true) - [(width - 1) / 2, (height - 1) / 2]
+    p = true - [(width - 1) / 2, (height - 1) / 2]
     for _ in range(12):
         found = BRIGHT.find(grey(light * shade, 3.0, rng))
-        order = [int(np.argmin(np.linalg.norm(found.uv - c, axis=1))) for c in true]
-        e, cov, together = found.uv[order] - true, found.cov_uv[order], found.common[1]
+        order, e, squares = in_order(found, true)
+        cov, together = found.cov_uv[order], found.common[1]
         errors.append(e.mean(axis=0))
-        normed += list(np.einsum("ni,nij,nj->n", e, np.linalg.inv(cov), e) / 2)
-        np.testing.assert_allclose(together[:2] + together[2] * np.array(true), together[2] * p, atol=1e-12)
+        normed += list(squares)
+        np.testing.assert_allclose(together[:2] + together[2] * true, together[2] * p, atol=1e-12)
         own = np.einsum("ni,nij,nj->", p, cov, p) / (p**2).sum() ** 2
         along.append(((e * p).sum() / (p**2).sum()) ** 2 / (own + together[2] ** 2))
         assert together[2] ** 2 > 0.2 * own
@@ -106,23 +119,16 @@ def test_vignetting_that_no_single_disc_shows_does_not_pull_all_of_them():
 
 def test_a_large_thing_that_slopes_is_no_vignetting():
     rng = np.random.default_rng(9)
-    size, width, height = 48, 480, 336
-    v, _ = np.mgrid[:height, :width].astype(float)
-    light, true = np.full((height, width), 45.0), []
-    for x, y in [(x, y) for x in (250, 298, 346) for y in (150, 198, 246)]:
-        c = size / 2 + rng.uniform(-0.5, 0.5, 2)
-        light[y : y + size, x : x + size] += 130 * share([outline(c, 12, 12, 0)], 0.8, np.zeros(2), size)
-        true.append(c + np.array([x, y]))
     size = 96
+    v, _ = np.mgrid[:336, :480].astype(float)
+    light, true = nine_discs(rng, 48, (250, 150), 12, 0.8)
     large = share([outline(np.array([48.2, 47.7]), 30, 28, 0.3)], 0.8, np.zeros(2), size)
     light[2:98, 190:286] += 130 * large * (1 + 0.002 * (v - 50))[2:98, 190:286]
     errors, normed = [], []
     for _ in range(12):
-        found = BRIGHT.find(grey(light, 3.0, rng))
-        order = [int(np.argmin(np.linalg.norm(found.uv - c, axis=1))) for c in true]
-        e = found.uv[order] - true
+        _, e, squares = in_order(BRIGHT.find(grey(light, 3.0, rng)), true)
         errors.append(e.mean(axis=0))
-        normed += list(np.einsum("ni,nij,nj->n", e, np.linalg.inv(found.cov_uv[order]), e) / 2)
+        normed += list(squares)
     # Taken for vignetting, it moves all nine by 0.008 px; noise leaves 0.001 px of their mean.
     assert np.linalg.norm(np.mean(errors, axis=0)) < 0.003
     assert np.mean(normed) < 1.4
@@ -132,20 +138,14 @@ def test_discs_before_level_surrounds_are_fitted_without_a_gradient():
     rng = np.random.default_rng(10)
     size, together, alone, normed = 40, [], [], []
     for _ in range(12):
-        light, true = np.full((336, 480), 45.0), []
-        for k in range(9):
-            x, y = 180 + size * (k % 3), 108 + size * (k // 3)
-            c = size / 2 + rng.uniform(-0.5, 0.5, 2)
-            light[y : y + size, x : x + size] += 130 * share([outline(c, 5, 5, 0)], 1.4, np.zeros(2), size)
-            true.append(((x, y), c))
+        light, true = nine_discs(rng, size, (180, 108), 5, 1.4)
         image = grey(light, 3.0, rng)
-        found = BRIGHT.find(image)
-        for (x, y), c in true:
-            k = int(np.argmin(np.linalg.norm(found.uv - c - (x, y), axis=1)))
-            e = found.uv[k] - c - (x, y)
-            together.append(e)
-            normed.append(e @ np.linalg.solve(found.cov_uv[k], e) / 2)
-            alone.append(BRIGHT.find(np.ascontiguousarray(image[y : y + size, x : x + size])).uv[0] - c)
+        _, e, squares = in_order(BRIGHT.find(image), true)
+        together += list(e)
+        normed += list(squares)
+        for c in true:
+            x, y = np.rint(c - size / 2).astype(int)  # the corner of its square
+            alone.append(BRIGHT.find(np.ascontiguousarray(image[y : y + size, x : x + size])).uv[0] - c + (x, y))
     # One disc alone does not show whether its surround is level: the gradient is estimated, and moves the centre.
     assert np.mean(np.square(together)) < 0.95 * np.mean(np.square(alone))
     assert 0.75 < np.mean(normed) < 1.25  # 108 chi-squares: 0.1
