@@ -130,17 +130,13 @@ def _no_text(path: str | Path, error: UnicodeDecodeError) -> str:
     return f"{path}: not a text file in {error.encoding}; {how}"
 
 
-def read_json(path: str | Path, what: str = "") -> Any:  # noqa: ANN401 - whatever JSON holds
+def read_json(path: str | Path) -> Any:  # noqa: ANN401 - whatever JSON holds
     """Read a JSON file.
-
-    Args:
-        path: the file.
-        what: what the file is expected to be, for the message: "a rig file".
 
     Raises:
         InputError: as :func:`read_text`, or not JSON; the message names the line.
     """
-    return parsed_json(read_text(path), path, what)
+    return parsed_json(read_text(path), path)
 
 
 def require_version(path: str | Path, what: str, version: object, newest: int) -> None:

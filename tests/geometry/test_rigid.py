@@ -25,18 +25,17 @@ def test_exact_points_give_the_pose(T_a_b, seed):
     np.testing.assert_allclose(fit_rigid(p_b, transform(T_a_b, p_b)), T_a_b, atol=1e-12)
 
 
-@given(poses(), SEEDS, st.integers(3, 12), st.booleans())
-def test_same_as_scipy(T_a_b, seed, n, weighted):
+@given(poses(), SEEDS, st.integers(3, 12))
+def test_same_as_scipy(T_a_b, seed, n):
     rng = np.random.default_rng(seed)
     p_b = points(seed, n)
     p_a = transform(T_a_b, p_b) + 1e-3 * rng.normal(size=(n, 3))
-    w = rng.uniform(0.2, 2.0, n) if weighted else np.ones(n)
-    T = fit_rigid(p_b, p_a, w if weighted else None)
-    mean_b, mean_a = np.average(p_b, axis=0, weights=w), np.average(p_a, axis=0, weights=w)
-    R, _ = Rotation.align_vectors(p_a - mean_a, p_b - mean_b, weights=w)
+    T = fit_rigid(p_b, p_a)
+    mean_b, mean_a = p_b.mean(axis=0), p_a.mean(axis=0)
+    R, _ = Rotation.align_vectors(p_a - mean_a, p_b - mean_b)
     assert_rotation(T[:3, :3])
     # Nearly collinear samples condition the rotation badly, so the cost is compared, which has a minimum there.
-    cost = [(w[:, None] * (p_a - mean_a - (p_b - mean_b) @ M.T) ** 2).sum() for M in (T[:3, :3], R.as_matrix())]
+    cost = [((p_a - mean_a - (p_b - mean_b) @ M.T) ** 2).sum() for M in (T[:3, :3], R.as_matrix())]
     assert cost[0] <= cost[1] * (1 + 1e-9) + 1e-18
     np.testing.assert_allclose(transform(T, mean_b), mean_a, atol=1e-14 * 8)
 
@@ -49,15 +48,6 @@ def test_mirrored_points_still_give_a_rotation():
 def test_points_in_a_plane_are_enough():
     p_b = points(6, 5) * [1, 1, 0]
     np.testing.assert_allclose(fit_rigid(p_b, p_b), np.eye(4), atol=1e-13)
-
-
-def test_a_weight_of_zero_leaves_a_point_out():
-    p_b = points(7)
-    p_a = p_b.copy()
-    p_a[2] += 5.0
-    w = np.ones(len(p_b))
-    w[2] = 0
-    np.testing.assert_allclose(fit_rigid(p_b, p_a, w), np.eye(4), atol=1e-13)
 
 
 @pytest.mark.parametrize("n", [0, 1, 2])

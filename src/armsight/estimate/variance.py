@@ -62,7 +62,7 @@ def most_probable(
     return np.asarray(np.exp(found.x))
 
 
-def restricted(linear: Linear, start: Array, low: float, high: float, steps: int = 40) -> Array:
+def restricted(linear: Linear, start: Array, low: float, high: float) -> Array:
     """Return the variances (K,) of the greatest restricted likelihood, without a prior.
 
     Args:
@@ -70,7 +70,6 @@ def restricted(linear: Linear, start: Array, low: float, high: float, steps: int
         start: (K,) variances to begin at.
         low: the least sigma.
         high: the greatest sigma.
-        steps: iterations at most.
     """
     from scipy.optimize import minimize
 
@@ -90,7 +89,7 @@ def restricted(linear: Linear, start: Array, low: float, high: float, steps: int
         jac=True,
         method="L-BFGS-B",
         bounds=bounds.tolist(),
-        options={"maxiter": steps, "ftol": 1e-9, "gtol": 0.02},
+        options={"maxiter": 40, "ftol": 1e-9, "gtol": 0.02},
     )
     return np.asarray(np.exp(unit * found.x))
 

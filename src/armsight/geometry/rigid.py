@@ -23,13 +23,12 @@ def collinear(points: Array) -> bool:
     return bool(spread[1] <= COLLINEAR**2 * spread[2])
 
 
-def fit_rigid(p_b: Array, p_a: Array, weights: Array | None = None) -> Array:
-    """Fit ``T_a_b`` with ``p_a ~ T_a_b @ p_b`` in weighted least squares.
+def fit_rigid(p_b: Array, p_a: Array) -> Array:
+    """Fit ``T_a_b`` with ``p_a ~ T_a_b @ p_b`` in least squares.
 
     Args:
         p_b: (..., N, 3) points in b, N >= 3, not all on one line.
         p_a: (..., N, 3) the same points in a.
-        weights: (N,) non-negative weights, equal by default.
 
     Returns:
         (..., 4, 4) T_a_b.
@@ -39,11 +38,8 @@ def fit_rigid(p_b: Array, p_a: Array, weights: Array | None = None) -> Array:
     """
     if p_b.shape[-2] < 3 or p_b.shape != p_a.shape:
         raise InputError(f"a rigid fit needs 3 or more matched points, got {p_b.shape[-2]} and {p_a.shape[-2]}")
-    w = np.full(p_b.shape[-2], 1.0 / p_b.shape[-2]) if weights is None else weights / np.sum(weights)
-    mean_b, mean_a = w @ p_b, w @ p_a
-    U, _, Vt = np.linalg.svd(
-        (p_a - mean_a[..., None, :]).swapaxes(-1, -2) @ (w[:, None] * (p_b - mean_b[..., None, :]))
-    )
+    mean_b, mean_a = p_b.mean(axis=-2), p_a.mean(axis=-2)
+    U, _, Vt = np.linalg.svd((p_a - mean_a[..., None, :]).swapaxes(-1, -2) @ (p_b - mean_b[..., None, :]))
     U[np.linalg.det(U @ Vt) < 0, :, 2] *= -1.0  # a mirror image fits better: flip the direction of least spread
     R = U @ Vt
     return pose(R, mean_a - (R @ mean_b[..., None])[..., 0])

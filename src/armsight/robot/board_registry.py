@@ -41,12 +41,7 @@ def is_real(name: str) -> bool:
     return name.startswith((SERIAL, *OWN_CONTROLLERS))
 
 
-def open_motion_board(
-    name: str,
-    plant: Plant | None = None,
-    *,
-    config: Configuration | None = None,
-) -> MotionBoard:
+def open_motion_board(name: str, plant: Plant | None = None) -> MotionBoard:
     """Open any board that moves an arm by its name; emulated, with the arm at its motors and the lab's configuration.
 
     InputError: there is no such kind of board, or something is behind its port that it does not take. DeviceError: it
@@ -59,7 +54,7 @@ def open_motion_board(
     if name.startswith(AR4):
         port, baud, model = serial_port(name, ar4_board.BAUD)
         return Ar4Board.connect(SerialLink.open(port, baud), name=port, model=model or "mk3")
-    return open_board(name, plant, config=config)
+    return open_board(name, plant)
 
 
 def check_board(name: str) -> None:

@@ -151,17 +151,13 @@ def _tried(
     return Ts
 
 
-def path(
-    rig: StereoRig, patterns: Sequence[Pattern], times_s: Array, *, distance_m: float = 0.5, speed: float = 1.0
-) -> tuple[Array, Array]:
-    """Return a smooth path of a target through the volume that both cameras see.
+def path(rig: StereoRig, patterns: Sequence[Pattern], times_s: Array) -> tuple[Array, Array]:
+    """Return a smooth path of a target through the volume that both cameras see; its start comes back after some ten s.
 
     Args:
         rig: the cameras.
         patterns: the target; all of it stays in view.
         times_s: (N,) times, s.
-        distance_m: of the path's middle from the cameras.
-        speed: 1 for a path that comes back to its start after some ten seconds.
 
     Returns:
         (N, 4, 4) poses of the target in the left camera's frame, m, and (N, 6) its velocity in its own axes, m/s, rad/s.
@@ -169,8 +165,9 @@ def path(
     Raises:
         InputError: the target is not in view even at rest in the middle.
     """
+    distance_m = 0.5  # of the path's middle from the cameras
     middle = _between(rig, np.array([distance_m]))[0]
-    rates = speed * np.array([0.7, 1.1, 0.5, 0.9, 0.6, 0.8])
+    rates = np.array([0.7, 1.1, 0.5, 0.9, 0.6, 0.8])
     phases = np.array([0.0, 0.4, 1.0, 0.2, 1.7, 2.5])
     ranges = np.array([0.35 * distance_m, 0.2 * distance_m, 0.2 * distance_m, 0.5, 0.5, 0.4])
 

@@ -16,7 +16,7 @@ from armsight.data import Array
 from armsight.robot.boards.codes import SensorKind
 from armsight.robot.boards.link import Sensed
 from armsight.sim.encoders import EncodedPlant, Encoders
-from armsight.sim.joints import JOINTS, JointModel, JointPlant, Transmission, drawn_model
+from armsight.sim.joints import JOINTS, JointModel, JointPlant, drawn_model
 
 _IN_ORDER = tuple(range(JOINTS))
 _OPEN_COUNTS = 65535
@@ -147,13 +147,11 @@ def drawn_wiring(seed: int) -> Wiring:
     return Wiring(motor_signs=tuple(map(int, motors)), potentiometer_signs=tuple(map(int, pots)))
 
 
-def drawn_workshop(
-    seed: int, *, load: float = 0.6, encoders: Encoders | None = None, transmission: Transmission | None = None
-) -> tuple[WorkshopPlant, JointModel]:
+def drawn_workshop(seed: int, *, encoders: Encoders | None = None) -> tuple[WorkshopPlant, JointModel]:
     """Return an arm as it hangs on its evening, and what it is made of."""
     rng = np.random.default_rng([seed, 22])
-    model = drawn_model(seed, load=load)
-    plant = JointPlant(-np.sign(model.gravity_n_m) * np.pi / 2, seed=seed, model=model, transmission=transmission)
+    model = drawn_model(seed)
+    plant = JointPlant(-np.sign(model.gravity_n_m) * np.pi / 2, seed=seed, model=model)
     return WorkshopPlant(plant, drawn_wiring(seed), rng.uniform(0, 100, JOINTS), encoders), model
 
 
