@@ -88,50 +88,25 @@ def call(armsight, name, arguments, output):
     return armsight(*words.split(), *arguments, f"--{_}" if option else "-o", output)
 
 
-@pytest.mark.parametrize("name", FILE_WRITERS)
-def test_a_file_that_cannot_be_written_is_reported_at_once(here, armsight, name):
-    before = sorted(os.listdir(here))
-    end = SUFFIXES.get(name, "")
-    for output, words in (
+@pytest.mark.parametrize("name", [*FILE_WRITERS, *FOLDER_WRITERS])
+def test_what_cannot_be_written_is_reported_at_once(here, armsight, name):
+    before, end = sorted(os.listdir(here)), SUFFIXES.get(name, "")
+    of_files = (
         (f"none/out{end}", ["cannot be written", "there is no folder"]),
         (f"/proc/out{end}", [f"/proc/out{end}", "cannot be written"]),
         (f"{'x' * 250}{end}", ["cannot be written", "File name too long"]),
-        *([] if end else [(".", ["it is a folder"])]),
-        *([] if end else [("-", ["-: give the name of a file"])]),
-    ):
-        assert_rejected(call(armsight, name, FILE_WRITERS[name], output), *words)
-    assert sorted(os.listdir(here)) == before
-
-
-@pytest.mark.parametrize("name", FOLDER_WRITERS)
-def test_a_folder_that_cannot_be_written_is_reported_at_once(here, armsight, name):
-    before = sorted(os.listdir(here))
-    for output, words in (
+        *([] if end else [(".", ["it is a folder"]), ("-", ["-: give the name of a file"])]),
+    )
+    of_folders = (
         ("rig.json", ["rig.json: no", "Not a directory"]),
         ("rig.json/deeper", ["rig.json/deeper: no", "here"]),
         ("/proc/out", ["/proc/out: no", " here: No such file"]),
         ("x" * 256, ["File name too long"]),
         ("-", ["-: give the name of a file or folder"]),
-    ):
-        assert_rejected(call(armsight, name, FOLDER_WRITERS[name], output), *words)
+    )
+    for output, words in of_files if name in FILE_WRITERS else of_folders:
+        assert_rejected(call(armsight, name, (FILE_WRITERS | FOLDER_WRITERS)[name], output), *words)
     assert sorted(os.listdir(here)) == before
-
-
-@pytest.mark.parametrize("name", FOLDER_WRITERS)
-def test_results_of_another_command_are_not_written_over(here, armsight, name):
-    (here / "their").mkdir()
-    for file in ("report.html", "summary.json"):
-        (here / "their" / file).write_text("<title>armsight: other</title>")
-        if (file, name) != ("summary.json", "demo"):  # which replaces its own
-            assert_rejected(call(armsight, name, FOLDER_WRITERS[name], "their"), "their: holds", "another folder")
-        (here / "their" / file).unlink()
-
-
-def test_what_is_replaced_is_said(here, armsight):
-    for expected in ([], ["note: replaced: print.pdf"]):
-        answer = armsight("body", "draw", "chessboard:9x6:20mm", "-o", "print.pdf")
-        assert answer.code == 0
-        assert [line for line in answer.err.splitlines() if "replaced" in line] == expected
 
 
 @pytest.mark.parametrize(

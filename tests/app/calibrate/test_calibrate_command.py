@@ -215,13 +215,17 @@ def test_a_camera_in_the_dark_is_named(few, armsight, tmp_path):
     assert "left images without" not in said.err
 
 
-def test_a_board_that_is_not_its_own_mirror_image_shows_a_driver_that_mirrors(armsight, tmp_path):
+@pytest.fixture
+def charuco_image():
     pattern, rng = charuco(4, 5, 0.05, 0.037, "DICT_4X4_50"), np.random.default_rng(1)
     T = pose(np.eye(3), np.array([-0.1, -0.1, 0.6]))
-    image = render(example_rig((640, 360)).left, [PosedBody((pattern,), T)], plain((640, 360), rng), rng=rng)
+    return render(example_rig((640, 360)).left, [PosedBody((pattern,), T)], plain((640, 360), rng), rng=rng)
+
+
+def test_a_board_that_is_not_its_own_mirror_image_shows_a_driver_that_mirrors(armsight, tmp_path, charuco_image):
     for n in range(3):
-        cv2.imwrite(str(tmp_path / f"left{n}.png"), np.roll(image, n, axis=1)[:, ::-1])
-        cv2.imwrite(str(tmp_path / f"right{n}.png"), np.roll(image, n + 9, axis=1))
+        cv2.imwrite(str(tmp_path / f"left{n}.png"), np.roll(charuco_image, n, axis=1)[:, ::-1])
+        cv2.imwrite(str(tmp_path / f"right{n}.png"), np.roll(charuco_image, n + 9, axis=1))
     spec = "charuco:4x5:50mm:37mm:DICT_4X4_50"
     said = armsight("calibrate", *images(tmp_path), "--target", spec, "-o", tmp_path / "rig.json")
     assert_rejected(said, "left images without the target: the target is found once they are mirrored")
@@ -236,12 +240,9 @@ def test_a_board_that_is_not_its_own_mirror_image_shows_a_driver_that_mirrors(ar
         ("charuco:5x4:50mm:37mm:DICT_4X4_50", "check its counts of squares"),
     ],
 )
-def test_a_charuco_board_of_another_family_size_or_counts_is_named(armsight, tmp_path, spec, named):
-    pattern, rng = charuco(4, 5, 0.05, 0.037, "DICT_4X4_50"), np.random.default_rng(1)
-    T = pose(np.eye(3), np.array([-0.1, -0.1, 0.6]))
-    image = render(example_rig((640, 360)).left, [PosedBody((pattern,), T)], plain((640, 360), rng), rng=rng)
-    cv2.imwrite(str(tmp_path / "left0.png"), image)
-    cv2.imwrite(str(tmp_path / "right0.png"), np.roll(image, 9, axis=1))
+def test_a_charuco_board_of_another_family_size_or_counts_is_named(armsight, tmp_path, charuco_image, spec, named):
+    cv2.imwrite(str(tmp_path / "left0.png"), charuco_image)
+    cv2.imwrite(str(tmp_path / "right0.png"), np.roll(charuco_image, 9, axis=1))
     said = armsight("calibrate", *images(tmp_path), "--target", spec, "-o", tmp_path / "rig.json")
     assert_rejected(said, named)
 

@@ -130,49 +130,49 @@ def test_what_stops_the_source_leaves_what_was_stored(tmp_path, stop, said, inte
 MOMENTS = {"first image": "left000002", "second image": "right000002", "index": "shots.csv"}
 
 
-@pytest.mark.parametrize("moment", MOMENTS)
-def test_a_disk_that_fills_within_a_shot_leaves_none_of_it(tmp_path, monkeypatch, moment):
-    shots, full = some(4), OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-    replacing, write, lines = recording.replacing, os.write, []
+@pytest.fixture(params=MOMENTS)
+def at_moment(request, monkeypatch):
+    """Have two functions called at a moment within the third shot, with what is written: an image, or an index line."""
 
-    def failing_replacing(path, mode="w", **how):
-        if path.name.startswith(MOMENTS[moment]):
-            raise InputError(f"{path}: cannot be written: {full.strerror}")
-        return replacing(path, mode, **how)
+    def arranged(at_image, at_line):
+        replacing, write, lines = recording.replacing, os.write, []
 
-    def failing_write(handle, data):
-        lines.append(data)
-        if moment == "index" and len(lines) == 4:
-            return write(handle, data[:7])  # half a line gets out
-        return write(handle, data)
+        def own_replacing(path, mode="w", **how):
+            if path.name.startswith(MOMENTS[request.param]):
+                at_image(path)
+            return replacing(path, mode, **how)
 
-    monkeypatch.setattr(recording, "replacing", failing_replacing)
-    monkeypatch.setattr(recording.os, "write", failing_write)
+        def own_write(handle, data):
+            lines.append(data)
+            return write(handle, at_line(data) if request.param == "index" and len(lines) == 4 else data)
+
+        monkeypatch.setattr(recording, "replacing", own_replacing)
+        monkeypatch.setattr(recording.os, "write", own_write)
+        return MOMENTS[request.param]
+
+    return arranged
+
+
+def test_a_disk_that_fills_within_a_shot_leaves_none_of_it(tmp_path, at_moment):
+    def fail(path):
+        raise InputError(f"{path}: cannot be written: {os.strerror(errno.ENOSPC)}")
+
+    shots, file = some(4), at_moment(fail, lambda data: data[:7])  # half a line gets out
     result = record(Played(shots), tmp_path / "a")
     assert result.shots == 2
-    assert MOMENTS[moment] in result.stopped
+    assert file in result.stopped
     assert result.stopped.endswith("cannot be written: No space left on device")
     assert_same(read_back(result.directory), shots[:2])
     assert_nothing_else(result.directory, shots[:2])
 
 
-@pytest.mark.parametrize("moment", MOMENTS)
-def test_an_interrupt_within_a_shot_waits_until_it_is_stored(tmp_path, monkeypatch, moment):
-    shots, replacing, write, lines = some(5), recording.replacing, os.write, []
+def test_an_interrupt_within_a_shot_waits_until_it_is_stored(tmp_path, at_moment):
+    def interrupt(data):
+        signal.raise_signal(signal.SIGINT)
+        return data
 
-    def interrupted_replacing(path, mode="w", **how):
-        if path.name.startswith(MOMENTS[moment]):
-            signal.raise_signal(signal.SIGINT)
-        return replacing(path, mode, **how)
-
-    def interrupted_write(handle, data):
-        lines.append(data)
-        if moment == "index" and len(lines) == 4:
-            signal.raise_signal(signal.SIGINT)
-        return write(handle, data)
-
-    monkeypatch.setattr(recording, "replacing", interrupted_replacing)
-    monkeypatch.setattr(recording.os, "write", interrupted_write)
+    shots = some(5)
+    at_moment(interrupt, interrupt)
     before = signal.getsignal(signal.SIGINT)
     result = record(Played(shots), tmp_path / "a")
     assert signal.getsignal(signal.SIGINT) == before
