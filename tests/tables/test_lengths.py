@@ -28,5 +28,6 @@ def test_the_message_names_what_was_found_what_is_expected_and_the_option():
     with pytest.raises(InputError) as caught:
         check_length(60.0, 1.0, BASELINE)
     assert str(caught.value) == (
-        "baseline 60 m, with the file's lengths in m; expected 1 mm to 20 m. In mm it is 60 mm: give --unit-m 0.001"
+        "baseline 60 m, with the file's lengths in m; expected 1 mm to 20 m. In mm it is 60 mm: give --unit-m 0.001; "
+        "in cm it is 600 mm: give --unit-m 0.01; in in it is 1.524 m: give --unit-m 0.0254"
     )

@@ -197,7 +197,12 @@ def _of_text(text: str, path: str | Path) -> list[Foreign]:
         return _json(text, path)
     if first.startswith("[") or re.match(r"[\w.\"-]+\s*=", first):
         return [_toml_or_ini(text, path)]
-    return [parsed_json(text, path)] if suffix == ".json" and first else parse_yaml(text, path)
+    if suffix == ".json" and first:
+        return [parsed_json(text, path)]
+    if suffix in (".yaml", ".yml", ""):
+        return parse_yaml(text, path)
+    with as_input_error(f"{path}: no file of names and values; read are {KINDS}", InputError, why=True):
+        return parse_yaml(text, path)
 
 
 def _json(text: str, path: str | Path) -> list[Foreign]:

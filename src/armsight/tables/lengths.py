@@ -66,11 +66,13 @@ def check_length(length_m: float, unit_m: float, usual: Usual, advice: str = "--
     expected = f"expected {metric(usual.least_m)} to {metric(usual.most_m)}"
     if unit is None:
         raise InputError(f"{found}; {expected}: is the file damaged, or its unit another one?")
-    other_m = UNITS_M[unit]
-    raise InputError(
-        f"{found}; {expected}. In {unit} it is {metric(length_m / unit_m * other_m)}: "
-        f"give {advice.format(unit_m=other_m, unit=unit)}"
-    )
+    in_units = {name: length_m / unit_m * m for name, m in UNITS_M.items()}
+    fits = [
+        f"n {name} it is {metric(each)}: give {advice.format(unit_m=UNITS_M[name], unit=name)}"
+        for name, each in in_units.items()
+        if usual.least_m <= each <= usual.most_m
+    ]
+    raise InputError(f"{found}; {expected}. I{'; i'.join(fits)}")
 
 
 def metric(length_m: float) -> str:

@@ -157,6 +157,35 @@ def test_lengths_of_luxonis_are_of_the_unit_given(tmp_path, scale, options):
     assert sum("raw images" in note for note in rig.provenance["notes"]) == 1
 
 
+def test_the_pair_of_luxonis_is_left_and_right_also_without_stereo_data(tmp_path):
+    document = depthai()
+    files = write(tmp_path, {"calib.json": json.dumps(document)})
+    swapped = import_rig(None, files, pair=("right", "left"))
+    np.testing.assert_allclose(swapped.T_left_right, T_RIGHT_LEFT, atol=1e-12)
+    document["stereoRectificationData"] |= {"leftCameraSocket": -1, "rightCameraSocket": -1}
+    (alone,) = write(tmp_path, {"alone.json": json.dumps(document)})
+    for pair in (None, ("left", "right"), ("CAM_B", "CAM_C")):
+        rig = import_rig(None, [alone], pair=pair)
+        np.testing.assert_allclose(rig.T_left_right, inverse(T_RIGHT_LEFT), atol=1e-12)
+
+
+def test_a_baseline_in_a_wrong_unit_is_said_in_those_it_can_be_in(tmp_path):
+    document, mm = depthai(), 1e3 * np.linalg.norm(T)
+    files = write(tmp_path, {"calib.json": json.dumps(document)})
+    with pytest.raises(InputError, match=re.escape(f"in cm it is {mm:.4g} mm: give --unit-m 0.01")):
+        import_rig(None, files, unit_m=1.0)
+    for _, camera in document["cameraData"]:
+        for axis in "xyz":
+            camera["extrinsics"]["translation"][axis] *= 0.5  # 10.7 m: it may be one
+    rig = import_rig(None, write(tmp_path, {"calib.json": json.dumps(document)}), unit_m=1.0)
+    assert any(f"{mm / 2:.4g} mm if in cm (--unit-m 0.01)" in note for note in rig.provenance["notes"])
+
+
+def test_a_program_is_no_calibration(tmp_path):
+    with pytest.raises(InputError, match=r"gen.py: no file of names and values; read are YAML.*line 2: not YAML"):
+        import_rig(None, write(tmp_path, {"gen.py": "import sys\nif len(sys.argv) > 1: print(1)\nx: int = 2\n"}))
+
+
 @pytest.mark.parametrize(
     ("name", "said"), [("stereo_calib", True), ("K_l", True), ("bouguet", False), ("multical", False)]
 )

@@ -23,7 +23,6 @@ from armsight.errors import InputError, naming
 from armsight.geometry.pose import inverse
 from armsight.geometry.rotation import exp_so3
 from armsight.tables.document import Foreign
-from armsight.tables.lengths import BASELINE, UNITS_M, metric
 from armsight.vision.camera_file import DISTORTION, MATRIX, SIZE, camera_of, described, found, plain
 from armsight.vision.rig import StereoRig
 from armsight.vision.rigfiles.rigfile import (
@@ -32,6 +31,7 @@ from armsight.vision.rigfiles.rigfile import (
     ImportOptions,
     RigFormat,
     count_paths,
+    fitting,
     imported,
     not_held,
     rectification,
@@ -247,14 +247,9 @@ def _unit_m(flat: Mapping[str, Foreign], length: float, options: ImportOptions) 
     """Return the length of the unit of T, m, from the file or the person, who must agree."""
     if "unit_m" not in flat:
         if options.unit_m is None:
-            fit = [
-                f"{metric(length * m)} if in {unit} (--unit-m {m:g})"
-                for unit, m in UNITS_M.items()
-                if BASELINE.least_m <= length * m <= BASELINE.most_m
-            ]
             raise InputError(
                 f"T is in the unit the board was given in, which the file does not say; it is {length:.4g} long, that is "
-                f"{', or '.join(fit) or 'nothing that a baseline can be'}; squares counted as 1: --unit-m SIDE"
+                f"{fitting(length) or 'nothing that a baseline can be'}; squares counted as 1: --unit-m SIDE"
             )
         return options.unit_m
     unit = flat["unit_m"]

@@ -221,10 +221,13 @@ def _depthai_entries(documents: Sequence[Document], paths: Sequence[Path]) -> En
     entries = dict[str, Mapping[str, Foreign]]()
     try:
         cameras = {int(socket): camera for socket, camera in need(documents[0], "cameraData")}
+        if not set(first) & set(cameras) and {1, 2} <= set(cameras):
+            first = [1, 2]  # no stereo data: CAM_B and CAM_C are left and right in depthai's own names
         for socket in sorted(cameras, key=lambda socket: (first.index(socket) if socket in first else 2, socket)):
             camera, step = cameras[socket], cameras[socket]["extrinsics"]
             lens, count = _DEPTHAI_LENSES.get(camera["cameraType"], (f"cameraType {camera['cameraType']}", 0))
             entries[_socket(socket)] = {
+                "name": SIDES[first.index(socket)] if socket in first else "",
                 "K": camera["intrinsicMatrix"],
                 "distortion": camera["distortionCoeff"][:count],
                 "distortion_model": lens,
