@@ -70,6 +70,8 @@
                                  bridge shows later */
 #define FOLLOWS 0.7f            /* of the answer of the configured resistance; half: weak motors look like bridges, double: a bridge shows late */
 #define FOLLOWS_SAMPLES 8u /* after a step the answer is that since; half: what was before hides a bridge, double: weak motors look like one */
+#define INVERTED 0.3f /* of their sum: so little may both differ, by R, K and noise; half: inverted currents are bridges, double:
+                         bridges at half of their speed drive on */
 #define STUCK_SUPPLY 0.2f /* of the supply: less a stuck bridge hardly moves; half: uncertain windings look like
                              bridges, double: bridges at 0.3 are not seen */
 #define STEP_RAD_S 0.05f /* a change of the motor's speed in a tick, beyond noise and torque, that is none; half: noise
@@ -340,7 +342,7 @@ static void part_begin(motor_state *motor, float angle_rad)
 
 void motor_limit(motor_state *motor)
 {
-    motor->limited = 1u;
+    motor->limited_ticks = motor->driven_ticks + 1u;
     motor->heard_rad_s = 0.0f;
     motor->step_rad_s = UNKNOWN_RAD_S;
 }
@@ -359,7 +361,6 @@ static void sample_limited(motor_state *motor, const motor_config *config, float
     motor->dither_vv = motor->dither_va = motor->dither_aa = motor->dithers = 0.0f; /* what changed is not known */
     motor->window_side = SIDE_UNKNOWN; /* backlash may be crossed meanwhile */
     motor->mean_ticks = 0u;
-    motor->limited = 0u;
 }
 
 void motor_sleep(zero_state *zero, float current_a)
@@ -431,7 +432,7 @@ static void sample(motor_state *motor, const motor_config *config, float ir_v, f
         const float by_resistance_v = SIGMAS * number_root(motor->variance_rr) * number_size(ir_v);
         motor->doubt_rad_s = (by_resistance_v - CONSTANT_OFF * number_size(emf_v)) / config->constant_v_s;
     }
-    const bool limited = motor->limited != 0u;
+    const bool limited = motor_is_limited(motor);
     if (limited) {
         sample_limited(motor, config, angle_rad);
     }
@@ -924,6 +925,16 @@ bool motor_is_stuck(const motor_state *motor, const motor_config *config, float 
     return stuck < STUCK_SHARE * sound && number_size(by_v) > STUCK_SUPPLY * supply_v;
 }
 
+bool motor_may_have_stepped(motor_state *motor)
+{
+    const bool unseen = motor->limited_ticks != 0u && motor->driven_ticks - motor->limited_ticks < MOTOR_STEP_TICKS;
+    if (!unseen && !motor_stepped(motor)) {
+        return false;
+    }
+    motor->step_ticks = motor->driven_ticks;
+    return true;
+}
+
 bool motor_disobeys(const motor_state *motor, const motor_config *config, float supply_v, float error_rad)
 {
     if (motor->sampled <= DISOBEY_SAMPLES) {
@@ -945,8 +956,11 @@ bool motor_disobeys(const motor_state *motor, const motor_config *config, float 
     const float terminal_v = ir_v + emf_v;
     /* The resistance or constant of a motor whose bridge follows may be half of the learnt. */
     const float unsure_v = !off && follows(motor, config) ? 0.5f * (number_size(ir_v) + number_size(emf_v)) : 0.0f;
+    /* Through shorted windings a current of the wrong sign takes as much as the back-EMF. */
+    const bool as_much = !off || number_size(ir_v - emf_v) < INVERTED * number_size(terminal_v);
     if (number_size(terminal_v - applied_v * per_tick) < STUCK_SUPPLY * supply_v + unsure_v ||
-        (motor->damping_share == 0.0f && config->resistance_ohm * motor->dither_va < -ANSWER_NONE * motor->dither_vv)) {
+        (as_much && motor->damping_share == 0.0f &&
+         config->resistance_ohm * motor->dither_va < -ANSWER_NONE * motor->dither_vv)) {
         return false;
     }
     if (off) { /* the current drives it on, or would if nothing held it: shorted windings brake */

@@ -68,12 +68,15 @@ static inline float motor_explains(const motor_state *motor)
     return motor->band_rad + MOTOR_TWIST * motor->twist_rad_per_a * motor->current_a;
 }
 
+/* Return whether its driver may have limited the current since the last sample. */
+static inline bool motor_is_limited(const motor_state *motor) { return motor->limited_ticks > motor->part_ticks; }
+
 /* Return whether motor and reading are apart further than that, noise and backlash explain. */
 static inline bool motor_is_apart(const motor_state *motor, const motor_config *config)
 {
     const float left_rad = number_size(motor->gap_rad) - config->apart_rad - motor_explains(motor);
     /* A motor that went less far than its duty's voltage leads it: the reading lags by as much. */
-    return left_rad > 0.0f && motor->limited == 0u &&
+    return left_rad > 0.0f && !motor_is_limited(motor) &&
            (motor->gap_rad * motor->withheld_rad >= 0.0f || left_rad > number_size(motor->withheld_rad));
 }
 
@@ -122,6 +125,10 @@ uint32_t motor_blames(const motor_state *motor, const motor_config *config, floa
 
 /* Return whether since such a step reading and current go with a voltage that stays, whatever is put out. */
 bool motor_is_stuck(const motor_state *motor, const motor_config *config, float supply_v, motor_sums *sums);
+
+/* Return whether the back-EMF has stepped, or may have while a driver limited the current: a bridge that drives by itself once the
+ * drives are off does so, a reading that fails does not. To be asked while they are off: until they are on again that stays so. */
+bool motor_may_have_stepped(motor_state *motor);
 
 /* Return whether for 16 ms a motor has not done what was put out to it, and by reading and current another voltage drives
  * it: against the way error_rad that it is driven, or at all where nothing was put out and shorted windings brake. */

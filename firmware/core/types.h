@@ -401,7 +401,7 @@ typedef struct motor_state {
     float part_v;            /* sums since the last sample: applied voltage, current; */
     float part_a;
     float part_rad;          /* reading then */
-    uint32_t limited;        /* not 0: a driver may have limited the current since */
+    uint32_t limited_ticks;  /* driven_ticks when a driver may last have limited the current; 0: never */
     uint32_t part_ticks;     /* driven_ticks then */
     float current_a;         /* the largest mean of a sample of late */
     float damped_rad_s;      /* the speed, smoothed */

@@ -74,6 +74,37 @@ def test_an_emergency_stop_brakes_by_shorted_windings_and_ends_asleep(motors, li
     assert arm.first == (None, None)
 
 
+@pytest.mark.parametrize("kind", [PotFault.FROZEN, PotFault.INVERTED])
+def test_a_reading_that_fails_at_an_emergency_stop_is_no_bridge(motors, library, kind):
+    for seed in SEEDS:
+        arm = motors.drawn_arm(library, seed)
+        arm.enable()
+        arm.rest(400)
+        motors.until_moving(arm, 3)
+        arm.plant.break_pot(3, kind, 0.0)
+        arm.swing(20, stop_at_fault=False)
+        arm.inputs.stop_pressed = 1
+        assert arm.tick(290)["windings_shorted"]
+        assert not int(arm.out[0]["joint_faults"][3]) >> Fault.BRIDGE % 32 & 1
+
+
+@pytest.mark.parametrize("current_ma", [1200, 3000])
+def test_a_moving_joint_whose_bridge_is_stuck_at_an_emergency_stop_is_braked(motors, library, current_ma):
+    for seed in SEEDS:
+        arm = motors.drawn_arm(library, seed, brake=motors.BRAKE_N_M)
+        arm.core.config.joint[3].current_limit_ma = current_ma
+        arm.core.crc, arm.core.crc_at, arm.core.crc_known = 0xFFFFFFFF, 0, 0
+        arm.enable()
+        arm.rest(400)
+        motors.until_moving(arm, 3)
+        arm.plant.stuck[3] = 0.7
+        arm.swing(20, stop_at_fault=False)
+        arm.inputs.stop_pressed, at = 1, arm.plant.link[3]
+        arm.tick(60)
+        assert asleep(arm)
+        assert abs(arm.plant.link[3] - at) < 0.1
+
+
 @pytest.mark.parametrize("share", [0.8, 1.4])
 def test_windings_that_warm_or_cool_are_followed(motors, library, share):
     for seed in SEEDS:
