@@ -373,11 +373,12 @@ class Ranged(Fused):
     def _take(self, estimator: KalmanEstimator, samples: Samples) -> None:
         estimator.on_reading = self._heard
         sensor, noise_m = self.entry.reference, self.entry.noise_m
+        _, _, learns_delay = estimator.settings  # as with units: a range would shift it
         # Single precision, as the message of ROS has it: so a run is replayed to the last digit.
         for t, z in zip(samples.t_s.tolist(), samples.z[:, 0].astype(np.float32).tolist(), strict=True):
             if z != self._value:
                 self._value, self._since_s = z, t
-            if t - self._looked_s < FIELDS_S:
+            if t - self._looked_s < FIELDS_S or learns_delay:
                 continue
             self._looked_s = t
             if not abs(z) < MOST_M:
