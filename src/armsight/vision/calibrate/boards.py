@@ -34,6 +34,7 @@ from armsight.vision.calibrate.heldout import (
     STEPS,
     Trial,
     adjusted,
+    assessed,
     concluded,
     cross_validate,
     freed,
@@ -52,7 +53,6 @@ from armsight.vision.calibrate.screen import (
     screen,
 )
 from armsight.vision.calibrate.start import agreed_symmetries, fits, imitated, residual_rms_px, start_board
-from armsight.vision.calibrate.weak import weaknesses
 from armsight.vision.camera import DISTORTION_MODELS, Camera
 from armsight.vision.markers.circles import unseen_row
 from armsight.vision.markers.marker import CalibrationBoard
@@ -319,6 +319,7 @@ def calibrate_boards(
     flat: bool = False,
     folds: int = FOLDS,
     singles: Sequence[Pair] = (),
+    moving: bool = False,
     progress: Progress = _silent,
     second: Second | None = None,
 ) -> Calibration:
@@ -333,6 +334,8 @@ def calibrate_boards(
         folds: how many parts the pairs are split into for the held-out errors.
         singles: detections of further images by one camera alone, the other side empty and with a reason: they help to
             determine what is inside the camera. Their board has the same drawing, and may be another print.
+        moving: the board moves on from pair to pair, so that errors of neighbours are alike: whether the cameras changed
+            meanwhile cannot be tested.
         progress: called with a line about what is being done.
         second: calls a function in another process, which takes its share of the distortion models; None without one.
 
@@ -385,6 +388,7 @@ def calibrate_boards(
         rejected=tuple(rejected),
         notes=(*notes, *screened.notes, *unseen_row(board, _shown(pairs))),
         disc_radius_m=radius_m,
+        moving=moving,
     )
     _apart(calibration.rig, trial.solution.state)
     return calibration
@@ -610,7 +614,7 @@ def calibrate_recording(
         _enough(len(seen), len(pairs), _usable(pairs)[1])
     given, several = _spread(seen), tuple(m for m in ("brown4", "fisheye") if m in models) or models[:1]
     first = calibrate_boards(
-        board, given, sizes, models=several, flat=flat, folds=2, singles=singles, progress=progress
+        board, given, sizes, models=several, flat=flat, folds=2, singles=singles, moving=True, progress=progress
     )
     progress("looking for the skew of the cameras")
     found = _Recording(board, tuple(pairs), t_s, first, not singles).one_time()
@@ -622,7 +626,7 @@ def calibrate_recording(
         given = _spread(moved)
         said = f"the cameras do not expose at one time: {shutters}; the detections were moved to one time"
     calibration = calibrate_boards(
-        board, given, sizes, models=models, flat=flat, folds=folds, singles=singles, progress=progress
+        board, given, sizes, models=models, flat=flat, folds=folds, singles=singles, moving=True, progress=progress
     )
     used = f"{len(seen)} of {len(pairs)} shots show the board to both cameras; {len(given)} were used"
     calibration = replace(
@@ -631,7 +635,7 @@ def calibrate_recording(
         notes=(*calibration.notes, used, said),
         recorded=True,
     )
-    return replace(calibration, weaknesses=weaknesses(calibration))
+    return assessed(calibration)
 
 
 def _shown(pairs: Sequence[Pair]) -> list[Ids]:

@@ -20,6 +20,7 @@ from armsight.geometry.pose import inverse, transform
 from armsight.geometry.rigid import fit_rigid, fit_scale
 from armsight.geometry.rotation import skew
 from armsight.vision.calibrate import MODELS
+from armsight.vision.calibrate.change import change_of
 from armsight.vision.calibrate.motion import ExposureMotion
 from armsight.vision.calibrate.result import LEAST_SIGMA_PX, Calibration, HeldOutErrors, PairErrors, RejectedPair
 from armsight.vision.calibrate.screen import noise_px
@@ -345,10 +346,14 @@ def concluded(
     rejected: tuple[RejectedPair, ...],
     notes: tuple[str, ...],
     disc_radius_m: float | None = None,
+    moving: bool = False,
 ) -> Calibration:
     """Put a calibration together from the drawing of a body and the adjustment; the rest as in Calibration."""
     model, solution, heldout = trial.model, trial.solution, trial.heldout
     rig, state = scaled(rig_of(solution), heldout), solution.state
+    change = None if moving else change_of(model, solution, observations, rig, len(pairs))
+    if change is not None:  # the rig holds for a state between the two
+        rig = replace(rig, cov=rig.cov + change.off.T @ change.off)
     found = model.body(state.shape)[: len(body.points)]
     found = transform(fit_rigid(found, body.points), found)
     deviation_m = float(np.sqrt(((found - body.points) ** 2).sum(axis=1).mean()))
@@ -368,7 +373,13 @@ def concluded(
             heldout,
         ),
         *(trial.errors, models, rejected, notes, (), motion, disc_radius_m),
+        change=change,
     )
+    return assessed(calibration)
+
+
+def assessed(calibration: Calibration) -> Calibration:
+    """Return a calibration with its weaknesses."""
     return replace(calibration, weaknesses=(*weaknesses(calibration), *_misfits(calibration)))
 
 

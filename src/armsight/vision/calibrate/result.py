@@ -9,6 +9,7 @@ import numpy as np
 
 from armsight.data import Array, Body, Record
 from armsight.plots import new_figure
+from armsight.vision.calibrate.change import CameraChange
 from armsight.vision.calibrate.motion import ExposureMotion
 from armsight.vision.pose.bundle import BundleSolution, Observations
 from armsight.vision.rig import StereoRig
@@ -97,6 +98,7 @@ class Calibration(Record):
         motion: how far the board moved between the two exposures of a pair; None where it stood still.
         disc_radius_m: radius of the board's discs, m, given or as the images show it; None for other boards.
         recorded: whether the pairs had times, so that the skew of the cameras was looked for.
+        change: how the cameras changed while the pairs were taken; None where they did not.
     """
 
     rig: StereoRig
@@ -116,6 +118,7 @@ class Calibration(Record):
     motion: ExposureMotion | None = None
     disc_radius_m: float | None = None
     recorded: bool = False
+    change: CameraChange | None = None
 
     def __repr__(self) -> str:
         """Return the errors on pairs left out of the fit, px and mm."""

@@ -33,7 +33,7 @@ _FIELD_DEGREE, _FIELD_SHARE, _FIELD_CHANCE = 4, 0.04, 1e-4
 
 def weaknesses(calibration: Calibration) -> tuple[str, ...]:
     """Assess a calibration: one sentence per weakness, what it is and what to do; empty where nothing stands out."""
-    checks = [_agreement, _pairs, _focus, _synchrony, _sides]
+    checks = [_agreement, _changed, _pairs, _focus, _synchrony, _sides]
     if calibration.rig.cov[0, 0] > 0:  # intrinsics were estimated, not given
         checks += [_tilts, _coverage, _focal, _scale]
     return tuple(message for check in checks if (message := check(calibration)) is not None)
@@ -62,6 +62,19 @@ def _agreement(calibration: Calibration) -> str | None:
         f"the images of both cameras contradict each other by {calibration.held_out.epipolar_rms_px:.0f} px: do not "
         "measure with this rig. Does a driver mirror the images of one camera, do left and right images belong to "
         "different moments, or do they show different boards?"
+    )
+
+
+def _changed(calibration: Calibration) -> str | None:
+    change = calibration.change
+    if change is None:
+        return None
+    before, after = calibration.pairs[change.row - 1 : change.row + 1]
+    return (
+        f"the cameras changed about between {before} and {after}: {change.what}, which displaces points by "
+        f"{1e3 * change.shift_m:.2g} mm; the rig is of neither state, and its sigmas allow for that. Did a lens "
+        "refocus, was a camera knocked, are images cropped or resized? It may also look like a board that moved between "
+        "two exposures. Lock the lenses, and calibrate from the pairs of one state"
     )
 
 

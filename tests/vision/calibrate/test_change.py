@@ -1,0 +1,76 @@
+"""Cameras that change while they are calibrated: what changed is named, and the rig's covariance holds both states."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from armsight.geometry.pose import exp_se3
+from armsight.vision.calibrate.boards import calibrate_boards
+from armsight.vision.calibrate.bodies import calibrate_bodies
+from armsight.vision.camera import Camera
+from armsight.vision.detections import SeenShot
+from board_views import SIZES, board_pairs, rig_and_board, rig_error
+
+FROM, COUNT = 12, 20
+
+
+def with_intrinsics(rig, side, change):
+    camera = rig.cameras[side]
+    other = Camera(camera.image_size_px, camera.model, change(camera.intrinsics), camera.distortion)
+    return replace(rig, left=other) if side == 0 else replace(rig, right=other)
+
+
+def refocused(rig):
+    return with_intrinsics(rig, 1, lambda k: k * [1.005, 1.005, 1, 1])
+
+
+def shifted(rig):
+    return with_intrinsics(rig, 0, lambda k: k + np.array([0, 0, 0, 2.0]))
+
+
+def knocked(rig):
+    return replace(rig, T_left_right=rig.T_left_right @ exp_se3(np.array([0, 2e-3, 0, 0.01, 0, 0])))
+
+
+def pairs_of(seed, change):
+    """Pairs of which those from FROM on are of changed cameras: the board, both rigs, the pairs."""
+    true, board, Ts = rig_and_board("brown4", count=COUNT, seed=seed)
+    after = change(true)
+    first, then = (board_pairs(rig, board.body.points, Ts, seed=seed) for rig in (true, after))
+    return board, (true, after), first[:FROM] + then[FROM:]
+
+
+@pytest.mark.parametrize(
+    ("change", "what"),
+    [
+        (refocused, "the right focal length by +0.4"),
+        (shifted, "the left image's position by "),
+        (knocked, "the relative pose of the cameras by "),
+    ],
+)
+@pytest.mark.parametrize("seed", [811, 812])
+def test_cameras_that_changed_are_named_and_their_covariance_holds_both_states(change, what, seed):
+    board, rigs, pairs = pairs_of(seed, change)
+    found = calibrate_boards(board, pairs, SIZES, models=("brown4",), folds=2)
+    assert found.change is not None
+    assert abs(found.change.row - FROM) <= 1
+    assert any("the cameras changed about between" in weak and what in weak for weak in found.weaknesses)
+    for rig in rigs:
+        error = rig_error(found.rig, rig)
+        assert error @ np.linalg.solve(found.rig.cov, error) < 4 * len(error)
+
+
+@pytest.mark.parametrize("seed", [821, 822, 823])
+def test_cameras_that_did_not_change_are_not_said_to(seed):
+    board, _, pairs = pairs_of(seed, lambda rig: rig)
+    assert calibrate_boards(board, pairs, SIZES, models=("brown4",), folds=2).change is None
+
+
+def test_cameras_of_known_intrinsics_that_were_knocked_are_named():
+    board, (true, _), pairs = pairs_of(831, knocked)
+    shots = [SeenShot(p.name, (p.left.ids, p.right.ids), (p.left.uv, p.right.uv)) for p in pairs]
+    found = calibrate_bodies(board.body, shots, true.cameras)
+    assert found.change is not None
+    assert abs(found.change.row - FROM) <= 1
+    assert "the relative pose of the cameras" in found.change.what
