@@ -212,13 +212,9 @@ DEPTH_IMAGES = 16
 
 @dataclass(frozen=True, eq=False)
 class DeepShot(Shot):
-    """A shot with uint16 images.
+    """A shot with uint16 images."""
 
-    Attributes:
-        bits: how many the cameras have; the images are shifted up to fill all 16.
-    """
-
-    bits: int = 16
+    bits: int = 16  #: how many the cameras have; the images are shifted up to fill all 16
 
 
 class BitDepth:

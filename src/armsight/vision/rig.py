@@ -38,20 +38,14 @@ TANGENT = ("x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad")
 
 @dataclass(frozen=True, eq=False)
 class Shutters(Record):
-    """When the rows of two cameras are exposed.
+    """When the rows of two cameras are exposed."""
 
-    Attributes:
-        skew_s: by how much the middle row of the right camera is later than that of the left, s, beyond the stamps.
-        readout_s: of all rows, s, in both cameras: a row begins by its H-th part later than the one above; 0 is a global
-            shutter.
-        cov: (2, 2) covariance of both, s^2; zero where given and not estimated.
-        jitter_s: standard deviation by which the skew of a shot differs from the mean, s, beyond the stamps.
-    """
-
+    #: by how much the middle row of the right camera is later than that of the left, s, beyond the stamps
     skew_s: float
+    #: of all rows, s, in both cameras: a row begins by its H-th part later than the one above; 0 is a global shutter
     readout_s: float
-    cov: Array
-    jitter_s: float = 0.0
+    cov: Array  #: (2, 2) covariance of both, s^2; zero where given and not estimated
+    jitter_s: float = 0.0  #: standard deviation by which the skew of a shot differs from the mean, s, beyond the stamps
 
     def __post_init__(self) -> None:
         """Check that times are finite and the covariance is one."""
@@ -90,15 +84,10 @@ class Shutters(Record):
 
 @dataclass(frozen=True, eq=False)
 class CameraNoise(Record):
-    """What one image of a camera says too little of: how far the centres of discs are off, over what the image says.
+    """What one image of a camera says too little of: how far the centres of discs are off, over what the image says."""
 
-    Attributes:
-        variance_factor: squared errors of discs' centres over their variances by the image's own noise.
-        freedom: degrees of freedom it was measured with; its relative sigma is sqrt(2 / freedom).
-    """
-
-    variance_factor: float
-    freedom: float
+    variance_factor: float  #: squared errors of discs' centres over their variances by the image's own noise
+    freedom: float  #: degrees of freedom it was measured with; its relative sigma is sqrt(2 / freedom)
 
     def __post_init__(self) -> None:
         """Check that both are positive and finite."""
@@ -118,28 +107,19 @@ class CameraNoise(Record):
 
 @dataclass(frozen=True, eq=False)
 class StereoRig(Record):
-    """Two cameras that see the same volume.
+    """Two cameras that see the same volume."""
 
-    Attributes:
-        left: the left camera; its frame is the rig's.
-        right: the right camera.
-        T_left_right: (4, 4) pose of the right camera in the left one's frame, m.
-        cov: (P, P) covariance of the rig's parameters: left intrinsics and distortion, right intrinsics and distortion,
-            and the tangent [translation m; rotation rad] of T_left_right (perturbation on the right). Zero where a
-            parameter was given and not estimated.
-        sigma_px: standard deviation of a detection beyond the image's own covariance, px: from the calibration.
-        provenance: where the rig comes from: command, data, versions.
-        shutters: when the rows of both cameras are exposed; None where it is unknown.
-        disc_noise: of the left and of the right camera; None where it was not measured.
-    """
-
-    left: Camera
-    right: Camera
-    T_left_right: Array
+    left: Camera  #: the left camera; its frame is the rig's
+    right: Camera  #: the right camera
+    T_left_right: Array  #: (4, 4) pose of the right camera in the left one's frame, m
+    #: (P, P) covariance of the rig's parameters: left intrinsics and distortion, right intrinsics and distortion, and
+    #: the tangent [translation m; rotation rad] of T_left_right (perturbation on the right). Zero where a parameter was
+    #: given and not estimated
     cov: Array
-    sigma_px: float
-    provenance: Mapping[str, Any] = field(default_factory=dict)
-    shutters: Shutters | None = None
+    sigma_px: float  #: standard deviation of a detection beyond the image's own covariance, px: from the calibration
+    provenance: Mapping[str, Any] = field(default_factory=dict)  #: where the rig comes from: command, data, versions
+    shutters: Shutters | None = None  #: when the rows of both cameras are exposed; None where it is unknown
+    #: of the left and of the right camera; None where it was not measured
     disc_noise: tuple[CameraNoise, CameraNoise] | None = None
 
     def __post_init__(self) -> None:

@@ -180,23 +180,14 @@ def _silent(message: str) -> None:
 
 @dataclass(frozen=True, eq=False)
 class LensModelSearch(Record):
-    """The choice of the distortion model by held-out error.
+    """The choice of the distortion model by held-out error."""
 
-    Attributes:
-        model: the board.
-        motion: first motion of the board between the exposures; None where it stands still.
-        screened: the detections to fit, and those to evaluate on.
-        folds: how many parts the pairs are split into.
-        sizes: image size of the left and of the right camera, px.
-        progress: called with a line about what is being done.
-    """
-
-    model: BundleModel
-    motion: ExposureMotion | None
-    screened: Screened
-    folds: int
-    sizes: tuple[tuple[int, int], tuple[int, int]]
-    progress: Callable[[str], None]
+    model: BundleModel  #: the board
+    motion: ExposureMotion | None  #: first motion of the board between the exposures; None where it stands still
+    screened: Screened  #: the detections to fit, and those to evaluate on
+    folds: int  #: how many parts the pairs are split into
+    sizes: tuple[tuple[int, int], tuple[int, int]]  #: image size of the left and of the right camera, px
+    progress: Callable[[str], None]  #: called with a line about what is being done
 
     def best(self, models: tuple[str, ...], second: Second | None = None) -> tuple[Trial, dict[str, HeldOutErrors]]:
         """Return the first model that no later one beats by more than WORTH, and the held-out errors of those tried.
@@ -297,17 +288,11 @@ LEAST_PAIRS = 3
 
 @dataclass(frozen=True, eq=False)
 class Pair(Record):
-    """One pair of images after detection.
+    """One pair of images after detection."""
 
-    Attributes:
-        name: what the pair is called.
-        left: detections in the left image.
-        right: detections in the right image.
-    """
-
-    name: str
-    left: Detections
-    right: Detections
+    name: str  #: what the pair is called
+    left: Detections  #: detections in the left image
+    right: Detections  #: detections in the right image
 
 
 def calibrate_boards(

@@ -27,98 +27,60 @@ class RejectedPair:
 
 @dataclass(frozen=True, eq=False)
 class PairErrors(Record):
-    """Errors of pairs that a rig was not fitted on.
+    """Errors of pairs that a rig was not fitted on."""
 
-    Attributes:
-        pair: (S,) rows of the pairs.
-        epipolar_px: (S,) RMS distance from the epipolar lines, both images, undistorted px.
-        rigid_m: (S,) RMS distance of the triangulated board from the perfect one after a rigid fit.
-        scale: (S,) how many times larger than the perfect board the triangulated one is.
-        weight: (S,) matched points of the pair.
-        normalised: (S,) RMS of the rigid residual over its predicted sigma.
-        over_noise: (S,) RMS of the rigid residual over the sigma that the corners' noise alone gives it.
-    """
-
-    pair: Array
-    epipolar_px: Array
-    rigid_m: Array
-    scale: Array
-    weight: Array
-    normalised: Array
-    over_noise: Array
+    pair: Array  #: (S,) rows of the pairs
+    epipolar_px: Array  #: (S,) RMS distance from the epipolar lines, both images, undistorted px
+    rigid_m: Array  #: (S,) RMS distance of the triangulated board from the perfect one after a rigid fit
+    scale: Array  #: (S,) how many times larger than the perfect board the triangulated one is
+    weight: Array  #: (S,) matched points of the pair
+    normalised: Array  #: (S,) RMS of the rigid residual over its predicted sigma
+    over_noise: Array  #: (S,) RMS of the rigid residual over the sigma that the corners' noise alone gives it
 
 
 @dataclass(frozen=True)
 class HeldOutErrors:
-    """Errors on pairs left out of the fit, RMS over all their points.
+    """Errors on pairs left out of the fit, RMS over all their points."""
 
-    Attributes:
-        folds: how many times the pairs were split.
-        epipolar_rms_px: distance from the epipolar line, undistorted px, both images.
-        rigid_rms_m: triangulated board against the perfect one, after a rigid fit, m.
-        scale_error: relative error of the triangulated board's size, mean over pairs; 0.001 is 0.1%.
-        normalised_rms: rigid residual over its predicted sigma; 1 where the uncertainty is honest.
-        over_noise_rms: rigid residual over the sigma that the corners' noise alone gives it, without calibration or
-            motion.
-        motion_rms_m: how far the board is expected to move along an axis between the exposures of a left-out pair, m; 0
-            where boards stand still.
-        motion_rms_rad: by how much it is expected to rotate about an axis, rad.
-    """
-
-    folds: int
-    epipolar_rms_px: float
-    rigid_rms_m: float
-    scale_error: float
-    normalised_rms: float
+    folds: int  #: how many times the pairs were split
+    epipolar_rms_px: float  #: distance from the epipolar line, undistorted px, both images
+    rigid_rms_m: float  #: triangulated board against the perfect one, after a rigid fit, m
+    scale_error: float  #: relative error of the triangulated board's size, mean over pairs; 0.001 is 0.1%
+    normalised_rms: float  #: rigid residual over its predicted sigma; 1 where the uncertainty is honest
+    #: rigid residual over the sigma that the corners' noise alone gives it, without calibration or motion
     over_noise_rms: float
+    #: how far the board is expected to move along an axis between the exposures of a left-out pair, m; 0 where boards
+    #: stand still
     motion_rms_m: float = 0.0
-    motion_rms_rad: float = 0.0
+    motion_rms_rad: float = 0.0  #: by how much it is expected to rotate about an axis, rad
 
 
 @dataclass(frozen=True, eq=False)
 class Calibration(Record):
-    """A calibrated rig with the estimates and errors of its calibration.
+    """A calibrated rig with the estimates and errors of its calibration."""
 
-    Attributes:
-        rig: the result.
-        body: the board or body as estimated, aligned to its drawing.
-        deviation_m: RMS distance of the estimated body from its drawing, m; zero where it was held to it.
-        pairs: names of the pairs used, in the order of the observations' shots; images of one camera alone come last and
-            have no name here.
-        pairs_found: how many pairs were given.
-        observations: the detections that were fitted.
-        solution: the adjusted state and residuals.
-        epipolar_rms_px: epipolar RMS of the fit, px.
-        held_out: errors on held-out pairs.
-        errors: the same per pair.
-        models: held-out errors of every distortion model that was tried.
-        rejected: pairs rejected, and why.
-        notes: what was corrected or partly dropped, and why.
-        weaknesses: what is weak, and what to do about it.
-        motion: how far the board moved between the two exposures of a pair; None where it stood still.
-        disc_radius_m: radius of the board's discs, m, given or as the images show it; None for other boards.
-        recorded: whether the pairs had times, so that the skew of the cameras was looked for.
-        change: how the cameras changed while the pairs were taken; None where they did not.
-    """
-
-    rig: StereoRig
-    body: Body
-    deviation_m: float
+    rig: StereoRig  #: the result
+    body: Body  #: the board or body as estimated, aligned to its drawing
+    deviation_m: float  #: RMS distance of the estimated body from its drawing, m; zero where it was held to it
+    #: names of the pairs used, in the order of the observations' shots; images of one camera alone come last and have
+    #: no name here
     pairs: tuple[str, ...]
-    pairs_found: int
-    observations: Observations
-    solution: BundleSolution
-    epipolar_rms_px: float
-    held_out: HeldOutErrors
-    errors: PairErrors
-    models: dict[str, HeldOutErrors]
-    rejected: tuple[RejectedPair, ...]
-    notes: tuple[str, ...]
-    weaknesses: tuple[str, ...]
+    pairs_found: int  #: how many pairs were given
+    observations: Observations  #: the detections that were fitted
+    solution: BundleSolution  #: the adjusted state and residuals
+    epipolar_rms_px: float  #: epipolar RMS of the fit, px
+    held_out: HeldOutErrors  #: errors on held-out pairs
+    errors: PairErrors  #: the same per pair
+    models: dict[str, HeldOutErrors]  #: held-out errors of every distortion model that was tried
+    rejected: tuple[RejectedPair, ...]  #: pairs rejected, and why
+    notes: tuple[str, ...]  #: what was corrected or partly dropped, and why
+    weaknesses: tuple[str, ...]  #: what is weak, and what to do about it
+    #: how far the board moved between the two exposures of a pair; None where it stood still
     motion: ExposureMotion | None = None
+    #: radius of the board's discs, m, given or as the images show it; None for other boards
     disc_radius_m: float | None = None
-    recorded: bool = False
-    change: CameraChange | None = None
+    recorded: bool = False  #: whether the pairs had times, so that the skew of the cameras was looked for
+    change: CameraChange | None = None  #: how the cameras changed while the pairs were taken; None where they did not
 
     def __repr__(self) -> str:
         """Return the errors on pairs left out of the fit, px and mm."""

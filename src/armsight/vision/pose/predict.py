@@ -36,16 +36,11 @@ def plain_rig(focal_px: float = 900.0, baseline_m: float = 0.2) -> StereoRig:
 
 @dataclass(frozen=True, eq=False)
 class PredictedView(Record):
-    """A body before two cameras.
+    """A body before two cameras."""
 
-    Attributes:
-        T_left_body: (4, 4) its pose.
-        forward: (3,) unit vector from the cameras to it, left camera's frame.
-        seen: (M, 2) whether a camera sees a point: in its image, and its face not rotated away; (M, 1): one camera alone.
-    """
-
-    T_left_body: Array
-    forward: Array
+    T_left_body: Array  #: (4, 4) its pose
+    forward: Array  #: (3,) unit vector from the cameras to it, left camera's frame
+    #: (M, 2) whether a camera sees a point: in its image, and its face not rotated away; (M, 1): one camera alone
     seen: NDArray[np.bool_]
 
     @property

@@ -59,49 +59,34 @@ SHUTTER_COLUMNS = ("skew_s", "readout_s", "sigma_skew_s", "sigma_readout_s")
 
 @dataclass(frozen=True, eq=False)
 class ShotPose(SeenPose):
-    """What was measured in one shot; the values after ``reason`` hold only where ``reason`` is None.
+    """What was measured in one shot; the values after ``reason`` hold only where ``reason`` is None."""
 
-    Attributes:
-        shot: name of the shot.
-        t_s: its time, s; None where it has none.
-        reason: why no pose was measured; None where one was.
-        position_m: (3,) position of the body's origin, m.
-        quaternion_wxyz: (4,) orientation of the body.
-        euler_zyx_deg: (3,) the same as angles about z, y, x, degrees.
-        pitch_singular: whether the angle about y is +-90 degrees: then only those about z and x together are determined.
-        cov_left: (6, 6) covariance [m; rad] along the left camera's axes.
-        cov_precision: (6, 6) the share of ``cov_left`` that differs from shot to shot; the rest is the calibration's.
-        cov_body: (6, 6) covariance [m; rad] along the body's axes.
-        residual_rms_m: RMS distance of the points from the body's, m; None where it is not known.
-        reprojection_rms_px: RMS reprojection error, px.
-        misfit: Birge ratio: how many times larger the residuals are than the pixel noise allows, 1 where they are not
-            larger; the covariances include it.
-        points_m: triangulated points by name, m.
-        dropped: points that were left out, and why.
-        way: how the follower found the body; None where it was not followed.
-        jump: what was noticed about a jump of the pose; None without.
-        took_ms: duration of the measurement, ms; None where it was not followed.
-        shutters: by which all observations were moved to the shot's time; None where they were taken as simultaneous.
-    """
-
-    shot: str
-    t_s: float | None
-    reason: str | None = None
-    position_m: Array = field(default_factory=lambda: np.full(3, np.nan))
-    quaternion_wxyz: Array = field(default_factory=lambda: np.full(4, np.nan))
+    shot: str  #: name of the shot
+    t_s: float | None  #: its time, s; None where it has none
+    reason: str | None = None  #: why no pose was measured; None where one was
+    position_m: Array = field(default_factory=lambda: np.full(3, np.nan))  #: (3,) position of the body's origin, m
+    quaternion_wxyz: Array = field(default_factory=lambda: np.full(4, np.nan))  #: (4,) orientation of the body
+    #: (3,) the same as angles about z, y, x, degrees
     euler_zyx_deg: Array = field(default_factory=lambda: np.full(3, np.nan))
+    #: whether the angle about y is +-90 degrees: then only those about z and x together are determined
     pitch_singular: bool = False
+    #: (6, 6) covariance [m; rad] along the left camera's axes
     cov_left: Array = field(default_factory=lambda: np.full((6, 6), np.nan))
+    #: (6, 6) the share of ``cov_left`` that differs from shot to shot; the rest is the calibration's
     cov_precision: Array = field(default_factory=lambda: np.full((6, 6), np.nan))
+    #: (6, 6) covariance [m; rad] along the body's axes
     cov_body: Array = field(default_factory=lambda: np.full((6, 6), np.nan))
-    residual_rms_m: float | None = None
-    reprojection_rms_px: float = math.nan
+    residual_rms_m: float | None = None  #: RMS distance of the points from the body's, m; None where it is not known
+    reprojection_rms_px: float = math.nan  #: RMS reprojection error, px
+    #: Birge ratio: how many times larger the residuals are than the pixel noise allows, 1 where they are not larger;
+    #: the covariances include it
     misfit: float = math.nan
-    points_m: Mapping[str, Array] = field(default_factory=dict)
-    dropped: tuple[Dropped, ...] = ()
-    way: str | None = None
-    jump: str | None = None
-    took_ms: float | None = None
+    points_m: Mapping[str, Array] = field(default_factory=dict)  #: triangulated points by name, m
+    dropped: tuple[Dropped, ...] = ()  #: points that were left out, and why
+    way: str | None = None  #: how the follower found the body; None where it was not followed
+    jump: str | None = None  #: what was noticed about a jump of the pose; None without
+    took_ms: float | None = None  #: duration of the measurement, ms; None where it was not followed
+    #: by which all observations were moved to the shot's time; None where they were taken as simultaneous
     shutters: Shutters | None = None
 
     @property
@@ -226,12 +211,9 @@ class ShotPoses:
 
     ``pandas.DataFrame(table.columns())`` and ``polars.DataFrame(table.columns())`` make a frame of it, as does whatever
     reads Arrow's interface where pyarrow is installed. The columns are those of ``armsight measure -o``.
-
-    Attributes:
-        poses: one a shot, missed ones included.
     """
 
-    poses: tuple[ShotPose, ...]
+    poses: tuple[ShotPose, ...]  #: one a shot, missed ones included
 
     def __len__(self) -> int:
         """Return how many shots there are."""
