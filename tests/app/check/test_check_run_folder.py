@@ -120,6 +120,7 @@ def test_rests_belong_to_their_poses_and_cycles(tmp_path, capsys):
     assert all(p["count"] == 5 for p in closed["poses"].values())
     assert closed["poses"]["P1"]["AP_m"]["raw"] < 0.5 * true
     assert said(capsys, tmp_path / "report", "--json").code == 0  # its check.csv
+    (tmp_path / "summary.json").write_text("{}")
     assert_rejected(said(capsys, tmp_path, "-o", tmp_path), "holds a report of run", "another folder")
     assert_rejected(
         said(capsys, tmp_path / "report", "-o", tmp_path / "report"), "check.csv", "read as well as written"

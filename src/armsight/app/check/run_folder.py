@@ -156,11 +156,6 @@ def require_known(folder: Path) -> None:
     require_version(summary, "run", found.get("version") if isinstance(found, dict) else None, VERSION)
 
 
-def is_run(folder: Path) -> bool:
-    """Return whether a folder holds a run."""
-    return _reference_file(folder).is_file()
-
-
 def _reference_file(folder: Path) -> Path:
     """Return the file of the commanded poses: by its present name, unless the folder has it by that of version 1 alone."""
     file, old = (folder / name for name in ("reference.csv", "wanted.csv"))
