@@ -11,7 +11,7 @@ import pytest
 from armsight.app.check.evaluate import evaluate, read_check
 from armsight.app.check.report import paths_figure
 from armsight.app.check.rows import read_rows
-from armsight.app.check.run_folder import _reversal_times, attained_in, is_run, joint_track, reversals_of, segments_of
+from armsight.app.check.run_folder import _reversal_times, attained_in, joint_track, reversals_of, segments_of
 from armsight.errors import InputError
 from cli_runs import assert_rejected, said_of
 
@@ -372,7 +372,6 @@ VERSION_1 = Path(__file__).parent / "written_by_version_1"
 
 
 def test_a_folder_of_version_1_is_read_as_version_1_read_it():
-    assert is_run(VERSION_1)
     attained = attained_in(VERSION_1, closed=False)
     assert [(row.pose, row.cycle, row.approach, row.t_s) for row in attained.rows] == [
         ("line", "1", "pose 1", 26.641),
