@@ -64,7 +64,7 @@ def known_unit():
 def made(folder, text="", readings=None):
     """Write a run to a folder and return that; with the text of references.toml it had that sensor, these its readings."""
     from armsight.loop.references.file import entries_of
-    from armsight.loop.running.setup import fused
+    from armsight.loop.running.beside import fused
     from strategies import ordinary_rig
 
     stamps, z = readings or known_unit()[:2]
@@ -298,6 +298,7 @@ def test_a_range_is_fused_and_recorded_and_said_to_agree_or_not(armsight, run, t
     answer = beside(z).lines[0]["reference"]
     assert answer["agrees"] is True
     assert 0.0 < answer["moved_rms_m"] < 1e-3
+    assert answer["sigma_rms_m"] < 1.001 * answer["sigma_without_rms_m"]
     assert beside(z + 0.05).lines[0]["reference"]["agrees"] is False
     answer = beside(z[np.minimum(np.arange(len(z)), 12)]).lines[0]["reference"]
     assert "stood still while the tool moved" in answer["losses"][0]

@@ -14,7 +14,8 @@ from armsight.app.run.devices import JUMP_S, LiveReadings
 from armsight.errors import ArmsightError
 from armsight.loop.references.file import COLUMNS, Entry
 from armsight.loop.references.inertial import Inertial
-from armsight.loop.running.setup import Fused, HostClock
+from armsight.loop.running.beside import Fused
+from armsight.loop.running.setup import HostClock
 
 ENTRY = Entry(Inertial.of("imu"), "mpu-6050", None, None, None, False)
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from armsight.loop.references.update import Shares, gained
+from armsight.loop.estimators.considered import Shares, gained
 
 
 def test_a_reading_of_three_numbers_is_the_joint_filter_without_gain_of_the_parameters():

@@ -24,12 +24,13 @@ from armsight.loop.estimators import Delay, KalmanEstimator
 from armsight.loop.references.file import Entry
 from armsight.loop.references.inertial import Inertial
 from armsight.loop.running import log
+from armsight.loop.running.beside import Fused
 from armsight.loop.running.calibrate import find_delay
 from armsight.loop.running.controllers import PERIOD_S, Planned
 from armsight.loop.running.data import NoteDatum
 from armsight.loop.running.log import Log, RunSegment
 from armsight.loop.running.loop import SIMULATED_SEARCH_S, Loop, beside, steady
-from armsight.loop.running.setup import Fused, Setup
+from armsight.loop.running.setup import Setup
 from armsight.robot.arm_file import open_arm
 from armsight.robot.boards.codes import BoardState
 from armsight.robot.boards.contract import Abilities

@@ -37,10 +37,10 @@ from armsight.geometry.pose import inverse, log_se3, pose
 from armsight.geometry.rotation import exp_so3
 from armsight.loop.estimators import KalmanEstimator, Mounting
 from armsight.loop.references.file import read_references
+from armsight.loop.running.beside import the_one
 from armsight.loop.running.calibrate import Progress, handeye_poses
 from armsight.loop.running.log import Log
 from armsight.loop.running.loop import Loop
-from armsight.loop.running.setup import the_one
 from armsight.loop.servo import PoseServo
 from armsight.processes import Process, caller
 from armsight.robot.arm_file import open_arm

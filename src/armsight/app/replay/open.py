@@ -16,7 +16,7 @@ from armsight.app.stream.streams import open_streams
 from armsight.data import Body
 from armsight.errors import InputError
 from armsight.loop.references.file import entries_of, read_references
-from armsight.loop.running.setup import fused, recorded, the_one
+from armsight.loop.running.beside import fused, recorded, the_one
 from armsight.robot.arm_file import open_arm
 from armsight.vision.markers.marker import Target
 from armsight.vision.markers.targets import open_body, open_target

@@ -29,8 +29,8 @@ from armsight.loop.estimators import (
     Remembered,
 )
 from armsight.loop.identify.odometry import Odometry, odometry
+from armsight.loop.running.beside import Fused, FusedRow, HeadingRow
 from armsight.loop.running.data import EventDatum, JointsDatum, Publisher, ShotDatum
-from armsight.loop.running.setup import Fused, FusedRow, HeadingRow
 from armsight.robot.kinematics.arm import Arm
 from armsight.vision.detections import SeenShot
 from armsight.vision.follow.follower import Follower, follows

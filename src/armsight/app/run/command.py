@@ -85,8 +85,8 @@ def command(
     from armsight.app.run.motion_file import read_motions
     from armsight.app.run.report import show
     from armsight.loop.references.file import read_references
+    from armsight.loop.running.beside import the_one
     from armsight.loop.running.calibrate import handeye_poses
-    from armsight.loop.running.setup import the_one
     from armsight.robot.arm_file import open_arm
     from armsight.vision.follow.follower import follows
     from armsight.vision.markers.targets import open_fixed, open_target

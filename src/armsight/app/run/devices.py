@@ -23,7 +23,8 @@ from armsight.errors import DeviceError, InputError
 from armsight.loop.references.distance import Distance
 from armsight.loop.references.file import COLUMNS, Entry
 from armsight.loop.references.inertial import INERTIAL_CLASSES, Inertial
-from armsight.loop.running.setup import Fused, HostClock, LiveShots, Setup, fused
+from armsight.loop.running.beside import Fused, fused
+from armsight.loop.running.setup import HostClock, LiveShots, Setup
 from armsight.robot.board_registry import EMULATED, check_board, emulator_name, open_motion_board, slowed
 from armsight.robot.boards.board import Board
 from armsight.robot.boards.contract import MotionBoard

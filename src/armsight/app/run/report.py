@@ -34,8 +34,8 @@ from armsight.errors import InputError
 from armsight.loop.health import health_lines, unseen_lines
 from armsight.loop.health.follow import correction_lines
 from armsight.loop.identify.odometry import Odometry, odometry
+from armsight.loop.running.beside import Fused
 from armsight.loop.running.log import Log
-from armsight.loop.running.setup import Fused
 from armsight.robot.kinematics.arm import Arm
 
 #: Track -> its name in tables.

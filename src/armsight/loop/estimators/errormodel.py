@@ -19,11 +19,11 @@ from armsight.geometry.matrix import solved
 from armsight.kernels import kernel
 from armsight.loop.estimators import armerror
 from armsight.loop.estimators.armerror import Prior, layout, pose_and_derivative, tangent
+from armsight.loop.estimators.considered import Considered
 from armsight.loop.estimators.estimator import PoseMeasurement
 from armsight.loop.estimators.readings import Smoothed
 from armsight.loop.references.reference import Reading, Reference
 from armsight.loop.references.strapdown import Navigated
-from armsight.loop.references.update import Considered
 from armsight.robot.kinematics.arm import Arm
 
 #: After so long a joint has crept wherever it could, s.

@@ -28,6 +28,7 @@ from armsight.geometry.pose import left_axes
 from armsight.loop.estimators import armerror
 from armsight.loop.estimators.armerror import Prior
 from armsight.loop.estimators.clock_doubt import ClockDoubt, JumpingClock
+from armsight.loop.estimators.considered import Considered, Shares, gained, passed
 from armsight.loop.estimators.errormodel import (
     LEARNING,
     NONE_CONSIDERED,
@@ -51,7 +52,6 @@ from armsight.loop.estimators.smoothing import Interval, blended, by_state, inte
 from armsight.loop.references.inertial import Inertial
 from armsight.loop.references.reference import Reading, Reference, ToolMotion
 from armsight.loop.references.strapdown import Advanced, Navigated, Samples, Strapdown
-from armsight.loop.references.update import Considered, Shares, gained, passed
 from armsight.robot.kinematics.arm import Arm
 
 #: A measurement less likely than this is an outlier.
@@ -646,7 +646,7 @@ class KalmanEstimator:
         """Return the state after a reading of a reference, None where it is an outlier; report it."""
         (reference, reading), t_s = taken, max(taken.t_s, before.t_s)
         before, joints = self._anew(self._felt(before, t_s, report=report), np.array([t_s]))
-        step = self._model.moved(before, joints, np.array([t_s]), learning=LEARNING)
+        step = self._model.moved(before, joints, np.array([t_s]))  # one number does not teach what a change of side did
         kept, added = step.kept[0], step.added[0]
         x, P = self._propagated(before, step)
         (T,), (by_state,) = self._model.poses(x, joints.q, joints.unseen)
