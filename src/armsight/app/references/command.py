@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -336,16 +337,7 @@ def _calibrated(entries: list[Entry], poses: Path) -> tuple[Report, list[Entry]]
     for entry in entries:
         readings = _averaged(entry, path)
         click.echo(f"{entry.reference.name}: fitting its parameters to {len(readings)} readings", err=True)
-        if isinstance(entry.reference, Distance) and entry.calibrated:
-            fits = {
-                other.where: np.median(
-                    [abs(float(z.z[0] - other.reference.expected(path(z.t_s), 0).z[0])) for z in readings]
-                )
-                for other in entries
-                if isinstance(other.reference, Distance) and other.calibrated
-            }
-            if fits[best := min(fits, key=lambda where: fits[where])] < SWAPPED * fits[entry.where]:
-                raise InputError(f"{entry.where}: its readings fit the anchor of {best}: swap their sources")
+        _require_own(entry, entries, readings, path)
         began = entry.reference if entry.calibrated else entry.reference.begun(readings, path)
         result = fit(began, readings, path, fit_delay=True)
         noise = max(result.noise.values()) * float(np.sqrt(np.median([each.cov[0, 0] for each in readings])))
@@ -353,15 +345,7 @@ def _calibrated(entries: list[Entry], poses: Path) -> tuple[Report, list[Entry]]
         values, parts = _said(result)
         if isinstance(entry.reference, Distance):
             off = [readings[k].t_s for k in np.flatnonzero(~result.used)]
-            spells = np.split(off, np.flatnonzero(np.diff(off) > DELAY_S) + 1) if off else []
-            times = ", ".join(f"{each[0]:.1f} to {each[-1]:.1f}" for each in spells[:SPELLS])
-            if times:
-                notes.append(
-                    Note("weak", f"{entry.where}: ranges are off at {times} s: a wire that hooks, a thing between?")
-                )
-            if (most := values["noise_factor"]["range"]) > NOISY:
-                said = f"it is off by {1e3 * noise:.2g} mm, {most:.2g} times its noise"
-                notes.append(Note("weak", f"{entry.where}: {said}: a wire that hangs through, or poses that are off"))
+            notes += [Note("weak", f"{entry.where}: {text}") for text in _ranges_off(off, noise, values)]
         found.append(values)
         blocks += parts
     sections = {"references": ("References", blocks)}
@@ -372,6 +356,38 @@ def _calibrated(entries: list[Entry], poses: Path) -> tuple[Report, list[Entry]]
         answer = "fair", f"Usable with care: {ratio}: something moves that no parameter describes; fasten the sensor."
     values = {"references": found}
     return Report("references calibrate", "References", "", "", sections, notes, values, assessed=answer), done
+
+
+def _require_own(entry: Entry, entries: list[Entry], readings: list[Any], path: Any) -> None:  # noqa: ANN401
+    """Raise an InputError where a range's readings fit the anchor of another one."""
+    import numpy as np
+
+    from armsight.errors import InputError
+    from armsight.loop.references.distance import Distance
+
+    if not (isinstance(entry.reference, Distance) and entry.calibrated):
+        return
+    fits = {
+        other.where: np.median([abs(float(z.z[0] - other.reference.expected(path(z.t_s), 0).z[0])) for z in readings])
+        for other in entries
+        if isinstance(other.reference, Distance) and other.calibrated
+    }
+    best = min(fits, key=lambda where: fits[where])
+    if fits[best] < SWAPPED * fits[entry.where]:
+        raise InputError(f"{entry.where}: its readings fit the anchor of {best}: swap their sources")
+
+
+def _ranges_off(off_s: list[float], noise_m: float, values: dict[str, Any]) -> Iterator[str]:
+    """Yield what is weak about a range: when it was off, times in s, and that its noise, m, is large."""
+    import numpy as np
+
+    if off_s:
+        spells = np.split(off_s, np.flatnonzero(np.diff(off_s) > DELAY_S) + 1)
+        times = ", ".join(f"{each[0]:.1f} to {each[-1]:.1f}" for each in spells[:SPELLS])
+        yield f"ranges are off at {times} s: a wire that hooks, a thing between?"
+    if (most := values["noise_factor"]["range"]) > NOISY:
+        said = f"it is off by {1e3 * noise_m:.2g} mm, {most:.2g} times its noise"
+        yield f"{said}: a wire that hangs through, or poses that are off"
 
 
 def _averaged(entry: Entry, path: Any) -> list[Any]:  # noqa: ANN401 - imported late
