@@ -90,6 +90,7 @@ def test_each_program_gives_the_same_poses_without_the_frames_that_lack_the_body
     kept = read_pose_table(tmp_path / name, columns="pose=Tool" if "two" in program else None, keep_missed=True)
     assert kept.missed == tuple("the body was not seen" if k == LOST else "" for k in range(4))
     np.testing.assert_allclose(kept.Ts[seen], table.Ts)
+    assert table.names is None  # rows of a robot's table have other names, or none
     assert table.unused == ()
     assert [text.splitlines()[line - 1].split("\t" if name == "a.tsv" else ",")[0] for line in table.lines] == [
         str(k + round(100 * begin_s or name == "a.tsv")) for k in seen

@@ -76,11 +76,11 @@ def capture_rows(path: Path, text: str, side: str, whose: str | None) -> Program
         raise InputError(f"{said} with lengths in {export.unit!r}; known are {', '.join(_UNITS_M)}")
     columns = [at[name] for name in (*_POSITION, *rotation)]
     read = [(line, _pose(row, columns, unit_m, export.rate_hz)) for line, row in export.frames]
-    rows = [(line, [f"line {line}", *cells]) for line, cells in read if cells]
+    rows = [(line, cells) for line, cells in read if cells]
     if not any("ok" in cells for _, cells in rows):
         raise InputError(f"{said}: none of its {len(read)} frames has a pose of the body")
     note = f"{path}: read as {program}'s, lengths in {export.unit}{_left_out(read)}"
-    return ProgramPoints(["shot", "status", "reason", "t_s", *_POSITION, *rotation], rows, None, (note,))
+    return ProgramPoints(["status", "reason", "t_s", *_POSITION, *rotation], rows, None, (note,))
 
 
 def _left_out(read: list[tuple[int, list[str] | None]]) -> str:

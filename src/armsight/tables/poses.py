@@ -34,7 +34,7 @@ _, NEAR_M, FAR_M = REACH
 REACH_M = 3.0
 MOST_DEG = 360.0  # an angle in degrees is not larger
 MIXED = 200.0  # lengths that differ by more than this factor in one table are not in one unit
-_MEASURED = {"shot", "status", "reason", "x_m"}  # columns of the poses that `armsight measure -o` wrote
+_MEASURED = {"status", "reason", "x_m"}  # columns of poses of which some may be missed, as `armsight measure -o` writes them
 
 
 class ArmJoints(Protocol):
@@ -188,7 +188,7 @@ def columns_in(
 
 
 def _shown(path: Path, head: list[str], rows: Rows) -> tuple[Rows, tuple[str, ...]]:
-    """Return the rows of `armsight measure`, some pose in those without one, and why they have none."""
+    """Return the rows, some pose in those that were missed, and why these have none."""
     status, reason, first = head.index("status"), head.index("reason"), head.index("x_m")
     some = next((row for _, row in rows if row[status] == "ok"), None)
     if some is None:
