@@ -3,6 +3,7 @@
 import json
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,11 +12,13 @@ from armsight.app.references import command
 from armsight.errors import InputError
 from armsight.geometry.pose import exp_se3, inverse, log_se3
 from armsight.geometry.rotation import quaternion_wxyz
+from armsight.loop.estimators.kalman import KalmanEstimator
 from armsight.loop.references.calibrate import PosePath
 from armsight.loop.references.file import COLUMNS, read_references, written
 from armsight.loop.references.heading import Magnetometer
 from armsight.loop.references.inertial import Inertial
 from armsight.loop.references.reference import ToolMotion
+from armsight.loop.running.beside import Ranged
 from armsight.robot.arm_file import open_arm
 from armsight.sim.references.distance import DrawWire
 from armsight.sim.references.heading import MagneticUnit
@@ -279,3 +282,55 @@ def test_a_range_is_checked_and_calibrated_and_what_is_wrong_with_it_is_named(ca
     assert said["references"][0]["drift_m"][0] > command.RESTS["range"][2]
     said = said_of(capsys, "references", "check", tmp_path / "mm.toml")
     assert (said.code, "as if in mm; give m" in said.err) == (2, True)
+
+
+def recorded_range(folder, rate_hz, anchor, sense, seconds=30.0):
+    """Write poses and a range, as a sensor senses distances (N,), that ``wire.toml`` names; return times and distances."""
+    at, t_s = np.arange(0.0, seconds, 0.02), np.arange(0.0, seconds - 0.02, 1 / rate_hz)
+    Ts = np.array([pose(t) for t in at])
+    rows = np.column_stack([at, Ts[:, :3, 3], quaternion_wxyz(Ts[:, :3, :3])])
+    np.savetxt(
+        folder / "poses.csv", rows, "%.9f", ",", header="t_s,x_m,y_m,z_m,qw,qx,qy,qz", comments=""
+    )  # fmt: skip
+    far = np.array([np.linalg.norm(T[:3, 3] + T[:3, :3] @ [0.0, 0.05, 0.06] - anchor) for T in map(pose, t_s)])
+    np.savetxt(folder / "wire.csv", np.column_stack([t_s, sense(far)]), "%.9g", ",", header="t_s,range_m", comments="")
+    (folder / "wire.toml").write_text('[wire]\nkind = "range"\nsource = "wire.csv"\n')
+    return t_s, far
+
+
+def calibrated_range(capsys, folder):
+    given = folder / "wire.toml", "--poses", folder / "poses.csv", "-o", folder / "out.toml", "--json"
+    return said_of(capsys, "references", "calibrate", *given, kind="range")
+
+
+class Taking(KalmanEstimator):
+    """An estimator that knows the poses, and keeps what it is given."""
+
+    settings, span_s = (None, None, False), (0.0, 30.0)
+
+    def __init__(self):
+        self.taken = []
+
+    def track(self, t_s):
+        return SimpleNamespace(Ts_base_tool=np.array([pose(t) for t in t_s]))
+
+    def take(self, reference, reading):
+        self.taken.append(reading)
+
+
+def test_the_noise_that_a_run_gives_a_range_is_that_of_what_it_fuses(capsys, tmp_path):
+    """White noise of 1 mm a reading at 500 Hz: calibrate's means of 20 ms have 0.32 mm."""
+    anchor, rng = np.array([0.8, 0.3, 0.9]), np.random.default_rng(17)
+    t_s, far = recorded_range(tmp_path, 500.0, anchor, lambda far: far + rng.normal(0.0, 1e-3, len(far)))
+    calibrated_range(capsys, tmp_path).done()
+    (entry,) = read_references(tmp_path / "out.toml")
+    run_of, estimator = Ranged(entry), Taking()
+    z = far + rng.normal(0.0, 1e-3, len(far))
+    keep = (t_s < 10.0) | (t_s > 10.5)  # after a gap there is one reading alone
+    run_of.give(estimator, t_s[keep], z[keep, None])
+    delay_s, taken = entry.reference.delay_s, estimator.taken
+    off = [r.z[0] - entry.reference.expected(ToolMotion(pose(r.t_s - delay_s)), 0).z[0] for r in taken]
+    assert len(taken) > 140
+    assert np.sqrt(np.mean(np.square(off) / [r.cov[0, 0] for r in taken])) == pytest.approx(1.0, abs=0.25)
+    assert np.sqrt(np.median([r.cov[0, 0] for r in taken])) == pytest.approx(1e-3 / np.sqrt(10), rel=0.25)
+    assert max(r.cov[0, 0] for r in taken) > 9.9 * entry.noise_m**2

@@ -25,8 +25,6 @@ RATE = 0.05
 UNIT = 0.2
 #: A rest is so long at least, s.
 REST_S = 0.5
-#: Readings are averaged over so long, s; half: twice the time, double: fast sweeps are cut (0.5 mm at 60 mm).
-AVERAGED_S = 0.02
 #: A smaller sweep is said to be small, deg; half: levers off by 10 mm pass, double: good sweeps are blamed.
 SMALL_DEG = 60.0
 #: Stamps of a sensor may be so late against those of the poses, s; half: a phone's are not found, double: more is cut off.
@@ -395,7 +393,7 @@ def _averaged(entry: Entry, path: Any) -> list[Any]:  # noqa: ANN401 - imported 
     import numpy as np
 
     from armsight.errors import InputError
-    from armsight.loop.references.heading import FIELDS_S
+    from armsight.loop.references.heading import AVERAGED_S, FIELDS_S
     from armsight.loop.references.reference import Reading
     from armsight.loop.references.stream import check_stream
 

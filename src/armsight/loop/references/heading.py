@@ -32,6 +32,8 @@ MOST_T = 5e-3
 _NEAR_RAD = 0.1
 #: Fields are compared so far apart, s; half: a motor counts twice, double: sweeps are short of attitudes.
 FIELDS_S = 0.2
+#: Readings are averaged over so long, s; half: twice the time, double: fast sweeps are cut (0.5 mm at 60 mm).
+AVERAGED_S = 0.02
 #: One sigma before a calibration: soft iron, relative; hard iron and field, T; half, double: nothing.
 _SOFT, _HARD_T, _FIELD_T = 0.3, 200e-6, 30e-6
 #: Attitudes for 10 unknowns a row at least; singular value, last over first, below which they do not span the space.

@@ -19,7 +19,7 @@ from armsight.loop.estimators.estimator import Estimator, Innovation, Outcome
 from armsight.loop.estimators.kalman import KalmanEstimator
 from armsight.loop.references.distance import MOST_M, Distance
 from armsight.loop.references.file import Entry, read_recording
-from armsight.loop.references.heading import FIELDS_S, LEAST_T, MOST_T, NOISE_T, Magnetometer, heading_off
+from armsight.loop.references.heading import AVERAGED_S, FIELDS_S, LEAST_T, MOST_T, NOISE_T, Magnetometer, heading_off
 from armsight.loop.references.inertial import INERTIAL_CLASSES, Inertial
 from armsight.loop.references.reference import Reading, ToolMotion
 from armsight.loop.references.strapdown import GAP_S, Samples
@@ -271,14 +271,15 @@ class Witness(Fused):
 
 
 class Ranged(Fused):
-    """A range to an anchor: of readings ``FIELDS_S`` apart, as errors of a drum and of a wire last, each is fused.
+    """A range to an anchor: means over ``AVERAGED_S``, whose noise calibrate found, are fused.
 
-    One that is longer than any range, or stands still while the tool moves away from where it came, is left out.
+    They are ``FIELDS_S`` apart, as errors of a drum and of a wire last. One that is longer than any range, or stands still
+    while the tool moves away from where it came, is left out.
     """
 
     #: Residuals over their sigma below which it agrees; half: chance disagrees, double: a wire that hangs by a mm agrees.
     honest = 1.5
-    _looked_s, _since_s, _value = -np.inf, -np.inf, np.nan
+    _looked_s, _since_s, _value, _most, _near = np.inf, -np.inf, np.nan, 1, list[tuple[float, float]]()
 
     def _take(self, estimator: KalmanEstimator, samples: Samples) -> None:
         estimator.on_reading = self._heard
@@ -286,20 +287,23 @@ class Ranged(Fused):
         _, _, learns_delay = estimator.settings  # as with units: a range would shift it
         # Single precision, as the message of ROS has it: so a run is replayed to the last digit.
         for t, z in zip(samples.t_s.tolist(), samples.z[:, 0].astype(np.float32).tolist(), strict=True):
-            if z != self._value:
-                self._value, self._since_s = z, t
-            if t - self._looked_s < FIELDS_S or learns_delay:
-                continue
-            self._looked_s = t
             if not abs(z) < MOST_M:
                 self._losses[f"a range above {MOST_M:g} m was left out: give m, not mm"] += 1
                 continue
+            if z != self._value:
+                self._value, self._since_s = z, t
+            self._near = [each for each in self._near if t - each[0] < AVERAGED_S] + [(t, z)]
+            self._most, self._looked_s = max(self._most, len(self._near)), min(self._looked_s, t)
+            if t - self._looked_s < FIELDS_S or learns_delay:
+                continue
+            self._looked_s = t
             at = np.clip(np.array([self._since_s, t]) - sensor.delay_s, *estimator.span_s)
             first, now = (sensor.expected(ToolMotion(T), 0).z for T in estimator.track(at).Ts_base_tool)
             if np.abs(now - first) > max(STILL * noise_m, LEAST_M):
                 self._losses["its value stood still while the tool moved"] += 1
                 continue
-            estimator.take(sensor, Reading(t, 0, np.array([z]), noise_m**2 * np.eye(1)))
+            (t, z), fewer = np.mean(self._near, axis=0), self._most / len(self._near)
+            estimator.take(sensor, Reading(float(t), 0, np.array([z]), noise_m**2 * fewer * np.eye(1)))
 
 
 def fused(entry: Entry, source: ReadingsSource | None = None, losses: Counter[str] | None = None) -> Fused:
