@@ -14,7 +14,8 @@ from armsight.geometry.pose import exp_se3, inverse, log_se3
 from armsight.geometry.rotation import quaternion_wxyz
 from armsight.loop.estimators.kalman import KalmanEstimator
 from armsight.loop.references.calibrate import PosePath
-from armsight.loop.references.file import COLUMNS, read_references, written
+from armsight.loop.references.distance import Distance
+from armsight.loop.references.file import COLUMNS, Entry, read_references, written
 from armsight.loop.references.heading import Magnetometer
 from armsight.loop.references.inertial import Inertial
 from armsight.loop.references.reference import ToolMotion
@@ -334,3 +335,20 @@ def test_the_noise_that_a_run_gives_a_range_is_that_of_what_it_fuses(capsys, tmp
     assert np.sqrt(np.mean(np.square(off) / [r.cov[0, 0] for r in taken])) == pytest.approx(1.0, abs=0.25)
     assert np.sqrt(np.median([r.cov[0, 0] for r in taken])) == pytest.approx(1e-3 / np.sqrt(10), rel=0.25)
     assert max(r.cov[0, 0] for r in taken) > 9.9 * entry.noise_m**2
+
+
+def test_a_range_that_sees_nothing_is_a_loss_of_its_own_and_hides_no_frozen_value():
+    """As ROS' Range says it, by inf; the sensor repeats one value, and every tenth reading saw nothing."""
+    sensor = Distance.of("sonar").moved(np.r_[0, 0.05, 0.06, 0.8, 0.3, 0.9, 0, 0])
+    run_of, estimator, t_s = (
+        Ranged(Entry(sensor, "mpu-6050", None, None, None, True)),
+        Taking(),
+        np.arange(0.0, 5.0, 0.02),
+    )
+    z = np.full((len(t_s), 1), sensor.expected(ToolMotion(pose(0.0)), 0).z[0])
+    z[::10], z[5::50] = np.inf, np.nan
+    run_of.give(estimator, t_s, z)
+    assert not any("not mm" in loss for loss in run_of.losses)
+    assert "nothing was seen: its range is inf or NaN (30 times)" in run_of.losses
+    assert any("stood still while the tool moved" in loss for loss in run_of.losses)
+    assert len(estimator.taken) < 3

@@ -288,7 +288,8 @@ class Ranged(Fused):
         # Single precision, as the message of ROS has it: so a run is replayed to the last digit.
         for t, z in zip(samples.t_s.tolist(), samples.z[:, 0].astype(np.float32).tolist(), strict=True):
             if not abs(z) < MOST_M:
-                self._losses[f"a range above {MOST_M:g} m was left out: give m, not mm"] += 1
+                seen = f"a range above {MOST_M:g} m was left out: give m, not mm"
+                self._losses[seen if math.isfinite(z) else "nothing was seen: its range is inf or NaN"] += 1
                 continue
             if z != self._value:
                 self._value, self._since_s = z, t
