@@ -45,7 +45,10 @@ nitpick_ignore_regex = [
         r"armsight\.(loop\.(estimators\.readings|handeye\.poses|identify\.(fit|model|identify|selection))"
         r"|robot\.trajectories\.limits|tables\.poses)\.\w+",
     ),
-    (r"py:.*", r"armsight\.vision\.(calibrate\.motion|markers\.(body_file|targets|disc\.target|discs|spec))\.\w+"),
+    (
+        r"py:.*",
+        r"armsight\.vision\.(calibrate\.(change|motion)|markers\.(body_file|targets|disc\.target|discs|spec))\.\w+",
+    ),
     (r"py:.*", r"armsight\.sim\.(budget\.plan\.CameraClass|camera\.stages\.\w+)"),
 ]
 suppress_warnings = ["config.cache"]  # sphinx-gallery keeps functions in its configuration

@@ -97,7 +97,7 @@ def out(metavar: str, text: str, *names: str, **attributes: Any) -> Any:  # noqa
 
 def _kept(context: click.Context, _: click.Parameter, given: Any) -> Any:  # noqa: ANN401 - a path, some, or None
     """Reject a folder of another command's results; say at the end which file, or report in a folder, was replaced."""
-    own = {"demo": "run"}.get(command := context.command_path.removeprefix("armsight "), command)
+    own = {"demo": "run"}.get(command := _command(context), command)
     for path in given if isinstance(given, tuple) else [given] if given is not None else []:
         file = os.path.expanduser(path)
         if os.path.isdir(file):
@@ -113,6 +113,11 @@ def _kept(context: click.Context, _: click.Parameter, given: Any) -> Any:  # noq
         if os.path.isfile(file):
             context.call_on_close(partial(_say_replaced, file, os.stat(file)))
     return given
+
+
+def _command(context: click.Context) -> str:
+    """Return the words of a command without the program's, which has another name where it is called otherwise."""
+    return "" if context.parent is None else f"{_command(context.parent)} {context.info_name}".strip()
 
 
 def _say_replaced(file: str, before: os.stat_result) -> None:

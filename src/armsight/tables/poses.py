@@ -34,7 +34,7 @@ _, NEAR_M, FAR_M = REACH
 REACH_M = 3.0
 MOST_DEG = 360.0  # an angle in degrees is not larger
 MIXED = 200.0  # lengths that differ by more than this factor in one table are not in one unit
-_MEASURED = {"status", "reason", "x_m"}  # columns of poses of which some may be missed, as `armsight measure -o` writes them
+_MEASURED = {"status", "reason", "x_m"}  # columns of poses of which some may be missed, as of `armsight measure`
 
 
 class ArmJoints(Protocol):

@@ -176,7 +176,7 @@ def test_every_figure_is_in_the_page_and_beside_it_and_not_blank(written):
 
 
 def test_the_parameters_are_shown_with_their_sigmas(written, calibration):
-    text, rig = page_of(written).text["parameters"], calibration.rig
+    text, rig = page_of(written).text["parameters"].replace("\u00a0", " "), calibration.rig
     sigma = np.sqrt(np.diag(rig.cov))
     found = re.search(r"fx, px(\d+\.\d+) ± (\d+\.\d+)(\d{3}\.\d+) ± ", text)
     assert float(found[1]) == pytest.approx(rig.left.intrinsics[0], abs=0.06)
@@ -190,7 +190,7 @@ def test_the_pose_tables_sigmas_are_along_the_left_cameras_axes():
     cov[8, 8] = 2e-3**2  # along the right camera's x, which is the left one's -z
     cov[12, 12] = np.radians(0.25) ** 2  # about y, which both share
     T = pose(exp_so3(np.array([0, np.pi / 2, 0])), np.array([0.1, 0.0, 0.2]))
-    text = Page(pose_table(StereoRig(camera, camera, T, cov, 0.1))).text[""]
+    text = Page(pose_table(StereoRig(camera, camera, T, cov, 0.1))).text[""].replace("\u00a0", " ")
     assert_has(text, "X, mm100 given", "Z, mm200.0 ± 2.0", "rotation vector Y, degrees90.00 ± 0.25")
     along = 0.2 / np.hypot(0.1, 0.2)
     assert f"baseline, mm{1e3 * np.hypot(0.1, 0.2):.1f} ± {2 * along:.1f}" in text
