@@ -114,7 +114,7 @@ def test_a_sweep_that_rotates_the_tool_little_is_said(sweep, capsys, monkeypatch
     given = "references", "calibrate", folder / "references.toml", "--poses", folder / "poses.csv", "--json"
     (weak,) = said_of(capsys, *given, kind="inertial").lines[0]["weak"]
     assert re.search(
-        r"the tool rotates by \d+ deg: the lever may be off by more than its sigma; rotate it by 200", weak
+        r"the tool rotates by \d+ deg: the lever of imu may be off by more than sigma; rotate it by 200", weak
     )
 
 
@@ -211,7 +211,7 @@ def test_a_magnetometer_is_checked_and_calibrated_and_other_units_are_named(caps
     assert run("references", "check", tmp_path / "out.toml") == 0
     monkeypatch.setattr(command, "SMALL_DEG", 200.0)
     said = said_of(capsys, "references", "calibrate", tmp_path / "out.toml", *given[:2])
-    assert "the iron may be off by more than its sigma" in said.out + said.err  # it has no lever
+    assert "the iron of m may be off by more than sigma" in said.out + said.err  # it has no lever
     said = said_of(capsys, "references", "calibrate", tmp_path / "micro.toml", *given[:2])
     assert (said.code, len(said.err.splitlines())) == (2, 2)  # and what is fitted
     assert "as if in uT" in said.err
@@ -227,7 +227,7 @@ def test_a_magnetometer_is_checked_and_calibrated_and_other_units_are_named(caps
     assert "it drifts by 2.3 uT at rest" in said["weak"][0]
 
 
-def test_a_range_is_checked_and_calibrated_and_what_is_wrong_with_it_is_named(capsys, tmp_path):
+def test_a_range_is_checked_and_calibrated_and_what_is_wrong_with_it_is_named(capsys, tmp_path, monkeypatch):
     """A draw-wire 80 mm beside the tool's origin, which hangs and hooks, on an eccentric drum."""
     t, rng = np.arange(0.0, 30.0, 0.02), np.random.default_rng(131)
     Ts = np.array([pose(at) for at in t])
@@ -267,6 +267,11 @@ def test_a_range_is_checked_and_calibrated_and_what_is_wrong_with_it_is_named(ca
     both = "".join((tmp_path / f"{name}_found.toml").read_text() for name in ("wire", "other"))
     swapped = both.replace("wire.csv", "that.csv").replace("other.csv", "wire.csv").replace("that.csv", "other.csv")
     (tmp_path / "swapped.toml").write_text(swapped)
+    monkeypatch.setattr(command, "SMALL_DEG", 200.0)
+    (tmp_path / "both.toml").write_text(both)
+    (weak, *_) = calibrate("both").done().lines[0]["weak"]
+    assert "the tool's point of wire and the tool's point of other may be off" in weak
+    monkeypatch.undo()
     assert "12.1 to 13.9 s" in calibrate("hooked").done().lines[0]["weak"][0]
     for given, text in (
         (("swapped",), "[wire]: its readings fit the anchor of"),

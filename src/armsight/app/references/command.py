@@ -329,8 +329,9 @@ def _calibrated(entries: list[Entry], poses: Path) -> tuple[Report, list[Entry]]
     far = int(np.argmax(np.linalg.norm(log_so3(R[0].T @ R), axis=1)))  # from the first pose; and from there
     angle_deg = float(np.degrees(np.linalg.norm(log_so3(R[far].T @ R), axis=1).max()))
     if angle_deg < SMALL_DEG:
-        what = {Inertial: "lever", Magnetometer: "iron", Distance: "tool's point"}[type(entries[0].reference)]
-        text = f"{poses}: the tool rotates by {angle_deg:.0f} deg: the {what} may be off by more than its sigma"
+        lost = {Inertial: "lever", Magnetometer: "iron", Distance: "tool's point"}
+        what = " and ".join(f"the {lost[type(each.reference)]} of {each.reference.name}" for each in entries)
+        text = f"{poses}: the tool rotates by {angle_deg:.0f} deg: {what} may be off by more than sigma"
         notes.append(Note("weak", f"{text}; rotate it by {SMALL_DEG:.0f} deg and more, about two axes"))
     for entry in entries:
         readings = _averaged(entry, path)
