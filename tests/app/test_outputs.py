@@ -170,3 +170,36 @@ def test_the_suffix_of_an_arms_files_is_checked(here, armsight):
 def test_millimetres_taken_for_metres_are_reported(here, armsight):
     said = armsight("dense", "rig.json", "left1.png", "right1.png", "--near", "300", "-o", "out")
     assert_rejected(said, "--near 300", "--near 0.3", "metres")
+
+
+#: Command -> the titles of its report, those of version 0.2 first.
+TITLES = {
+    "board bringup": ("Bring-up", "armsight: bring-up", "armsight: board bringup"),
+    "calibrate --report": ("armsight: calibration report", "armsight: calibrate"),
+    "handeye": ("armsight: hand-eye calibration", "armsight: handeye"),
+    "identify": ("armsight: identification of an arm", "armsight: identify"),
+    "arm report": ("armsight: A&amp;B", "armsight: arm report"),
+    "rig update --report": ("armsight rig update", "armsight: rig update"),
+    "check": ("armsight: check",),
+    "budget": ("armsight: budget",),
+}
+REPORTED = FOLDER_WRITERS | {
+    "identify": ("--data", "poses.csv", "--arm", "arm.toml"),
+    "rig update --report": (".", "-o", "2.json"),
+}
+
+
+@pytest.mark.parametrize("name", TITLES)
+def test_a_report_is_replaced_by_its_own_command_alone_also_one_of_version_0_2(here, armsight, name):
+    page = here / "their" / "report.html"
+    page.parent.mkdir()
+    (page.parent / "report.json").write_text('{"arm": "A&B"}')
+    for own, titles in TITLES.items():
+        for title in titles:
+            page.write_text(f"<title>{title}</title>")
+            said = call(armsight, name, REPORTED[name], "their")
+            words = f"their: holds a report of {own.partition(' --')[0]}, which would be written over"
+            assert said.code == 2, said
+            assert (words in said.err) == (own != name), said.err
+    page.write_text("<title>Coverage report</title>")
+    assert_rejected(call(armsight, name, REPORTED[name], "their"), "holds a report of another program")

@@ -12,6 +12,8 @@ many commands have, and the kinds of sources and boards that commands open thems
 from __future__ import annotations
 
 import contextlib
+import html
+import json
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping
@@ -39,6 +41,14 @@ BOARD = "board: "
 #: What a cell is called among the streams.
 CELL = "cell:"
 _TYPES = {Path: PATH, int: click.INT, float: click.FLOAT}  # others are texts
+#: Titles of reports of version 0.2 -> their command; the report of an arm had the arm's name.
+_TITLES = {
+    "Bring-up": "board bringup",
+    "bring-up": "board bringup",
+    "calibration report": "calibrate",
+    "hand-eye calibration": "handeye",
+    "identification of an arm": "identify",
+}
 _KINDS = {int: "N", float: "X"}  #: in help; a file or a text is called as its option, where no better is declared
 
 
@@ -99,19 +109,15 @@ def _kept(context: click.Context, _: click.Parameter, given: Any) -> Any:  # noq
     """Reject a folder of another command's results; say at the end which file, or report in a folder, was replaced."""
     own = {"demo": "run"}.get(command := _command(context), command)
     for path in given if isinstance(given, tuple) else [given] if given is not None else []:
-        file = os.path.expanduser(path)
+        file = Path(path).expanduser()
         if os.path.isdir(file):
-            folder, file = file, os.path.join(file, "report.html")
-            theirs = "run" if os.path.isfile(os.path.join(folder, "summary.json")) else ""
-            with contextlib.suppress(OSError), open(file, encoding="utf-8", errors="replace") as report:
-                title = re.search(r"<title>armsight: ([^<]*)", report.read(500))
-                theirs = theirs or (title[1] if title else "another program")
-            if theirs not in ("", own):
+            if (theirs := _written_by(file)) not in ("", own):
                 raise InputError(
                     f"{path}: holds a report of {theirs}, which would be written over; choose another folder"
                 )
+            file /= "report.html"
         if os.path.isfile(file):
-            context.call_on_close(partial(_say_replaced, file, os.stat(file)))
+            context.call_on_close(partial(_say_replaced, file, file.stat()))
     return given
 
 
@@ -120,9 +126,24 @@ def _command(context: click.Context) -> str:
     return "" if context.parent is None else f"{_command(context.parent)} {context.info_name}".strip()
 
 
-def _say_replaced(file: str, before: os.stat_result) -> None:
+def _written_by(folder: Path) -> str:
+    """Return the command whose report is in a folder, also of version 0.2; empty where there is none."""
+    if (folder / "summary.json").is_file():
+        return "run"
+    with contextlib.suppress(OSError), open(folder / "report.html", encoding="utf-8", errors="replace") as report:
+        found = re.search(r"<title>(?:armsight:? |(?=Bring-up))([^<]*)", report.read(500))
+        title = html.unescape(found[1]) if found else "another program"
+        with contextlib.suppress(OSError, ValueError):
+            arms = json.loads((folder / "report.json").read_text(encoding="utf-8"))
+            if isinstance(arms, dict) and arms.get("arm") == title:
+                return "arm report"
+        return _TITLES.get(title, title)
+    return ""
+
+
+def _say_replaced(file: Path, before: os.stat_result) -> None:
     with contextlib.suppress(FileNotFoundError):
-        if (now := os.stat(file)).st_ino != before.st_ino or now.st_mtime_ns != before.st_mtime_ns:
+        if (now := file.stat()).st_ino != before.st_ino or now.st_mtime_ns != before.st_mtime_ns:
             click.echo(f"note: replaced: {file}", err=True)
 
 
