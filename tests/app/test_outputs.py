@@ -187,6 +187,7 @@ REPORTED = FOLDER_WRITERS | {
     "identify": ("--data", "poses.csv", "--arm", "arm.toml"),
     "rig update --report": (".", "-o", "2.json"),
 }
+RUN = ("--rig", "none.json", "--target", "body.toml", "--source", ".", "--board", "emulated:")
 
 
 @pytest.mark.parametrize("name", TITLES)
@@ -203,3 +204,11 @@ def test_a_report_is_replaced_by_its_own_command_alone_also_one_of_version_0_2(h
             assert (words in said.err) == (own != name), said.err
     page.write_text("<title>Coverage report</title>")
     assert_rejected(call(armsight, name, REPORTED[name], "their"), "holds a report of another program")
+
+
+@pytest.mark.parametrize("name", [*FOLDER_WRITERS, "run"])
+def test_a_run_is_not_written_over_and_a_summary_of_others_keeps_no_other_command_away(here, armsight, name):
+    (here / "their").mkdir()
+    (here / "their" / "summary.json").write_text("{}")
+    said = call(armsight, name, {**FOLDER_WRITERS, "run": RUN}[name], "their")
+    assert ("their: holds a report of run" in said.err) == (name in {*TITLES, "replay"}), said.err

@@ -100,18 +100,19 @@ def argument(metavar: str | None = None, **attributes: Any) -> Any:  # noqa: ANN
     return Declaration((), {"metavar": metavar, **attributes}, True)
 
 
-def out(metavar: str, text: str, *names: str, **attributes: Any) -> Any:  # noqa: ANN401 - as above
-    """Declare what is written, and what its help says: ``-o``, or the option of another name."""
-    return option(text, *(names or ("-o", "--output")), metavar=metavar, callback=_kept, **attributes)
+def out(metavar: str, text: str, *names: str, report: bool = False, **attributes: Any) -> Any:  # noqa: ANN401 - as above
+    """Declare what is written, ``-o`` or of another name; ``report``: a folder that is not another command's."""
+    kept = partial(_kept, report)
+    return option(text, *(names or ("-o", "--output")), metavar=metavar, callback=kept, **attributes)
 
 
-def _kept(context: click.Context, _: click.Parameter, given: Any) -> Any:  # noqa: ANN401 - a path, some, or None
-    """Reject a folder of another command's results; say at the end which file, or report in a folder, was replaced."""
+def _kept(report: bool, context: click.Context, _: click.Parameter, given: Any) -> Any:  # noqa: ANN401 - a path, some, None
+    """Reject a folder of another command's report; say at the end which file, or report in a folder, was replaced."""
     own = {"demo": "run"}.get(command := _command(context), command)
     for path in given if isinstance(given, tuple) else [given] if given is not None else []:
         file = Path(path).expanduser()
         if os.path.isdir(file):
-            if (theirs := _written_by(file)) not in ("", own):
+            if report and (theirs := _written_by(file)) not in ("", own):
                 raise InputError(
                     f"{path}: holds a report of {theirs}, which would be written over; choose another folder"
                 )

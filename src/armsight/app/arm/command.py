@@ -251,7 +251,7 @@ def report(
     run: Path = argument("RUN"),
     arm_name: str | None = option("The nominal arm; by default the one that the run names.", "--arm", metavar="ARM"),
     compare: tuple[Path, ...] = option("Another arm's report.json.", metavar="FILE.json"),
-    output: Path | None = out("DIR", "Folder for report.html, .pdf and .json; needs armsight[report]."),
+    output: Path | None = out("DIR", "Folder for report.html, .pdf and .json; needs armsight[report].", report=True),
     as_json: bool = JSON,
 ) -> None:
     """Report what an arm does, what explains its error, and what each remedy would bring.

@@ -242,7 +242,10 @@ def selftest_(
 def bringup(
     name: str = _BOARD,
     folder: Path = out(
-        "DIR", "Folder of board.toml, report.html, and bringup.json, where what was found is kept.", default="bringup"
+        "DIR",
+        "Folder of board.toml, report.html, and bringup.json, where what was found is kept.",
+        default="bringup",
+        report=True,
     ),
     steps: tuple[str, ...] = option("Only this step; may be repeated.", "--step", choices=STEPS),
     joints: tuple[int, ...] = option("Only this joint; may be repeated.", "--joint", min=1, max=6),

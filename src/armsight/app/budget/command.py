@@ -36,7 +36,7 @@ def command(
     options: PlanOptions,
     plan: tuple[str, ...] = argument("[PLAN.toml] [KEY=VALUE]..."),
     optimise: bool = option("Choose what is left out, for each class of cameras.", "--best"),
-    output: str | None = out("DIR", "Write report.html, budget.json, the rig and the body to print."),
+    output: str | None = out("DIR", "Write report.html, budget.json, the rig and the body to print.", report=True),
     as_json: bool = JSON,
 ) -> int:
     """Say before a rig is bought what it will measure, what limits it, and what would make it better.

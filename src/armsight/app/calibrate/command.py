@@ -38,7 +38,9 @@ class CalibrateOptions:
     refine_body: Path | None = out("OUT.csv", "Estimate the body's points too, and write them here.", "--refine-body")
     folds: int = option("Parts for the held-out errors.", min=2, default=FOLDS)
     output: Path = out("RIG.json", "The rig to write.")
-    report: Path | None = out("DIR", "Write an HTML report with figures; needs armsight[report].", "--report")
+    report: Path | None = out(
+        "DIR", "Write an HTML report with figures; needs armsight[report].", "--report", report=True
+    )
     as_json: bool = JSON
 
 

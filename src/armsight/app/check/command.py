@@ -54,7 +54,9 @@ def command() -> None:
 def evaluated(
     data: Path = argument("RUN|POSES.csv"),
     closed: bool = option("Of a run: evaluate the motions with the loop closed on vision."),
-    output: Path | None = out("DIR", "Folder for report.html, check.json, figures; needs armsight[report]."),
+    output: Path | None = out(
+        "DIR", "Folder for report.html, check.json, figures; needs armsight[report].", report=True
+    ),
     columns: str | None = option(
         "Names of columns in your CSV, such as x_m=X,command_x_m=X0.", metavar="NAME=COLUMN,..."
     ),

@@ -14,7 +14,7 @@ from armsight.app.show.messages import require
 @click.command("demo")
 @declared
 def command(
-    output: Path = out("DIR", "Folder of the run.", default="demo"),
+    output: Path = out("DIR", "Folder of the run.", default="demo", report=True),
     seed: int = SEED,
     arm: str = option(
         "The simulated arm: nominal, used, worn, or a TOML file (docs/howto/workcell.md).", default="worn"

@@ -53,7 +53,7 @@ class Options:
     streams: bool = option("Both tables are streams (t_s) whose clocks differ: find the offset.")
     scale: bool = option("The target's size may be wrong: fit it.")
     plan: int = option("Choose the next N poses.", metavar="N", min=0, max=50, default=0, show_default=False)
-    output: Path | None = out("DIR", "Folder for the page and the files; needs armsight[report].")
+    output: Path | None = out("DIR", "Folder for the page and the files; needs armsight[report].", report=True)
     as_json: bool = JSON
 
 

@@ -39,7 +39,9 @@ def command(
     priors: tuple[str, ...] = option(
         "Sigma (m, rad) of a parameter or kind; 0 keeps it.", "--prior", metavar="NAME=SIGMA"
     ),
-    output: Path | None = out("DIR", "Folder for the corrected arm and the report; needs armsight[report]."),
+    output: Path | None = out(
+        "DIR", "Folder for the corrected arm and the report; needs armsight[report].", report=True
+    ),
     verbose: bool = option("Print all numbers, and why the others were not fitted.", "-v", "--verbose"),
     as_json: bool = JSON,
 ) -> None:

@@ -24,7 +24,7 @@ _REASONS = 3
 @declared
 def command(
     recording: str = argument("RUN|BAG"),
-    output: Path | None = out("DIR", "Write the tables to this folder."),
+    output: Path | None = out("DIR", "Write the tables to this folder.", report=True),
     rig: str | None = option("Another rig: needs images or tags in the recording.", metavar="RIG.json"),
     target: str | None = option("Another body: needs images or tags in the recording.", metavar="SPEC|BODY"),
     arm: str | None = option("Another arm model.", metavar="ARM"),

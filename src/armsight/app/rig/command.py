@@ -111,7 +111,7 @@ def update_(
         "Use shots from this time on, board's clock, s; by default from when the run found that the cameras had moved.",
         metavar="S",
     ),
-    report: Path | None = out("DIR", "Folder for a page: old rig beside new.", "--report"),
+    report: Path | None = out("DIR", "Folder for a page: old rig beside new.", "--report", report=True),
     as_json: bool = JSON,
 ) -> None:
     """Estimate the relative pose of a run's cameras again, from the body that the run saw: without a board.

@@ -56,7 +56,7 @@ def command(
     references: Path | None = REFERENCES,
     open_loop: bool = option("Control by the joint sensors alone; do not close the loop on vision."),
     follow_rig: bool = FOLLOW_RIG,
-    output: Path = out("DIR", "Folder of the run.", default="run"),
+    output: Path = out("DIR", "Folder of the run.", default="run", report=True),
     as_json: bool = JSON,
 ) -> None:
     """Run the experiment on a real arm: hand-eye calibration, the motions, the loop closed on vision.
