@@ -15,7 +15,9 @@ def test_the_unit_of_a_baseline(number, unit_m, fits):
     if fits is None:
         check_length(number * unit_m, unit_m, BASELINE)
     else:
-        with pytest.raises(InputError, match=rf"expected 1 mm to 20 m. In {fits} it is .*give --unit-m"):
+        with pytest.raises(
+            InputError, match=rf"expected 1 mm to 20 m. If the file is in {fits}, it is .*give --unit-m"
+        ):
             check_length(number * unit_m, unit_m, BASELINE)
 
 
@@ -28,6 +30,7 @@ def test_the_message_names_what_was_found_what_is_expected_and_the_option():
     with pytest.raises(InputError) as caught:
         check_length(60.0, 1.0, BASELINE)
     assert str(caught.value) == (
-        "baseline 60 m, with the file's lengths in m; expected 1 mm to 20 m. In mm it is 60 mm: give --unit-m 0.001; "
-        "in cm it is 600 mm: give --unit-m 0.01; in in it is 1.524 m: give --unit-m 0.0254"
+        "baseline 60 m, with the file's lengths in m; expected 1 mm to 20 m. If the file is in mm, it is 60 mm: give "
+        "--unit-m 0.001. If the file is in cm, it is 600 mm: give --unit-m 0.01. If the file is in inches, it is 1.524 m: "
+        "give --unit-m 0.0254"
     )

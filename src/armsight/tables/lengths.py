@@ -11,7 +11,7 @@ from typing import NamedTuple
 from armsight.errors import InputError
 
 #: Units that people write lengths in, m; in the order in which they are tried.
-UNITS_M = {"mm": 1e-3, "m": 1.0, "cm": 1e-2, "in": 0.0254}
+UNITS_M = {"mm": 1e-3, "m": 1.0, "cm": 1e-2, "inches": 0.0254}
 
 
 class Usual(NamedTuple):
@@ -53,26 +53,27 @@ def check_length(length_m: float, unit_m: float, usual: Usual, advice: str = "--
         length_m: as it was read, m.
         unit_m: the unit that it was read in, m.
         usual: what it is of.
-        advice: the option that names the right unit; ``{unit_m}`` stands for it, m, ``{unit}`` for its name.
+        advice: the option that names the right unit; ``{unit_m}`` stands for it, m.
 
     Raises:
         InputError: what was found, what is expected, and the option that would do.
     """
     if usual.least_m <= length_m <= usual.most_m:
         return
-    unit = fitting_unit(length_m, unit_m, usual)
     name = next((name for name, other_m in UNITS_M.items() if other_m == unit_m), f"units of {unit_m:g} m")
     found = f"{usual.what} {metric(length_m)}, with the file's lengths in {name}"
     expected = f"expected {metric(usual.least_m)} to {metric(usual.most_m)}"
-    if unit is None:
-        raise InputError(f"{found}; {expected}: is the file damaged, or its unit another one?")
-    in_units = {name: length_m / unit_m * m for name, m in UNITS_M.items()}
-    fits = [
-        f"n {name} it is {metric(each)}: give {advice.format(unit_m=UNITS_M[name], unit=name)}"
-        for name, each in in_units.items()
-        if usual.least_m <= each <= usual.most_m
-    ]
-    raise InputError(f"{found}; {expected}. I{'; i'.join(fits)}")
+    fits = fitting(length_m / unit_m, usual, f"give {advice}")
+    raise InputError(f"{found}; {expected}{f'. {fits}' if fits else ': is the file damaged, or its unit another one?'}")
+
+
+def fitting(length: float, usual: Usual, advice: str = "--unit-m {unit_m:g}") -> str:
+    """Return what a length is in each unit in which it can be one, and the option; empty where it can be in none."""
+    return ". ".join(
+        f"If the file is in {unit}, it is {metric(length * m)}: {advice.format(unit_m=m)}"
+        for unit, m in UNITS_M.items()
+        if usual.least_m <= length * m <= usual.most_m
+    )
 
 
 def metric(length_m: float) -> str:

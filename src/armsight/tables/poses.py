@@ -262,7 +262,7 @@ def _suffix(table: Columns) -> str:
 
 def _or_else(table: Columns, far: float, side: str) -> str:
     """Return what else lengths that are too large for metres may be: of another unit, or the angles of six numbers."""
-    others = [name for name in ("cm", "in") if far * UNITS_M[name] <= REACH_M < far]
+    others = [name for name in ("cm", "inches") if far * UNITS_M[name] <= REACH_M < far]
     said = f"; or in {' or '.join(others)}? write those in m or mm" if others else ""
     if "n1" not in table.at or "n4" in table.at or far > MOST_DEG:
         return said

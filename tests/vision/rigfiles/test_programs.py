@@ -172,7 +172,7 @@ def test_the_pair_of_luxonis_is_left_and_right_also_without_stereo_data(tmp_path
 def test_a_baseline_in_a_wrong_unit_is_said_in_those_it_can_be_in(tmp_path):
     document, mm = depthai(), 1e3 * np.linalg.norm(T)
     files = write(tmp_path, {"calib.json": json.dumps(document)})
-    with pytest.raises(InputError, match=re.escape(f"in cm it is {mm:.4g} mm: give --unit-m 0.01")):
+    with pytest.raises(InputError, match=re.escape(f"If the file is in cm, it is {mm:.4g} mm: give --unit-m 0.01")):
         import_rig(None, files, unit_m=1.0)
     for _, camera in document["cameraData"]:
         for axis in "xyz":
@@ -213,7 +213,12 @@ AS_ANOTHERS = [
 ]
 #: Wrong units: the unit in which the baseline would be an ordinary one is named.
 UNITS = [
-    (name, {"unit_m": unit}, None, rf"baseline .* expected 1 mm to 20 m. In {right} it is .*: give --unit-m {number}")
+    (
+        name,
+        {"unit_m": unit},
+        None,
+        rf"baseline .* expected 1 mm to 20 m. If the file is in {right}, it is .*: give --unit-m {number}",
+    )
     for name in ONE_OF
     for unit, right, number in (
         ((1.0, "mm", "0.001"), (1e-6, "mm", "0.001"))

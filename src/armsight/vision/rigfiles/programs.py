@@ -365,7 +365,7 @@ def _orbslam_part(document: Document, name: str) -> dict[str, Foreign]:
 
 
 #: Names of units in MATLAB, m.
-_WORLD_UNITS = {**UNITS_M, "millimeters": 1e-3, "meters": 1.0, "centimeters": 1e-2, "inches": 0.0254}
+_WORLD_UNITS = {**UNITS_M, "millimeters": 1e-3, "meters": 1.0, "centimeters": 1e-2, "in": 0.0254}
 
 
 def _matlab_inner(document: Document) -> Mapping[str, Foreign] | None:
