@@ -178,7 +178,15 @@ def test_a_baseline_in_a_wrong_unit_is_said_in_those_it_can_be_in(tmp_path):
         for axis in "xyz":
             camera["extrinsics"]["translation"][axis] *= 0.5  # 10.7 m: it may be one
     rig = import_rig(None, write(tmp_path, {"calib.json": json.dumps(document)}), unit_m=1.0)
-    assert any(f"{mm / 2:.4g} mm if in cm (--unit-m 0.01)" in note for note in rig.provenance["notes"])
+    long = (
+        f"the baseline is {mm / 20:.4g} m, which is long. If the file is in mm, it is {mm / 20:.4g} mm: --unit-m 0.001"
+    )
+    assert f"{long}. If the file is in cm, it is {mm / 2:.4g} mm: --unit-m 0.01" in "\n".join(rig.provenance["notes"])
+    for _, camera in document["cameraData"]:
+        for axis in "xyz":
+            camera["extrinsics"]["translation"][axis] *= 250  # 2.7 m in mm: long, and too long in any other unit
+    rig = import_rig(None, write(tmp_path, {"calib.json": json.dumps(document)}), unit_m=1e-3)
+    assert f"the baseline is {mm / 80:.4g} m, which is long" in rig.provenance["notes"]
 
 
 def test_a_program_is_no_calibration(tmp_path):
@@ -333,7 +341,7 @@ DAMAGED = {
     "counts of a matrix": ({"c.yml": PROGRAMS["k1"][2]["cam_stereo.yml"].replace("rows: 3", "rows: 4", 1)}, MM_SIZE, "K1 is damaged: it says 4 rows and 3 cols, and its data holds 9"),
     "transposed": ({"c.npz": npz(**(named("K1", "D1", "K2", "D2") | {"K1": K_LEFT.T, "K2": K_RIGHT.T}))}, MM_SIZE, "transposed, as MATLAB's IntrinsicMatrix is"),
     "no distortion": ({"c.npz": npz(K1=K_LEFT, K2=K_RIGHT, R=R, T=T)}, MM_SIZE, "has no distortion of both cameras"),
-    "no unit": (PROGRAMS["k1"][2], {"image_size_px": SIZE}, r"unit the board was given in, .*214.8 long, that is 214.8 mm if in mm .--unit-m 0.001."),
+    "no unit": (PROGRAMS["k1"][2], {"image_size_px": SIZE}, r"unit the board was given in, .*214.8 long. If the file is in mm, it is 214.8 mm: --unit-m 0.001. If .*If squares"),
     "ds": (changed("basalt", ("pinhole-radtan8", "ds")), {}, "'ds' is not supported; supported are"),
     "pair unknown": (PROGRAMS["three cameras"][2], {"pair": ("cam0", "cam7")}, "has no camera 'cam7'; there are cam0, cam1, cam2"),
     "uncalibrated camera_info": (changed("rostopic", (r"K: \[[^]]*\]", "K: [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]")), {}, "uncalibrated|must be|not calibrated"),

@@ -23,6 +23,7 @@ from armsight.errors import InputError, naming
 from armsight.geometry.pose import inverse
 from armsight.geometry.rotation import exp_so3
 from armsight.tables.document import Foreign
+from armsight.tables.lengths import BASELINE, fitting
 from armsight.vision.camera_file import DISTORTION, MATRIX, SIZE, camera_of, described, found, plain
 from armsight.vision.rig import StereoRig
 from armsight.vision.rigfiles.rigfile import (
@@ -31,7 +32,6 @@ from armsight.vision.rigfiles.rigfile import (
     ImportOptions,
     RigFormat,
     count_paths,
-    fitting,
     imported,
     not_held,
     rectification,
@@ -248,8 +248,8 @@ def _unit_m(flat: Mapping[str, Foreign], length: float, options: ImportOptions) 
     if "unit_m" not in flat:
         if options.unit_m is None:
             raise InputError(
-                f"T is in the unit the board was given in, which the file does not say; it is {length:.4g} long, that is "
-                f"{fitting(length) or 'nothing that a baseline can be'}; squares counted as 1: --unit-m SIDE"
+                f"T is in the unit the board was given in, which the file does not say; it is {length:.4g} long. "
+                f"{fitting(length, BASELINE) or 'No unit makes it a baseline'}. If squares count as 1: --unit-m SIDE"
             )
         return options.unit_m
     unit = flat["unit_m"]

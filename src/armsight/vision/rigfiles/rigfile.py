@@ -22,7 +22,7 @@ from armsight.files import replacing
 from armsight.geometry.check import checked
 from armsight.geometry.pose import inverse, mean_pose, pose
 from armsight.tables.document import Foreign
-from armsight.tables.lengths import BASELINE, UNITS_M, check_length, metric
+from armsight.tables.lengths import BASELINE, check_length, fitting, metric
 from armsight.vision.camera import Camera
 from armsight.vision.camera_file import camera_of
 from armsight.vision.rig import StereoRig
@@ -198,12 +198,6 @@ def rigid(R: Foreign, t: Foreign, name: str) -> tuple[Array, list[str]]:
     return mean_pose(T[None]), [f"{name} as printed is off a rotation by {off:.1g}; the nearest rotation was taken"]
 
 
-def fitting(length: float, most_m: float = BASELINE.most_m) -> str:
-    """Return what a baseline in a file's unit is in the units in which it can be one, and their options."""
-    usual = {unit: m for unit, m in UNITS_M.items() if BASELINE.least_m <= length * m <= most_m}
-    return ", or ".join(f"{metric(length * m)} if in {unit} (--unit-m {m:g})" for unit, m in usual.items())
-
-
 def imported(
     cameras: Sequence[Camera],
     T_left_right: Array,
@@ -241,7 +235,8 @@ def imported(
     with naming(paths[-1]):
         check_length(baseline_m, unit_m, BASELINE)
     if baseline_m > LONG_M:
-        notes.append(f"the baseline is {metric(baseline_m)}; it is {fitting(baseline_m / unit_m, LONG_M)}")
+        fits = fitting(baseline_m / unit_m, BASELINE._replace(most_m=LONG_M))
+        notes.append(f"the baseline is {metric(baseline_m)}, which is long" + (fits and f". {fits}"))
     count = left.parameters.size + right.parameters.size + 6
     provenance = {
         "origin": "imported",
