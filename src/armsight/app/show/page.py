@@ -87,7 +87,8 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "") ->
     """Return an HTML table; ``head`` is plain text, escaped."""
     top = "".join(f'<th scope="col">{cell}</th>' for cell in head)
     body = "".join(
-        f'<tr><th scope="row">{first}</th>' + "".join(map(_cell, head[1:], rest)) + "</tr>\n" for first, *rest in rows
+        f'<tr><th scope="row">{first}</th>{"".join(_cell(*each) for each in zip(head[1:], rest, strict=True))}</tr>\n'
+        for first, *rest in rows
     )
     return f'<table class="{kind}"><thead><tr>{top}</tr></thead>\n<tbody>\n{body}</tbody></table>\n'
 
