@@ -46,7 +46,7 @@ def typed(monkeypatch):
                     break
                 rest.insert(0, "evaluate")
             command = command.get_command(context, rest.pop(0))
-        command.make_context("armsight", rest).close()
+        command.make_context(command.name, rest, click.Context(group, info_name="armsight")).close()
         came.append(" ".join(arguments))
         return next((code for part, code in codes.items() if came[-1].startswith(part)), 0)
 
