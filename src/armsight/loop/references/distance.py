@@ -30,7 +30,7 @@ EACH = ("x_m", "y_m", "z_m", "offset_m", "scale")  # parameters of an anchor
 _POINT_M, _ANCHOR_M, _OFFSET_M, _SCALE = 0.2, 3.0, 1.0, 0.02
 #: Positions whose extents, least over greatest, are below this are in a plane; half: 10 mm of a sweep pass for a space.
 _SPANS = 0.02
-#: A tool that moves so far, m, changes a range; half: a step of 10 mm is a frozen value, double: short ones are blunders.
+#: A value is frozen that should change by so much, m; half: a coarse step is one, double: short ones are blunders.
 STILL_M = 0.2
 #: Singular values below this share of the greatest are noise; half, double: nothing.
 _LEAST = 1e-4
@@ -38,6 +38,9 @@ _LEAST = 1e-4
 MOST_M = 100.0
 #: Readings change by so many times the tool's travel where their unit is wrong; half: tools with long levers are, too.
 _TRAVELS = 5.0
+#: The closed form is fitted so often to readings off by at most so many times the median; half: blunders stay, double:
+#: nothing. It leaves still values out where so many others are; half: 18 unknowns are open, double: nothing.
+_ROUNDS, _BLUNDER, _ENOUGH = 5, 6.0, 40
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -74,22 +77,39 @@ class Distance(Reference):
         if high - low > _TRAVELS * (travel := float(np.linalg.norm(np.ptp(p, axis=0)))) + 2 * _POINT_M:
             said = f"its readings change by {high - low:.3g} while the tool moves by {travel:.2g} m"
             raise InputError(f"{self.name}: {said}: give m, not mm")
-        for rows in np.split(np.arange(len(z)), np.flatnonzero(np.abs(np.diff(z)) > 1e-9) + 1):
-            if (moved := float(np.linalg.norm(np.ptp(p[rows], axis=0)))) > STILL_M:
-                said = f"its value stands still from {t_s[rows[0]]:.2f} to {t_s[rows[-1]]:.2f} s, while the tool moves"
-                raise InputError(f"{self.name}: {said} by {moved:.2g} m: is the sensor alive, the wire fast?")
         spread = np.linalg.svd(p - p.mean(axis=0), compute_uv=False)
         if spread[-1] < _SPANS * spread[0]:
             raise InputError(
                 f"{self.name}: the tool moves in a plane, whose mirror image fits as well: move it across, too"
             )
-        by = [-2.0 * p, 2.0 * np.einsum("nij,ni->nj", R, p), 2.0 * z[:, None], -2.0 * R.reshape(-1, 9)]
-        linear = np.column_stack([*by, np.ones(len(z))])
-        size = np.repeat([_ANCHOR_M, _POINT_M, _OFFSET_M, _ANCHOR_M * _POINT_M, _ANCHOR_M**2], [3, 3, 1, 9, 1])
-        found = size * np.linalg.lstsq(linear * size, z**2 - (p**2).sum(axis=1), rcond=_LEAST)[0]
-        if np.median(z) < found[6]:
+        spells = np.split(np.arange(len(z)), np.flatnonzero(np.abs(np.diff(z)) > 1e-9) + 1)
+        spells = [rows for rows in spells if np.linalg.norm(np.ptp(p[rows], axis=0)) > STILL_M]
+        use = np.abs(z - np.median(z)) < travel + 4 * _POINT_M  # no point of the tool moves by more
+        few = use.copy()
+        few[np.concatenate([*spells, np.empty(0, int)])] = False
+        use = few if few.sum() > _ENOUGH else use
+        for _ in range(_ROUNDS):
+            c, a = _closed_form(R[use], p[use], z[use])
+            x = p + R @ c
+            far, across = (np.linalg.norm(x - each, axis=1) for each in (a, 2 * x[use].mean(axis=0) - a))
+            # Far away, where spheres are nearly planes, what falls from an anchor rises from its mirror image.
+            rises, mirrored, falls = (each - np.median(each[use]) for each in (z - far, z - across, z + far))
+            off = min(rises, mirrored, falls, key=lambda each: float(np.median(np.abs(each[use]))))
+            use = np.abs(off) <= _BLUNDER * np.median(np.abs(off[use]))
+        wrong, right, other = (np.median(np.abs(each[use])) for each in (falls, rises, mirrored))
+        if wrong < min(right, other) / 2:
             raise InputError(f"{self.name}: its readings fall as the tool moves away: give their negative")
-        return replace(self, anchors=found[None, :3], p_tool=found[3:6], offset=found[6:7])
+        if other < right:
+            a, far = 2 * x[use].mean(axis=0) - a, across
+        for rows in spells:
+            if np.ptp(far[rows]) > STILL_M:
+                said = (
+                    f"its value stands still from {t_s[rows[0]]:.2f} to {t_s[rows[-1]]:.2f} s, while the range changes"
+                )
+                raise InputError(
+                    f"{self.name}: {said} by {np.ptp(far[rows]):.2g} m: is the sensor alive, the wire fast?"
+                )
+        return replace(self, anchors=a[None], p_tool=c, offset=np.array([np.median((z - far)[use])]))
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -127,6 +147,15 @@ class Distance(Reference):
             offset=self.offset + each[:, 3],
             scale=self.scale + each[:, 4],
         )
+
+
+def _closed_form(R: Array, p: Array, z: Array) -> tuple[Array, Array]:
+    """Return the tool's point (3,) and the anchor (3,) of ranges (N,), whatever their sign, m."""
+    by = [-2.0 * p, 2.0 * np.einsum("nij,ni->nj", R, p), 2.0 * z[:, None], -2.0 * R.reshape(-1, 9)]
+    linear = np.column_stack([*by, np.ones(len(z))])
+    size = np.repeat([_ANCHOR_M, _POINT_M, _OFFSET_M, _ANCHOR_M * _POINT_M, _ANCHOR_M**2], [3, 3, 1, 9, 1])
+    found = size * np.linalg.lstsq(linear * size, z**2 - (p**2).sum(axis=1), rcond=_LEAST)[0]
+    return found[3:6], found[:3]
 
 
 LONG, SHORT = (
