@@ -292,6 +292,8 @@ CAUSES: dict[str, CauseRow] = {
         "explains most of them: one camera has another zoom or focus, or shows a part of its image, or left and right "
         "images do not belong together",
         "look at the pairs of images; calibrate the rig again with images as they are now", alternatives=("lens", "time")),
+    "board": CauseRow("body", "measurements",
+        "{other}: {size:.0f} shots were missed", "give the board as it is, as --target or in its file"),
     # The computer.
     "stalled": CauseRow("host", "ms",
         "the computer stalled {times}, for {size:.0f} ms at most: commands were late",

@@ -18,6 +18,8 @@ from armsight.app.measure.run import MeasureRun
 from armsight.app.measure.shots import _detected, reversed_notes
 from armsight.files import read_table
 from armsight.geometry.pose import exp_se3, inverse, log_se3, pose, transform
+from armsight.sim.render.render import render
+from armsight.sim.render.scene import PosedBody, chessboard
 from armsight.vision.markers.body_file import save_body_csv
 from armsight.vision.markers.targets import open_body, open_target
 from armsight.vision.pose.shot_pose import CSV_COLUMNS
@@ -448,6 +450,21 @@ def test_a_rig_whose_camera_moved_is_named_and_the_exit_code_says_so(rendered, t
     assert found["cost_mm"] > 1.0
     assert abs(found["size"] - 0.3) < 4 * found["sigma"]
     assert "do not trust this result: rig: " in said.err
+
+
+@pytest.mark.parametrize(("rows", "code"), [((6, 6, 5), 3), ((6, 6), 2), ((5, 5, 6), 0)])
+def test_a_board_of_other_counts_is_named(rendered, tmp_path, armsight, rows, code):
+    """Of ``rows``, 5 is the board that is given; the others leave no pose to be trusted where they are more."""
+    rig, rng = StereoRig.load(rendered.rig), np.random.default_rng(3)
+    for k, row in enumerate(rows):
+        T = pose(Rotation.from_rotvec([0.2, -0.1, 0.1 * k]).as_matrix(), np.array([-0.07, -0.04, 0.5]))
+        for side, camera, T_left in zip(("left", "right"), rig.cameras, (np.eye(4), rig.T_left_right), strict=True):
+            board = PosedBody((chessboard(8, row, 0.02),), inverse(T_left) @ T)
+            cv2.imwrite(str(tmp_path / f"{side}{k}.png"), render(camera, [board], rng=rng))
+    said = armsight("measure", rendered.rig, "--target", "chessboard:8x5:20mm", *images(tmp_path))
+    assert said.code == code, said.err
+    assert ("the board has 8x6 (chessboard), not 8x5" in said.err) == (code > 0)
+    assert ("do not trust this result: body: the board" in said.err) == (code == 3)
 
 
 def test_a_fixed_body_that_moves_is_named(rendered, armsight, tmp_path):

@@ -17,6 +17,7 @@ from armsight.sim.render.scene import PosedBody, chessboard
 from armsight.vision.camera import Camera
 from armsight.vision.markers.aruco import cells
 from armsight.vision.markers.board import BOARDS, board_in_view, open_board
+from armsight.vision.markers.chessboard import extends_beyond, find_grid, fit_grid
 from asserts import one_line
 
 SPECS = {
@@ -412,3 +413,18 @@ def test_a_board_of_another_size_is_rejected_and_its_size_is_named(said):
     problem = open_board(f"chessboard:{said}:25mm").detect(image).problem
     assert problem is not None
     assert "extends beyond" in problem or "but corners of 9x6: a board of that size" in problem
+
+
+@pytest.mark.parametrize("f_px", [300.0, 420.0, 560.0])
+@pytest.mark.parametrize("w", [(0.3, -0.5, 0.1), (0.1, 0.3, -0.2), (0.1, 0.5, -0.2)])
+def test_a_part_of_a_board_seen_at_an_angle_is_no_whole_board(w, f_px):
+    R = exp_so3(np.array(w))
+    T = pose(R, np.array([0.0, 0.0, 0.33 * f_px / 560.0]) - R @ np.array([0.1, 0.0625, 0.0]))
+    camera = Camera((640, 480), "none", np.array([f_px, f_px, 319.5, 239.5]), np.zeros(0))
+    image = render(camera, [PosedBody((chessboard(9, 6, 0.025),), T)], rng=np.random.default_rng(1))
+    whole = find_grid(image, 9, 6)
+    for part in (np.s_[:, :8], np.s_[:, 1:], np.s_[:5], np.s_[1:], np.s_[:]):
+        rough = np.ascontiguousarray(whole[part])
+        fits = fit_grid(image, rough)
+        more = extends_beyond(image, fits, fits.kept, np.sign(fits.contrast), rough.shape[:2])
+        assert more == (len(rough) < 6 or rough.shape[1] < 9)

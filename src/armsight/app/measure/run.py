@@ -90,7 +90,9 @@ def measure_shots(options: MeasureOptions) -> tuple[HealthFinding, ...]:
             click.echo(f"armsight: stopped after {run.total} shots{kept}", err=True)
             raise
         shots.finish(run.records)
-        contradicted = missed.finding()
+        other = shots.other_board() if run.total > 2 * run.measured else ""
+        contradicted = make_finding("board", (run.total - run.measured, 0.0), words={"other": other}) if other else None
+        contradicted = contradicted or missed.finding()
         if run.total and not run.measured:
             raise ArmsightError(run.nothing_measured(contradicted))
     click.echo(run.summary(time.perf_counter() - started), err=True)
@@ -236,7 +238,7 @@ class MeasureRun:
         first, mistake = self.first, self.shots.mistake()
         assert first is not None
         why = mistake or f"{first.shot}: {first.reason}"
-        if contradicted is not None and contradicted.cause == "rig" and not mistake:
+        if contradicted is not None and contradicted.cause in ("rig", "body") and not mistake:
             why += f"; {contradicted.what}; {contradicted.advice}"
         written = "" if self.options.output is None else f" (the reason of each is in {self.options.output})"
         return f"none of {self.total} shots could be measured: {why}{written}"

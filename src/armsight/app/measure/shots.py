@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -19,7 +20,8 @@ from armsight.files import check_writable
 from armsight.loop.health import HealthFinding
 from armsight.vision.detections import NAMED, SeenShot, read_detections
 from armsight.vision.follow.follower import Follower, follows
-from armsight.vision.image import one_image
+from armsight.vision.image import grey, one_image
+from armsight.vision.markers.board import BOARDS, board_in_view
 from armsight.vision.markers.calibrated_board import is_print
 from armsight.vision.markers.circles import unseen_row
 from armsight.vision.markers.marker import Target
@@ -80,6 +82,8 @@ class DetectedShots:
         """Return nothing: only images show what was done to them."""
         return ""
 
+    other_board = mistake
+
 
 class ImageShots:
     """Shots of images."""
@@ -96,7 +100,7 @@ class ImageShots:
                 "--save-rig writes skew, readout and the noise of discs: give --skew find, or a body of discs"
             )
         self.skewed: list[HealthFinding] = []  #: filled at the end: that the cameras do not expose at one time
-        self._missed: Shot | None = None  # the first with both images
+        self._missed: list[Shot] = []  # the first with both images
         self._again: Source | None = None
         self._source = source = open_source(options.source)
         try:
@@ -126,7 +130,7 @@ class ImageShots:
             if self.noise is not None and isinstance(found, PoseEstimate):
                 self.noise.add(found)
             if isinstance(found, Missed) and shot.left is not None and shot.right is not None:
-                self._missed = self._missed or shot
+                self._missed.extend([shot] * (len(self._missed) < _LOOKED_AT))
             if self._requested is None and self._timed and len(first) < NOTED_SHOTS:
                 first.append((shot.t_s, found))
             yield result
@@ -188,7 +192,8 @@ class ImageShots:
 
     def mistake(self) -> str:
         """Return what was done to the images where a missed shot can be measured once it is undone; empty otherwise."""
-        if (shot := self._missed) is None or shot.left is None or shot.right is None:
+        shot = next(iter(self._missed), None)
+        if shot is None or shot.left is None or shot.right is None:
             return ""
         if one_image(shot.left, shot.right):
             return "the left and the right image are the same: give the images of two cameras"
@@ -199,6 +204,25 @@ class ImageShots:
             if isinstance(found, PoseEstimate) and len(found.points.ids) > len(found.dropped):
                 fits[-len(found.points.ids), found.reprojection_rms_px] = what
         return fits[min(fits)] if fits else ""
+
+    def other_board(self) -> str:
+        """Return which board most images of missed shots show whole, where the target is no such board or a part of it."""
+        kind, counts, points = *_board(self.body), len(self.body.points)
+        images = [grey(image) for shot in self._missed for image in (shot.left, shot.right) if image is not None]
+        if kind not in BOARDS or not images:
+            return ""
+        shown = [board.body for image in images if (board := board_in_view(image)) is not None]
+        seen = Counter(_board(body) for body in shown if _board(body)[0] != kind or len(body.points) > points)
+        (said, of), count = next(iter(seen.most_common(1)), (("", ""), 0))
+        return f"the board has {of} ({said}), not {counts}" if 2 * count > max(len(shown), 2) else ""
+
+
+def _board(body: Body) -> tuple[str, str]:
+    """Return the kind of a board, and its counts as its name has them, the larger first; empty for other bodies."""
+    kind, _, rest = body.name.partition(":")
+    counts = rest.partition(":")[0].split("x")
+    ordered = sorted(counts, key=int, reverse=True) if all(each.isdigit() for each in counts) else []
+    return kind, "x".join(ordered)
 
 
 def open_shots(
@@ -248,6 +272,8 @@ class NamedShots:
         return ", ".join(self.names) + (f" and {more} more" if more else "")
 
 
+#: Missed shots whose images are looked at again; half: one odd image decides, double: the end takes seconds.
+_LOOKED_AT = 5
 #: What a camera's driver may have done to its images -> how it is undone.
 _FLIPS: dict[str, Callable[[Image], Image]] = {
     "rotated by 180 degrees": lambda image: image[::-1, ::-1],

@@ -38,8 +38,13 @@ MORE_SHARE = 0.7
 #: disturbed corner: a glint, a finger, a staple.
 MISFIT_RATIO = 4.0
 COPY_BLUR_PX = 0.75  # in a smaller copy; half: few images are reduced, double: sharp ones are
-#: The four outermost lines of a grid (rows, columns), each with the one next to it.
-_ENDS = ((np.s_[0], np.s_[1]), (np.s_[-1], np.s_[-2]), (np.s_[:, 0], np.s_[:, 1]), (np.s_[:, -1], np.s_[:, -2]))
+#: The four outermost lines of a grid (rows, columns), each with the two next to it.
+_ENDS = (
+    (np.s_[0], np.s_[1], np.s_[2]),
+    (np.s_[-1], np.s_[-2], np.s_[-3]),
+    (np.s_[:, 0], np.s_[:, 1], np.s_[:, 2]),
+    (np.s_[:, -1], np.s_[:, -2], np.s_[:, -3]),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,8 +220,10 @@ def extends_beyond(
     uv = np.where(kept[:, None], fits.uv, np.nan).reshape(*shape, 2)
     squares = local_squares(uv)[0]
     signs = colours.reshape(shape)
-    for end, inner in _ENDS:
-        beyond, sides, colour = 2 * uv[end] - uv[inner], squares[end], -signs[end]
+    for end, second, third in _ENDS:
+        step, sides, colour = uv[end] - uv[second], squares[end], -signs[end]
+        change = step - (uv[second] - uv[third])  # of steps, by perspective and lens
+        beyond = uv[end] + step + np.nan_to_num(change)
         least = max(3.0, MORE_SHARE * np.count_nonzero(np.isfinite(beyond[:, 0])))
         if np.count_nonzero(crossing_signs(image, beyond, sides) == colour) < least:
             continue
