@@ -281,8 +281,8 @@ class Columns:
         at = self.at.get(name)
         return ["" if at is None else sys.intern(row[at]) for _, row in self.rows]
 
-    def numbers(self, names: Sequence[str], *, gaps: bool = False, empty: bool = False) -> Array:
-        """Return columns (N, K); with ``empty`` NaN where a cell is empty, with ``gaps`` also where it is not finite."""
+    def numbers(self, names: Sequence[str], *, gaps: bool = False, empty: bool = False, text: bool = False) -> Array:
+        """Return columns (N, K); NaN with ``empty`` where a cell is empty, ``gaps`` also not finite, ``text`` no number."""
         self.require(*names)
         if len(self.rows) * len(names) > _MOST_NUMBERS:
             raise InputError(
@@ -294,7 +294,8 @@ class Columns:
             cells = [row[k] if k < len(row) else "" for k in columns]
             values = [math.nan if value is None else value for value in map(number, cells)]
             if not all(map(math.isfinite, values)):
-                self._check(line, dict(zip(names, cells, strict=True)), gaps=gaps, empty=empty or gaps)
+                if not text:
+                    self._check(line, dict(zip(names, cells, strict=True)), gaps=gaps, empty=empty or gaps)
                 values = [value if math.isfinite(value) else math.nan for value in values]
             out[i] = values
         return out

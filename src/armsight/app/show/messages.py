@@ -55,9 +55,10 @@ class _Notes(logging.Handler):
 
 
 def print_notes() -> None:
-    """Print what reading an arm logs as notes on stderr."""
-    logger = logging.getLogger("armsight.robot")
-    logger.handlers[:], logger.propagate = [_Notes(logging.WARNING)], False
+    """Print what reading an arm or a recording logs as notes on stderr."""
+    for name in ("armsight.robot", "armsight.loop.references"):
+        logger = logging.getLogger(name)
+        logger.handlers[:], logger.propagate = [_Notes(logging.WARNING)], False
 
 
 def weak(text: str) -> str:

@@ -2,10 +2,10 @@
 
 [imu]
 kind = "inertial"           # or "magnetometer", "range": a wire, bar, laser or radio to one anchor
-source = "imu.csv"          # CSV or JSON lines: t_s and its columns, such as gyro_x_rad_s; a bag of ROS, a run
+source = "imu.csv"          # CSV or JSON lines: t_s and its columns, in SI or as gyro_x_deg_s; a bag of ROS, a run
 live = "udp:5005"           # where `armsight run` reads it, JSON lines of the same keys; or serial:PORT
 class = "mpu-6050"          # of an inertial unit; what is not known is left out
-rate_hz = 100.0
+rate_hz = 100.0             # of any kind: `armsight references check` compares it
 delay_s = 0.004
 sigma_delay_s = 0.001
 noise_m = 0.0005            # of a range
@@ -16,10 +16,14 @@ covariance = [[..], ..]
 from __future__ import annotations
 
 import json
+import logging
 import os
+import re
 import tomllib
-from collections.abc import Callable, Sequence
+import unicodedata
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -33,9 +37,13 @@ from armsight.geometry.check import checked
 from armsight.loop.references.distance import Distance
 from armsight.loop.references.heading import Magnetometer
 from armsight.loop.references.inertial import Inertial
+from armsight.loop.references.reference import STANDARD_GRAVITY_M_S2
+from armsight.loop.references.stream import check_seconds
 from armsight.tables.columns import Columns
+from armsight.tables.lengths import UNITS_M
 from armsight.vision.sources.bag.reader import S_NS, SUFFIXES, Bag, BagMessage
 
+_LOG = logging.getLogger(__name__)
 #: Keys of a reference's table.
 _NUMBERS_LEAST = {"rate_hz": 1e-3, "delay_s": -np.inf, "sigma_delay_s": 0.0, "noise_m": 1e-7}
 _KEYS = ("kind", "source", "live", "class", *_NUMBERS_LEAST, "parameters", "covariance")
@@ -48,13 +56,21 @@ COLUMNS: dict[type[Sensor], tuple[str, ...]] = {
     Magnetometer: tuple(f"field_{a}_t" for a in "xyz"),
     Distance: ("range_m",),
 }
+#: Units that may stand at the end of a column's name, in those of ``COLUMNS``.
+_UNITS = {
+    "rad_s": {"rad_s": 1.0, "deg_s": np.pi / 180, "dps": np.pi / 180},
+    "m_s2": {"m_s2": 1.0, "g": STANDARD_GRAVITY_M_S2, "mg": 1e-3 * STANDARD_GRAVITY_M_S2},
+    "t": {"t": 1.0, "mt": 1e-3, "ut": 1e-6, "nt": 1e-9, "gauss": 1e-4, "mgauss": 1e-7},
+    "m": {"m": 1.0} | UNITS_M,
+    "s": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
+}
+#: Slower readings, Hz, that last long have no times in s; half: 5 kHz in ms pass, double: a unit at 10 Hz is rejected.
+_SLOWEST_HZ: dict[type[Sensor], float] = {Inertial: 10.0, Magnetometer: 1.0, Distance: 1.0}
 #: Messages of ROS that have them; bytes of the numbers at the end of these, and where among them a reading stands.
 RANGE = "sensor_msgs/Range"
-MESSAGES: dict[type[Sensor], str] = {
-    Inertial: "sensor_msgs/Imu",
-    Magnetometer: "sensor_msgs/MagneticField",
-    Distance: RANGE,
-}
+MESSAGES: dict[type[Sensor], str] = dict(
+    zip(KINDS, ("sensor_msgs/Imu", "sensor_msgs/MagneticField", RANGE), strict=True)
+)
 _NUMBERS = {MESSAGES[Inertial]: (37 * 8, np.r_[13:16, 25:28]), MESSAGES[Magnetometer]: (12 * 8, np.r_[0:3])}
 
 
@@ -144,10 +160,8 @@ def _known(where: str, sensor: Sensor, given: object, covariance: object) -> Sen
 
 def written(entry: Entry, folder: Path) -> str:
     """Return the table of a reference as text, for a file in a folder."""
-    sensor, lines = (
-        entry.reference,
-        [f"[{json.dumps(entry.reference.name)}]", f'kind = "{KINDS[type(entry.reference)]}"'],
-    )
+    sensor = entry.reference
+    lines = [f"[{json.dumps(sensor.name)}]", f'kind = "{KINDS[type(sensor)]}"']
     if entry.source is not None:
         lines.append(f"source = {json.dumps(os.path.relpath(entry.source, folder))}")
     if entry.live is not None:
@@ -167,29 +181,67 @@ def written(entry: Entry, folder: Path) -> str:
 def read_recording(path: Path, kind: type[Sensor] = Inertial) -> tuple[Array, Array]:
     """Return times (N,), s, and values of a recording, by a reference's columns: of a unit (N, 6), rad/s and m/s2.
 
+    Lines and messages without a finite number in each are left out, and logged.
+
     Raises:
-        InputError: the file, the line and what was expected.
+        InputError: the file, the line and what was expected; most lines are left out.
     """
     if path.is_dir() or path.suffix.lower() in SUFFIXES:
-        if kind is Distance:
-            topics, t_s, _, z = read_ranges(path)
-            if len(topics) > 1:
-                raise InputError(f"{path}: expected one topic of {RANGE}; there are {len(topics)}: {', '.join(topics)}")
-            return t_s, z[:, None]
-        return _of_bag(Bag(path), MESSAGES[kind])
-    lines = path.suffix.lower() in (".jsonl", ".ndjson")
-    columns = _json_lines(path, COLUMNS[kind]) if lines else Columns.of_csv(path)
-    return columns.numbers(["t_s"])[:, 0], columns.numbers(COLUMNS[kind])
+        if kind is not Distance:
+            rows = _of_bag(Bag(path), MESSAGES[kind])
+            return rows[:, 0], rows[:, 1:]
+        topics, t_s, _, z = read_ranges(path)
+        if len(topics) > 1:
+            raise InputError(f"{path}: expected one topic of {RANGE}; there are {len(topics)}: {', '.join(topics)}")
+        return t_s, z[:, None]
+    columns = (_json_lines if path.suffix.lower() in (".jsonl", ".ndjson") else Columns.of_csv)(path)
+    names, factors = zip(*(_column(columns, name) for name in ("t_s", *COLUMNS[kind])), strict=True)
+    rows = _kept(path, columns.numbers(names, text=True) * factors, "line", columns.line)
+    check_seconds(rows[:, 0], _SLOWEST_HZ[kind], f"{path}: {names[0]}")
+    return rows[:, 0], rows[:, 1:]
 
 
-def _of_bag(bag: Bag, kind: str) -> tuple[Array, Array]:
-    """Return the readings of a recording of ROS, or of a run.mcap: of its one topic of a kind."""
+def _kept(path: str | Path, rows: Array, what: str, number: Callable[[int], int]) -> Array:
+    """Return the rows (N, k) that are finite; ``number``: of a row, as the file counts its lines or messages."""
+    bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
+    first = ", ".join(str(number(int(row))) for row in bad[:5]) + " .." * (len(bad) > 5)
+    said = f"{path}: {len(bad)} of {len(rows)} {what}s have an empty cell or no finite number ({what} {first})"
+    if 2 * len(bad) > len(rows):
+        raise InputError(f"{said}: too many to leave out; correct them")
+    if len(bad):
+        _LOG.warning("%s and are left out", said)
+    return np.delete(rows, bad, axis=0)
+
+
+def _column(columns: Columns, name: str) -> tuple[str, float]:
+    """Return the file's column for one of ours, whatever its unit, and the factor that makes it ours."""
+    there = {_plain(each): each for each in columns.head if each}
+    unit = next(each for each in _UNITS if name.endswith(f"_{each}"))
+    stem = name.removesuffix(unit)
+    known = {stem + each: factor for each, factor in _UNITS[unit].items()}
+    if found := next((each for each in known if each in there), None):
+        return there[found], known[found]
+    like = "time|stamp|^t" if unit == "s" else f"{stem[-2]}(_|$)" if "_" in stem[:-1] else ""
+    near = get_close_matches(name, [each for each in there if re.search(like, each)], 1, 0.1)
+    meant = f"did you mean {there[near[0]]}? rename it with its unit" if near else "add it"
+    missing = f"column {name} is missing, also in another unit ({', '.join(known)})"
+    raise InputError(f"{columns.path}: {missing}; there are {columns.near(name)}: {meant}")
+
+
+def _plain(name: str) -> str:
+    """Return a column's name in small letters, what separates its words as _: gyro_x_deg_s of Gyro X (deg/s)."""
+    name = unicodedata.normalize("NFKC", name.replace("\N{DEGREE SIGN}", "deg").replace("^", "")).lower()
+    return re.sub(r"[\W_]+", "_", name.replace("\N{GREEK SMALL LETTER MU}", "u")).strip("_")
+
+
+def _of_bag(bag: Bag, kind: str) -> Array:
+    """Return times and readings (N, 1 + k) of a recording of ROS, or of a run.mcap: of its one topic of a kind."""
     topics = [topic.name for topic in bag.of_kind(kind)]
     if len(topics) != 1:
         listed = ", ".join(topics) or bag.holds()
         raise InputError(f"{bag.path}: expected one topic of {kind}; there are {len(topics)}: {listed}")
-    found = [reading_of(message) for message in bag.messages(topics)]
-    return np.array([t for t, _ in found]), np.array([z for _, z in found])
+    rows = np.array([(t, *z) for t, z in map(reading_of, bag.messages(topics))]).reshape(-1, 1 + len(_NUMBERS[kind][1]))
+    return _kept(bag.path, rows, "message", lambda row: row + 1)
 
 
 def read_ranges(path: Path) -> tuple[tuple[str, ...], Array, NDArray[np.int64], Array]:
@@ -234,21 +286,18 @@ def reading_of(message: BagMessage) -> tuple[float, Array]:
     return _time_s(message), values[rows]
 
 
-def _json_lines(path: Path, names: Sequence[str]) -> Columns:
-    """Return the columns of a file of one JSON object a line."""
-    rows = list[tuple[int, list[str]]]()
-    head = ["t_s", *names]
+def _json_lines(path: Path) -> Columns:
+    """Return the columns of a file of one JSON object a line; of other lines empty cells."""
+    records, wrong = dict[int, dict[str, Any]](), ""
     for line, text in enumerate(read_text(path, _MOST_MB).splitlines(), 1):
         if not text.strip():
             continue
         try:
             record = json.loads(text)
-        except ValueError as error:
-            raise InputError(f"{path}: line {line}: not JSON: {error}") from None
-        missing = head if not isinstance(record, dict) else [name for name in head if name not in record]
-        if missing:
-            raise InputError(f"{path}: line {line}: expected an object with {', '.join(head)}; {missing[0]} is missing")
-        rows.append((line, [str(record[name]) for name in head]))
-    if not rows:
-        raise InputError(f"{path}: is empty")
-    return Columns(path, head, rows)
+        except (ValueError, RecursionError) as error:
+            record, wrong = None, wrong or f"line {line}: not JSON: {error}"
+        records[line] = record if isinstance(record, dict) else {}
+    head = list(dict.fromkeys(name for record in records.values() for name in record))
+    if not head:
+        raise InputError(f"{path}: {wrong or ('expected an object a line' if records else 'is empty')}")
+    return Columns(path, head, [(line, [str(each.get(name, "")) for name in head]) for line, each in records.items()])

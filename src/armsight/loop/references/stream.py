@@ -38,6 +38,8 @@ LEAVES, NOISE = 0.08, 1.5
 MOST_DAMPED = 0.3
 #: A tool has settled where the vibration's amplitude is below this, m.
 SETTLED_M = 2e-5
+#: A sweep is no longer, s; half: slow ranges of 20 minutes are rejected, double: 3 s whose times are in ms pass.
+MOST_S = 1800.0
 #: Averaging times of the Allan deviation, a decade, and the share of the recording that is the longest.
 A_DECADE, LONGEST = 8, 0.2
 #: The coefficients: name -> its share of the Allan variance at an averaging time.
@@ -99,17 +101,14 @@ def check_stream(t_s: Array, z: Array, source: str) -> StreamCheck:
 
     Args:
         t_s: (N,) times, s.
-        z: (N, k) values.
+        z: (N, k) values, finite.
         source: its file, for messages.
 
     Raises:
-        InputError: too short, no numbers, or times that run backwards.
+        InputError: too short, or times that run backwards.
     """
     if len(t_s) < 20:
         raise InputError(f"{source}: {len(t_s)} readings; 20 at least are needed")
-    if not (np.isfinite(t_s).all() and np.isfinite(z).all()):
-        row = int(np.flatnonzero(~np.isfinite(np.column_stack([t_s, z])).all(axis=1))[0])
-        raise InputError(f"{source}: reading {row + 1} is no number; leave such rows out")
     steps = np.diff(t_s)
     if (steps < 0.0).any():
         row = int(np.argmax(steps < 0.0))
@@ -135,6 +134,18 @@ def check_stream(t_s: Array, z: Array, source: str) -> StreamCheck:
         saturated,
         _rests(z, period),
     )
+
+
+def check_seconds(t_s: Array, slowest_hz: float, source: str) -> None:
+    """Raise an InputError where times (N,) last long at a lower rate than a sensor's slowest, Hz: they are not in s."""
+    steps, length_s = np.diff(t_s), float(np.ptp(t_s)) if len(t_s) else 0.0
+    rate_hz = 1.0 / float(np.median(steps[steps > 0.0])) if length_s > MOST_S else slowest_hz
+    if rate_hz < slowest_hz:
+        unit, scale = next(((u, k) for u, k in (("ms", 1e3), ("us", 1e6)) if rate_hz * k >= slowest_hz), ("ns", 1e9))
+        raise InputError(
+            f"{source} looks like {unit}: {rate_hz:.2g} Hz for {length_s:.3g} s, in {unit} {scale * rate_hz:.3g} Hz for "
+            f"{length_s / scale:.3g} s; it must be seconds: name it t_{unit}, or cut a slow recording to {MOST_S:g} s"
+        )
 
 
 def _saturated(column: Array) -> bool:
