@@ -925,14 +925,10 @@ bool motor_is_stuck(const motor_state *motor, const motor_config *config, float 
     return stuck < STUCK_SHARE * sound && number_size(by_v) > STUCK_SUPPLY * supply_v;
 }
 
-bool motor_may_have_stepped(motor_state *motor)
+bool motor_may_have_stepped(const motor_state *motor)
 {
     const bool unseen = motor->limited_ticks != 0u && motor->driven_ticks - motor->limited_ticks < MOTOR_STEP_TICKS;
-    if (!unseen && !motor_stepped(motor)) {
-        return false;
-    }
-    motor->step_ticks = motor->driven_ticks;
-    return true;
+    return unseen || motor_stepped(motor);
 }
 
 bool motor_disobeys(const motor_state *motor, const motor_config *config, float supply_v, float error_rad)

@@ -126,9 +126,9 @@ uint32_t motor_blames(const motor_state *motor, const motor_config *config, floa
 /* Return whether since such a step reading and current go with a voltage that stays, whatever is put out. */
 bool motor_is_stuck(const motor_state *motor, const motor_config *config, float supply_v, motor_sums *sums);
 
-/* Return whether the back-EMF has stepped, or may have while a driver limited the current: a bridge that drives by itself once the
- * drives are off does so, a reading that fails does not. To be asked while they are off: until they are on again that stays so. */
-bool motor_may_have_stepped(motor_state *motor);
+/* Return whether the back-EMF has stepped of late, or may have while a driver limited the current: a bridge that drives by
+ * itself once the drives are off does so, a reading that fails does not. */
+bool motor_may_have_stepped(const motor_state *motor);
 
 /* Return whether for 16 ms a motor has not done what was put out to it, and by reading and current another voltage drives
  * it: against the way error_rad that it is driven, or at all where nothing was put out and shorted windings brake. */

@@ -503,7 +503,8 @@ void safety_watch_rest(core_state *core)
     for (uint32_t i = core->tick % WATCH_TICKS; i < core->config.joint_count; i += WATCH_TICKS) {
         joint_state *joint = &core->joint[i];
         const joint_config *config = &core->config.joint[i];
-        if ((motor_may_have_stepped(&joint->motor) &&
+        joint->motor.stepped_off |= motor_may_have_stepped(&joint->motor) ? 1u : 0u;
+        if ((joint->motor.stepped_off != 0u &&
              motor_disobeys(&joint->motor, &config->motor, core->supply_v, 0.0f)) ||
             runs_on(core, joint, config, true)) {
             blame(core, joint, FAULT_BRIDGE, i);

@@ -402,7 +402,8 @@ typedef struct motor_state {
     float part_a;
     float part_rad;          /* reading then */
     uint32_t limited_ticks;  /* driven_ticks when a driver may last have limited the current; 0: never */
-    uint32_t part_ticks;     /* driven_ticks then */
+    uint32_t stepped_off;    /* not 0: motor_may_have_stepped as the drives went off, or since; until they are on */
+    uint32_t part_ticks;     /* driven_ticks when the last sample was taken */
     float current_a;         /* the largest mean of a sample of late */
     float damped_rad_s;      /* the speed, smoothed */
     float beyond_rad_s;      /* what kd damps beyond the reading's speed */

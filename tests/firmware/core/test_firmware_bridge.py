@@ -105,6 +105,35 @@ def test_a_moving_joint_whose_bridge_is_stuck_at_an_emergency_stop_is_braked(mot
         assert abs(arm.plant.link[3] - at) < 0.1
 
 
+@pytest.mark.parametrize(("kind", "named"), [(PotFault.DRIFT, Fault.POT_DRIFT), (None, Fault.CURRENT_SENSOR)])
+def test_a_step_before_a_stop_names_no_fault_once_the_drives_are_on_again(motors, library, kind, named):
+    """50 ms after: with a step of late a reading that drifts would be a current sensor."""
+    for seed in SEEDS:
+        arm = motors.drawn_arm(library, seed)
+        arm.enable()
+        arm.rest(400)
+        motors.until_moving(arm, 3)
+        arm.plant.stuck[3] = 0.7
+        arm.tick(4)
+        arm.inputs.stop_pressed = 1
+        arm.tick(4)
+        arm.plant.stuck[3], arm.plant.blocked[:] = 0.0, True
+        assert arm.tick(90)["windings_shorted"]
+        assert arm.core.joint[3].motor.stepped_off
+        arm.inputs.stop_pressed = 0
+        arm.command(c.COMMAND_CLEAR_STOP)
+        arm.command(c.COMMAND_ENABLE)
+        assert not arm.core.joint[3].motor.stepped_off
+        arm.rest(48)
+        assert arm.first == (None, None)
+        arm.plant.blocked[:] = False
+        arm.plant.hand_n_m[:] = arm.model.gravity_n_m * np.cos(arm.plant.link)
+        motors.offset(arm, 3) if kind is None else arm.plant.break_pot(3, kind, 3.0)
+        arm.rest(600)
+        arm.rest_on(600)
+        assert arm.first == (named, 3)
+
+
 @pytest.mark.parametrize("share", [0.8, 1.4])
 def test_windings_that_warm_or_cool_are_followed(motors, library, share):
     for seed in SEEDS:
