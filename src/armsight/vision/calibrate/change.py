@@ -3,7 +3,7 @@
 In: an adjustment of all pairs, in the order in which they were taken. Out: between which two the cameras changed, what
 changed and by how much; None where one state fits all. Each way to change and each split of the pairs is a score test
 (Rao, 1948) in which every shot's own parameters are eliminated. The same test of the pairs in random orders shows what
-chance, outliers and what the lens model lacks do (a permutation test; Good, 2005).
+chance and outliers do (a permutation test; Good, 2005), and in orders by the boards' poses what the lens model lacks does.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ from armsight.vision.triangulate import optimal_points
 
 #: Least pairs on either side of a change, and the least share of all; half: more that chance offers, double: later found.
 _LEAST, _LEAST_SHARE = 3, 0.15
-#: Random orders, and the share of them that may look as changed; half and double: another rate of false alarms.
+#: Random orders, as many by pose, and the share of the first that may look as changed; half and double: another rate of
+#: false alarms.
 _ORDERS, _CHANCE = 200, 0.005
 #: Least square of a change in sigmas of the rig, per parameter; half: changes that sigmas hold are named, double: fewer.
 _MATTERS = 4.0
@@ -34,7 +35,7 @@ class CameraChange(Record):
     """What changed in the cameras between two pairs."""
 
     row: int  #: the first pair after it
-    what: str  #: the part that changed, and by how much, such as "the right focal length by +1.0 %"
+    what: str  #: the part that changed, and by how much: "the right focal length by +1.0 %"; empty: or the lens model
     off: Array  #: (2, P) the rig's parameters before and after it less those of the fit to all pairs
     shift_m: float  #: by how much it displaces the points that the pairs measured, median, m
 
@@ -69,6 +70,17 @@ def _gains(H: Array, g: Array, whole: tuple[Array, Array], ways: list[NDArray[np
     return np.array([(slope * step).sum(axis=1) for (_, slope), step in zip(blocks, steps, strict=True)]), steps
 
 
+def _by_pose(Ts: Array, model: BundleModel) -> NDArray[np.intp]:
+    """Return orders (K, N) of N pairs by the poses of their boards: by where, how far and how tilted, and by mixtures."""
+    middle = transform(Ts, model.body(np.zeros(len(model.modes))).mean(axis=0))
+    sight = middle[:, :2] / middle[:, 2:]
+    off_axis = np.linalg.norm(sight - sight.mean(axis=0), axis=1)
+    poses = np.column_stack([sight, np.log(middle[:, 2]), Ts[:, :2, 2], off_axis])
+    poses = (poses - poses.mean(axis=0)) / np.maximum(poses.std(axis=0), 1e-300)
+    mixtures = np.random.default_rng(1).standard_cauchy((_ORDERS - poses.shape[1], poses.shape[1]))
+    return np.argsort(np.concatenate([np.eye(poses.shape[1]), mixtures]) @ poses.T, axis=1)
+
+
 def change_of(
     model: BundleModel, solution: BundleSolution, seen: Observations, rig: StereoRig, pairs: int
 ) -> CameraChange | None:
@@ -76,16 +88,11 @@ def change_of(
     count, least = rig.left.parameters.size, max(_LEAST, int(np.ceil(_LEAST_SHARE * pairs)))
     if pairs < 2 * least:
         return None
-    left, right = np.arange(2), count + np.arange(2)
-    named = {
-        "the left focal length": left,
-        "the right focal length": right,
-        "both focal lengths": np.concatenate([left, right]),
-        "the left image's position": left + 2,
-        "the right image's position": right + 2,
-        "the positions of both images": np.concatenate([left, right]) + 2,
-        "the relative pose of the cameras": np.arange(len(rig.cov) - 6, len(rig.cov)),
-    }
+    left, right, both = np.arange(2), count + np.arange(2), np.array([0, 1, count, count + 1])
+    focal = {"the left focal length": left, "the right focal length": right, "both focal lengths": both}
+    names = "the left image's position", "the right image's position", "the positions of both images"
+    named = focal | dict(zip(names, (left + 2, right + 2, both + 2), strict=True))
+    named["the relative pose of the cameras"] = np.arange(len(rig.cov) - 6, len(rig.cov))
     free = np.diag(rig.cov) > 0
     column_of, named = np.cumsum(free) - 1, {name: p for name, p in named.items() if free[p].all()}
     ways = [column_of[p] for p in named.values()]
@@ -96,13 +103,14 @@ def change_of(
     whole, inner = (H.sum(axis=0), g.sum(axis=0)), slice(least - 1, pairs - least)
     H, g = H[:pairs], g[:pairs]
     gains, steps = _gains(H, g, whole, ways)
-    random, orders = np.random.default_rng(0), list[Array]()
-    for _ in range(_ORDERS):
-        order = random.permutation(pairs)
-        orders.append(_gains(H[order], g[order], whole, ways)[0][:, inner].max(axis=1))
-    usual = np.maximum(np.mean(orders, axis=0), 1e-300)
-    over = gains[:, inner] / usual[:, None]
-    if over.max() <= np.quantile((np.array(orders) / usual).max(axis=1), 1 - _CHANCE):
+    random, by_pose = np.random.default_rng(0), _by_pose(solution.state.Ts_left_body[:pairs], model)
+    by_chance, by_lens = (
+        np.array([_gains(H[order], g[order], whole, ways)[0][:, inner].max(axis=1) for order in orders])
+        for orders in ([random.permutation(pairs) for _ in range(_ORDERS)], by_pose)
+    )
+    usual = np.maximum(by_chance.mean(axis=0), 1e-300)
+    over = (gains[:, inner] / usual[:, None]).max()
+    if over <= np.quantile((by_chance / usual).max(axis=1), 1 - _CHANCE):
         return None
     beyond = gains[:, inner] - usual[:, None]
     way, column = np.unravel_index(int(np.argmax(beyond)), beyond.shape)
@@ -113,12 +121,15 @@ def change_of(
     off[:, free] = np.stack([-drawn, step - drawn]) * unit
     if max(each @ solve_scaled(rig.cov[np.ix_(free, free)], each) for each in off[:, free]) < _MATTERS * free.sum():
         return None
+    sure = over > (by_lens / usual).max()
     points = transform(solution.state.Ts_left_body[:pairs, None], model.body(solution.state.shape)).reshape(-1, 3)
     views = points, transform(inverse(rig.T_left_right), points)
     uv = np.stack([camera.project(p) for camera, p in zip(rig.cameras, views, strict=True)], axis=1)
     by_rig = optimal_points(rig, uv, np.broadcast_to(np.eye(2), (len(uv), 2, 2, 2)))[2]
     shift_m = float(np.nanmedian(np.linalg.norm(by_rig @ (off[1] - off[0]), axis=1)))
-    return CameraChange(split, f"{name} by {_amount(rig, p, (off[1] - off[0])[p])}", off, shift_m)
+    return CameraChange(
+        split, f"{name} by {_amount(rig, p, (off[1] - off[0])[p])}" if sure else "", off * sure, shift_m
+    )
 
 
 def _amount(rig: StereoRig, p: NDArray[np.intp], step: Array) -> str:

@@ -360,22 +360,9 @@ def concluded(
     epipolar_px = residual_epipolar_rms(rig, of_middles(model, state, observations))
     notes = (*notes, *unfinished(solution))
     motion = None if trial.motion is None else trial.motion.scaled(heldout.normalised_rms)
-    calibration = Calibration(
-        *(
-            rig,
-            replace(body, points=found),
-            deviation_m,
-            pairs,
-            pairs_found,
-            observations,
-            solution,
-            epipolar_px,
-            heldout,
-        ),
-        *(trial.errors, models, rejected, notes, (), motion, disc_radius_m),
-        change=change,
-    )
-    return assessed(calibration)
+    drawn, by_pair = replace(body, points=found), (trial.errors, models, rejected, notes, (), motion, disc_radius_m)
+    seen = (deviation_m, pairs, pairs_found, observations, solution, epipolar_px, heldout)
+    return assessed(Calibration(rig, drawn, *seen, *by_pair, change=change))
 
 
 def assessed(calibration: Calibration) -> Calibration:

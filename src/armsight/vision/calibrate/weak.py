@@ -24,8 +24,15 @@ _REJECTED_SHARE = 0.2
 _CONTRADICTION = 0.005
 #: How many times as large as what boards moved between exposures it may be.
 _OF_MOTION = 3.0
+#: By which share of their distance points may move where pairs fit other cameras: beyond, sigmas cannot hold it. Half: a
+#: camera that rotated by half a degree contradicts; double: images that are mirrored from a pair on may not.
+_FAR_CHANGE = 0.1
 _FAR_MOTION, _FARTHEST = 2.0, 4
 _ROLLED_DEG = 60.0
+_RECORD = (
+    " By what time they differ is not found here, for images have none: give a recording, `armsight calibrate --source "
+    "video:LEFT,RIGHT` or a folder of `armsight record`, of a board that moves"
+)
 #: Degree of the polynomials of the position in an image that residuals may follow, beyond which share of their square and
 #: which chance they show a lens that the model cannot express.
 _FIELD_DEGREE, _FIELD_SHARE, _FIELD_CHANCE = 4, 0.04, 1e-4
@@ -46,13 +53,17 @@ def contradicted(calibration: Calibration) -> bool:
     """
     longest = max(max(camera.image_size_px) for camera in calibration.rig.cameras)
     motion_px = 0.0 if calibration.motion is None else _way_px(calibration, calibration.motion)
-    return calibration.held_out.epipolar_rms_px > max(_CONTRADICTION * longest, _OF_MOTION * motion_px)
+    changed = calibration.change is not None and calibration.change.shift_m > _FAR_CHANGE * _distance_m(calibration)
+    return changed or calibration.held_out.epipolar_rms_px > max(_CONTRADICTION * longest, _OF_MOTION * motion_px)
+
+
+def _distance_m(calibration: Calibration) -> float:
+    return float(np.linalg.norm(calibration.solution.state.Ts_left_body[:, :3, 3], axis=1).mean())
 
 
 def _way_px(calibration: Calibration, motion: ExposureMotion) -> float:
     """Return what a motion between exposures moves a board by in the right image, RMS along an axis, px."""
-    distance = float(np.linalg.norm(calibration.solution.state.Ts_left_body[:, :3, 3], axis=1).mean())
-    return float(calibration.rig.right.intrinsics[0] * motion.rms_m / distance)
+    return float(calibration.rig.right.intrinsics[0] * motion.rms_m / _distance_m(calibration))
 
 
 def _agreement(calibration: Calibration) -> str | None:
@@ -60,8 +71,8 @@ def _agreement(calibration: Calibration) -> str | None:
         return None
     return (
         f"the images of both cameras contradict each other by {calibration.held_out.epipolar_rms_px:.0f} px: do not "
-        "measure with this rig. Does a driver mirror the images of one camera, do left and right images belong to "
-        "different moments, or do they show different boards?"
+        "measure with this rig. Does a driver mirror the images of one camera, or of both midway, do left and right "
+        "images belong to different moments, or do they show different boards?"
     )
 
 
@@ -70,6 +81,11 @@ def _changed(calibration: Calibration) -> str | None:
     if change is None:
         return None
     before, after = calibration.pairs[change.row - 1 : change.row + 1]
+    if not change.what:
+        return (
+            f"the pairs up to {before} and those from {after} on fit other cameras, and their boards stand elsewhere: the "
+            "cameras changed, or the lens model does not fit. Try another --lens-model, and mix near, far, left and right"
+        )
     return (
         f"the cameras changed about between {before} and {after}: {change.what}, which displaces points by "
         f"{1e3 * change.shift_m:.2g} mm; the rig is of neither state, and its sigmas allow for that. Did a lens "
@@ -82,9 +98,7 @@ def _pairs(calibration: Calibration) -> str | None:
     used = len(calibration.pairs)
     found = calibration.pairs_found - sum("frame that repeats" in each.reason for each in calibration.rejected)
     if used < _GOOD_PAIRS:
-        hidden = (
-            ", and one whose board moved between the images may go unnoticed among so few" if used < _TESTED else ""
-        )
+        hidden = ", and one whose board moved between the images may go unnoticed" if used < _TESTED else ""
         return f"only {used} pairs were used{hidden}: take {_GOOD_PAIRS} or more, near and far and tilted every way"
     if used < (1 - _REJECTED_SHARE) * found:
         return f"{found - used} of {found} pairs were rejected: see the reasons; hold the board still for every shot"
@@ -128,11 +142,9 @@ def coverage(calibration: Calibration, side: int, cells: int) -> Array:
 def _focus(calibration: Calibration) -> str | None:
     observations = calibration.observations
     image = np.trace(observations.cov_uv, axis1=1, axis2=2)
-    noise = [float(np.sqrt(np.median(image[observations.camera == side]))) for side in (0, 1)]
-    residual = [
-        float(np.sqrt(np.median((calibration.solution.residuals_px[observations.camera == side] ** 2).sum(axis=1))))
-        for side in (0, 1)
-    ]
+    each, residual_px2 = [observations.camera == side for side in (0, 1)], calibration.solution.residuals_px**2
+    noise = [float(np.sqrt(np.median(image[rows]))) for rows in each]
+    residual = [float(np.sqrt(np.median(residual_px2[rows].sum(axis=1)))) for rows in each]
     for values in (noise, residual):
         worse = int(np.argmax(values))
         if min(values) > 0 and values[worse] > _FOCUS_RATIO * values[1 - worse]:
@@ -199,17 +211,7 @@ def _moved(calibration: Calibration, motion: ExposureMotion) -> str | None:
         f"{1e3 * motion.rms[1]:.2g} mrad RMS along and about each axis ({way_px:.2g} px{most}): the cameras are not "
         f"synchronised. The rig's noise of {calibration.rig.sigma_px:.2g} px allows for a body that moves like that, the "
         f"corners alone have {calibration.solution.sigma_px:.2g} px: hold still what is measured, or trigger both cameras "
-        f"together.{_hint(calibration)}"
-    )
-
-
-def _hint(calibration: Calibration) -> str:
-    """Say how the skew of the cameras is found, where it was not."""
-    if calibration.recorded:
-        return ""
-    return (
-        " By what time they differ is not found here, for images have none: give a recording, `armsight calibrate --source "
-        "video:LEFT,RIGHT` or a folder of `armsight record`, of a board that moves"
+        f"together.{'' if calibration.recorded else _RECORD}"
     )
 
 
@@ -237,8 +239,7 @@ def require_order(calibration: Calibration) -> None:
 
 def _focal(calibration: Calibration) -> str | None:
     sigma = np.sqrt(np.diag(calibration.rig.cov))
-    camera = calibration.rig.left
-    share = float(sigma[0] / camera.intrinsics[0])
+    share = float(sigma[0] / calibration.rig.left.intrinsics[0])
     if share > 0.005:
         return (
             f"the focal length is known to {100 * share:.1f}% only, and distances with it: add tilted boards at several "
