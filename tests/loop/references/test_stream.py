@@ -68,6 +68,18 @@ def test_an_integral_that_is_rounded_is_quantization():
     assert coefficients(tau, variance[:, 0], freedom)["quantization"] == pytest.approx(step / np.sqrt(12), rel=0.1)
 
 
+@pytest.mark.parametrize("speed", [0.3, 1.0, 2.0])
+def test_a_range_of_a_coarse_step_has_no_rest_and_no_end(speed):
+    """Steps of 10 mm, which repeat while the tool goes to and fro by 0.4 m, and then slowly."""
+    t = np.arange(0.0, 30.0, 0.02)
+    far = 1.0 + 0.2 * np.sin(speed * t) + 0.05 * np.sin(1.7 * speed * t)
+    found = check_stream(t, np.round(far, 2)[:, None], "wire.csv")
+    assert (found.saturated, found.rests) == ((), ())
+    noise = np.random.default_rng(6).normal(0.0, 1e-3, (len(t), 1))
+    at_end = check_stream(t, np.minimum(far[:, None] + noise, 1.15), "wire.csv")
+    assert at_end.saturated == (0,)  # which no step explains
+
+
 def test_a_coarse_axis_is_not_saturated():
     rng = np.random.default_rng(2)
     t = np.arange(0.0, 20.0, PERIOD_S)

@@ -241,7 +241,7 @@ def _check(entry: Entry) -> tuple[dict[str, Any], list[str], list[str]]:
     rest = z[stream.rest]
     values["rest_s"] = len(rest) / stream.rate_hz
     if not len(rest):
-        weak.append(f"{name}: no rest of a second was found, so its noise is unknown")
+        weak.append(f"{name}: no rest of a second shows its noise, which is unknown")
         return values, lines, weak
     if not isinstance(entry.reference, Inertial):
         _, variance, _ = allan(rest, 1.0 / stream.rate_hz)  # of single readings: without what drifts

@@ -24,6 +24,9 @@ GAP = 3.0
 FROZEN = 10
 #: The greatest or least value of a column so many times in a row is its limit.
 SATURATED = 5
+#: One number repeats because of its step where more than this share repeats, and most changes are below so many steps;
+#: half: fine steps are not seen, double: coarse noise is a step.
+REPEATS, STEPS = 0.05, 1.5
 #: A rest: blocks of this length, s, whose spread is at most so many times that of the quietest fifth, for so long, s.
 BLOCK_S, QUIET, REST_S = 0.25, 2.0, 1.0
 #: Means of neighbouring blocks of a rest differ by at most so many sigmas of chance.
@@ -61,7 +64,7 @@ class StreamCheck(Record):
         doubled: share of the rows that repeat the row before.
         frozen_s: the longest time in which no column changed, s.
         saturated: columns that stand at their greatest or least value for a while, and no coarse step apart from the next.
-        rests: rows of the rests; empty where there are none.
+        rests: rows of the rests; empty where there are none, or where one number's step hides them.
     """
 
     rate_hz: float
@@ -120,7 +123,9 @@ def check_stream(t_s: Array, z: Array, source: str) -> StreamCheck:
     if period <= 0.0:
         raise InputError(f"{source}: all readings have the time {t_s[0]:.3f} s")
     same = (np.diff(z, axis=0) == 0.0).all(axis=1)
-    saturated = tuple(k for k, column in enumerate(z.T) if _saturated(column))
+    moves = np.abs(np.diff(z, axis=0))[~same]
+    stepped = z.shape[1] == 1 and same.mean() > REPEATS and np.median(moves) < STEPS * moves.min(initial=np.inf)
+    saturated = () if stepped else tuple(k for k, column in enumerate(z.T) if _saturated(column))
     low, high = np.quantile(steps, [0.16, 0.84])
     pauses = steps > GAP * period
     frozen = _longest(same)
@@ -132,7 +137,7 @@ def check_stream(t_s: Array, z: Array, source: str) -> StreamCheck:
         float(same.mean()),
         frozen * period if frozen >= FROZEN else 0.0,
         saturated,
-        _rests(z, period),
+        () if stepped else _rests(z, period),
     )
 
 
