@@ -12,6 +12,7 @@ import errno
 import io
 import itertools
 import json
+import math
 import os
 import re
 import stat
@@ -24,6 +25,7 @@ from armsight.errors import InputError
 if TYPE_CHECKING:
     from _typeshed import ReadableBuffer
 
+    _Paths = Iterable[str | Path | None]
 
 #: Largest documents (JSON, TOML, XML) and tables that are read: parsed they take 10 to 40 times as much memory.
 DOCUMENT_MB = 8  # half: a recording's truth of 10,000 shots is rejected; double: a hostile file takes 600 MB
@@ -482,20 +484,19 @@ def try_writing(folder: Path) -> None:
         pass
 
 
-def check_writable(path: str | Path, *, apart_from: Iterable[str | Path | None] = ()) -> None:
+def check_writable(path: str | Path, *, apart_from: _Paths = (), outputs: _Paths = ()) -> None:
     """Find out before long work whether a file can be written at ``path``; nothing is left there.
 
     Args:
         path: the file to be.
-        apart_from: files that must not be written over: what is read, and what else is written.
+        apart_from: files that are read.
+        outputs: what else is written.
 
     Raises:
-        InputError: its folder is missing or not writable, ``path`` is no ordinary file, or one of ``apart_from``.
+        InputError: its folder is missing or not writable, ``path`` is no ordinary file, or one of the others.
     """
     _check_name(path)
-    for other in apart_from:
-        if other is not None and _same_file(other, path):
-            raise InputError(f"{path}: is given twice, or is read as well as written; give the result another name")
+    _check_apart(path, apart_from, outputs)
     target = _target(path)
     folder = target.parent
     if not os.access(folder, os.W_OK):
@@ -532,7 +533,7 @@ def check_suffix(path: str | Path, suffix: str, what: str) -> None:
         raise InputError(f"{path}: {what} is written as {suffix}; give it a name that ends so")
 
 
-def check_outputs(outputs: Iterable[str | Path | None], inputs: Iterable[str | Path | None] = ()) -> None:
+def check_outputs(outputs: _Paths, inputs: _Paths = ()) -> None:
     """Find out before long work whether all files of a command can be written, each apart from the others and the inputs.
 
     Args:
@@ -542,10 +543,10 @@ def check_outputs(outputs: Iterable[str | Path | None], inputs: Iterable[str | P
     Raises:
         InputError: as :func:`check_writable`, for the first that cannot be written.
     """
-    taken = list(inputs)
+    inputs, taken = list(inputs), list[str | Path]()
     for path in outputs:
         if path is not None:
-            check_writable(path, apart_from=taken)
+            check_writable(path, apart_from=inputs, outputs=taken)
             taken.append(path)
 
 
@@ -594,22 +595,25 @@ def alone_in(folder: Path, command: str) -> Iterator[None]:
 def check_folder(
     path: str | Path,
     *,
-    holding: Iterable[str] = (),
-    apart_from: Iterable[str | Path | None] = (),
+    holding: Sequence[str] = (),
+    signs: Sequence[str] = ("report.html",),
+    apart_from: _Paths = (),
+    outputs: _Paths = (),
     problem: str = "nothing can be written here",
-    advice: str = "",
 ) -> Path:
     """Return a folder, ``~`` expanded, if files can be written to it, before long work; a missing one is not made.
 
     Args:
         path: the folder to be.
         holding: names of files that will be written to it.
-        apart_from: files that must not be written over.
+        signs: files that show that the command made the folder; a report is the last file it writes.
+        apart_from: files that are read.
+        outputs: what else is written.
         problem: what does not work, as the message has it: "no report can be written here".
-        advice: what to do, at the end of the message.
 
     Raises:
-        InputError: it cannot be made or written to, or it or one of its files is one of ``apart_from``.
+        InputError: it cannot be made or written to, it or one of its files is one of the others, or it holds some of
+            ``holding`` that the command did not write, or that were changed since.
     """
     _check_name(path)
     folder = Path(path).expanduser()
@@ -623,13 +627,18 @@ def check_folder(
                 (there / part).lstat()  # a name too long comes up here
         try_writing(there)
     except OSError as error:
+        advice = "; give a folder" if isinstance(error, NotADirectoryError) else ""
         raise InputError(f"{folder}: {problem}: {error.strerror}{advice}") from None
-    others = [other for other in apart_from if other is not None]
+    apart_from, outputs = list(apart_from), list(outputs)
     for part in (*(() if folder.is_dir() else (folder,)), *(folder / name for name in holding)):
-        if any(_same_file(other, part) for other in others):
-            raise InputError(
-                f"{part}: is given twice, or is read as well as written; choose another folder for the results"
-            )
+        _check_apart(part, apart_from, outputs)
+    files, written_ns, why = [folder / name for name in holding], 0.0, ""
+    if any((folder / sign).exists() for sign in signs):
+        page = folder / "report.html"
+        written_ns = page.stat().st_mtime_ns if page.is_file() else math.inf
+        why = f" changed after {page.name} was written: move them, or"
+    if lost := ", ".join(each.name for each in files if each.is_file() and each.stat().st_mtime_ns > written_ns):
+        raise InputError(f"{path}: holds {lost}, which would be written over;{why} choose another folder")
     return folder
 
 
@@ -639,6 +648,14 @@ def _check_name(path: str | Path) -> None:
         raise InputError(
             f"{str(path) or repr('')}: give the name of a file or folder; --json prints to standard output"
         )
+
+
+def _check_apart(path: str | Path, inputs: _Paths, outputs: _Paths) -> None:
+    """Reject a file to be that is also read, or written as something else."""
+    if any(other is not None and _same_file(other, path) for other in inputs):
+        raise InputError(f"{path}: is read, and would be written over; give the result another name")
+    if any(other is not None and _same_file(other, path) for other in outputs):
+        raise InputError(f"{path}: is given twice, for two results; give each a name of its own")
 
 
 def _same_file(one: str | Path, other: str | Path) -> bool:

@@ -140,7 +140,7 @@ def test_no_input_is_written_over(here, armsight, arguments, file):
     for name in ("pair/left.png", "page.svg", "arm.urdf"):
         (here / name).write_text("nonsense\n")
     before = {path: path.read_bytes() for path in here.rglob("*.*")}
-    assert_rejected(armsight(*arguments), "read")
+    assert_rejected(armsight(*arguments), "would be written over")
     assert {path: path.read_bytes() for path in here.rglob("*.*")} == before
     assert (here / file).exists()
 
@@ -212,3 +212,55 @@ def test_a_run_is_not_written_over_and_a_summary_of_others_keeps_no_other_comman
     (here / "their" / "summary.json").write_text("{}")
     said = call(armsight, name, {**FOLDER_WRITERS, "run": RUN}[name], "their")
     assert ("their: holds a report of run" in said.err) == (name in {*TITLES, "replay"}), said.err
+
+
+@pytest.mark.parametrize(
+    ("name", "held"),
+    [
+        ("budget", ["budget.json", "rig.json", "body.toml"]),
+        ("identify", ["corrected.toml", "zeros.toml"]),
+        ("handeye", ["handeye.json"]),
+        ("demo", ["rig.json", "motion.toml"]),
+        ("dense match", ["left.png"]),
+        ("replay", ["poses.csv"]),
+        ("arm report", ["report.json"]),
+        ("board bringup", ["board.toml"]),
+    ],
+)
+def test_a_folder_of_ones_own_files_is_left_alone(here, armsight, name, held):
+    (here / "mine").mkdir()
+    for each in (*held, "notes.txt"):
+        (here / "mine" / each).write_text("mine\n")
+    given = {**FOLDER_WRITERS, "identify": ("--arm", "six_r", "--data", "poses.csv"), "budget": ()}[name]
+    said = call(armsight, name, given, "mine")
+    assert_rejected(said, "mine: holds", ", which would be written over; choose another folder", *held)
+    assert "notes" not in said.err
+    assert {path.read_text() for path in (here / "mine").iterdir()} == {"mine\n"}
+
+
+def test_a_folder_is_written_again_with_a_note_until_one_edits_it(here, armsight):
+    arguments = ("budget", "volume=0.1x0.1x0.1m", "distance=0.7m", "camera=machine-vision-2mp", "-o", "bud")
+    assert armsight(*arguments).code == 0
+    assert "replaced" not in (first := armsight(*arguments, "--json")).out
+    for each in ("report.html", "budget.json", "rig.json", "body.toml", "body.pdf"):
+        assert os.path.join("bud", each) in first.err
+    edited = (here / "bud" / "body.toml").read_text() + "# mine\n"
+    (here / "bud" / "body.toml").write_text(edited)
+    assert_rejected(armsight(*arguments), "bud: holds body.toml,", "changed after report.html was written")
+    assert (here / "bud" / "body.toml").read_text() == edited
+
+
+@pytest.mark.parametrize("name", FILE_WRITERS)
+def test_a_file_of_another_kind_is_left_alone(here, armsight, name):
+    output = f"mine{SUFFIXES.get(name, '.json')}"
+    (here / output).write_text("[other]\nx = 1\n")
+    if name != "arm calibrated":  # which keeps the file
+        said = call(armsight, name, FILE_WRITERS[name], output)
+        assert_rejected(said, f"{output}: holds something else, which would be written over")
+    assert (here / output).read_text() == "[other]\nx = 1\n"
+
+
+def test_files_of_the_same_kind_are_replaced_and_named(here, armsight):
+    arguments = ("rig", "export", "rig.json", "--format", "ros", "-o", "l.yaml", "r.yaml")
+    assert "replaced" not in armsight(*arguments).err
+    assert "note: replaced: l.yaml, r.yaml\n" in armsight(*arguments).err

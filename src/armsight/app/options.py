@@ -28,6 +28,8 @@ import click
 
 from armsight.errors import InputError
 
+#: What is in a rig's file, for :func:`out`.
+IS_RIG = '"armsight-rig"'
 #: A file or a folder.
 PATH = click.Path(path_type=Path)
 #: The simulated workcell as cameras.
@@ -100,14 +102,17 @@ def argument(metavar: str | None = None, **attributes: Any) -> Any:  # noqa: ANN
     return Declaration((), {"metavar": metavar, **attributes}, True)
 
 
-def out(metavar: str, text: str, *names: str, report: bool = False, **attributes: Any) -> Any:  # noqa: ANN401 - as above
-    """Declare what is written, ``-o`` or of another name; ``report``: a folder that is not another command's."""
-    kept = partial(_kept, report)
-    return option(text, *(names or ("-o", "--output")), metavar=metavar, callback=kept, **attributes)
+def out(metavar: str, text: str, *names: str, report: bool = False, kind: str = "", **attributes: Any) -> Any:  # noqa: ANN401
+    """Declare what is written, ``-o`` or of another name.
+
+    ``report``: a folder that is not another command's. ``kind``: a pattern that a file must hold to be replaced.
+    """
+    callback = partial(kept, report=report, kind=kind)
+    return option(text, *(names or ("-o", "--output")), metavar=metavar, callback=callback, **attributes)
 
 
-def _kept(report: bool, context: click.Context, _: click.Parameter, given: Any) -> Any:  # noqa: ANN401 - a path, some, None
-    """Reject a folder of another command's report; say at the end which file, or report in a folder, was replaced."""
+def kept(context: click.Context, _: click.Parameter, given: Any, kind: str = "", *, report: bool = False) -> Any:  # noqa: ANN401
+    """Reject a folder of another command's report, or a file of another kind; say at the end what was replaced."""
     own = {"demo": "run"}.get(command := _command(context), command)
     for path in given if isinstance(given, tuple) else [given] if given is not None else []:
         file = Path(path).expanduser()
@@ -116,9 +121,15 @@ def _kept(report: bool, context: click.Context, _: click.Parameter, given: Any) 
                 raise InputError(
                     f"{path}: holds a report of {theirs}, which would be written over; choose another folder"
                 )
-            file /= "report.html"
-        if os.path.isfile(file):
-            context.call_on_close(partial(_say_replaced, file, file.stat()))
+        elif os.path.isfile(file) and kind:
+            with contextlib.suppress(OSError), open(file, encoding="latin-1") as there:
+                if (head := there.read(5000)) and not re.search(kind, head, re.MULTILINE):
+                    raise InputError(f"{path}: holds something else, which would be written over; choose another name")
+        if own not in ("hub", "live"):  # which add to their files
+            if "before" not in context.meta:
+                context.meta["before"] = {}
+                context.call_on_close(partial(_say_replaced, context.meta["before"]))
+            context.meta["before"] |= _state(os.path.expanduser(path))
     return given
 
 
@@ -142,10 +153,20 @@ def _written_by(folder: Path) -> str:
     return ""
 
 
-def _say_replaced(file: Path, before: os.stat_result) -> None:
-    with contextlib.suppress(FileNotFoundError):
-        if (now := file.stat()).st_ino != before.st_ino or now.st_mtime_ns != before.st_mtime_ns:
-            click.echo(f"note: replaced: {file}", err=True)
+def _state(path: str) -> dict[str, tuple[int, int]]:
+    """Return inode and time, ns, of a file and of those named after it, or of the files of a folder."""
+    folder, name = (path, "") if os.path.isdir(path) else os.path.split(path)
+    beside = re.compile(rf"{re.escape(name)}$|{re.escape(os.path.splitext(name)[0])}[.-]" if name else "")
+    with contextlib.suppress(OSError):
+        files = [os.path.join(folder, each) for each in os.listdir(folder or ".") if beside.match(each)]
+        return {each: (at.st_ino, at.st_mtime_ns) for each in files if os.path.isfile(each) for at in [os.stat(each)]}
+    return {}
+
+
+def _say_replaced(before: Mapping[str, tuple[int, int]]) -> None:
+    there = ((file, os.stat(file)) for file in sorted(before) if os.path.exists(file))
+    if changed := ", ".join(file for file, now in there if (now.st_ino, now.st_mtime_ns) != before[file]):
+        click.echo(f"note: replaced: {changed}", err=True)
 
 
 def _parameters(of: Any) -> Iterator[click.Parameter]:  # noqa: ANN401 - a function or a class

@@ -123,7 +123,7 @@ def test_rests_belong_to_their_poses_and_cycles(tmp_path, capsys):
     (tmp_path / "summary.json").write_text("{}")
     assert_rejected(said(capsys, tmp_path, "-o", tmp_path), "holds a report of run", "another folder")
     assert_rejected(
-        said(capsys, tmp_path / "report", "-o", tmp_path / "report"), "check.csv", "read as well as written"
+        said(capsys, tmp_path / "report", "-o", tmp_path / "report"), "check.csv", "is read, and would be written over"
     )
 
 

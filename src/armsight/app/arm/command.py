@@ -67,7 +67,7 @@ def list_(as_json: bool = JSON) -> None:
 @declared
 def show(
     arm_name: str = _ARM,
-    output: Path | None = out("ARM.png", "Draw the arm at home; needs armsight[report]."),
+    output: Path | None = out("ARM.png", "Draw the arm at home; needs armsight[report].", kind="PNG"),
     as_json: bool = JSON,
 ) -> None:
     """Print an arm's table, limits and reach."""
@@ -147,7 +147,9 @@ def ik(
 
 @command.command()
 @declared
-def urdf(arm_name: str = _ARM, output: Path = out("ARM.urdf", "The file to write."), as_json: bool = JSON) -> None:
+def urdf(
+    arm_name: str = _ARM, output: Path = out("ARM.urdf", "The file to write.", kind="<robot"), as_json: bool = JSON
+) -> None:
     """Write an arm as a URDF file."""
     _check_written(output, arm_name, suffix=".urdf", what="an arm")
 
@@ -218,7 +220,7 @@ def plan(
     poses: int = option("Poses, each from both sides.", min=8, max=500, default=40),
     cycles: int = option("How often five poses come again.", min=0, max=1000, default=30),
     seed: int = SEED,
-    output: Path = out("FILE.toml", "The motions to write."),
+    output: Path = out("FILE.toml", "The motions to write.", kind=r"^\[\[motion"),
     as_json: bool = JSON,
 ) -> None:
     """Plan the recording of `arm report`: motions for `armsight run --open-loop --motion FILE.toml`.

@@ -264,8 +264,8 @@ def bringup(
     Each joint is moved by hand, each motor driven by a pulse of at most 3 degrees, and then, after a yes, by a swing of 10.
     What was found is kept: the same command goes on where it ended. On an emulated board an arm and a person are drawn.
     """
-    from armsight.app.board.bringup import Bringup, TerminalOperator
-    from armsight.app.show.page import writable_folder
+    from armsight.app.board.bringup import CONFIG_FILE, FOUND_FILE, Bringup, TerminalOperator
+    from armsight.app.show.page import PAGE, writable_folder
     from armsight.app.show.plotting import require_matplotlib
     from armsight.files import check_folder
     from armsight.robot.board_registry import SERIAL, emulator_name
@@ -279,7 +279,8 @@ def bringup(
 
     require_matplotlib()
     kinds = _encoders(encoders)
-    check_folder(folder, problem="nothing of a bring-up can be written here")
+    held, signs = (CONFIG_FILE, PAGE), (FOUND_FILE,)
+    check_folder(folder, holding=held, signs=signs, problem="nothing of a bring-up can be written here")
     if name.startswith(SERIAL):
         board = _open(name)
         person: Operator = TerminalOperator(echo)
@@ -494,7 +495,9 @@ def config() -> None:
 
 @config.command()
 @declared
-def get(name: str = _BOARD, output: Path | None = out("FILE", "Write it there."), as_json: bool = JSON) -> None:
+def get(
+    name: str = _BOARD, output: Path | None = out("FILE", "Write it there.", kind="^board *="), as_json: bool = JSON
+) -> None:
     """Print the configuration in use as a board.toml, or write it to a file."""
     from armsight.files import write_text
     from armsight.robot.boards.board_file import configuration_text, entries

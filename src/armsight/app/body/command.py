@@ -57,7 +57,7 @@ def check(
 @declared
 def draw(
     paths: tuple[str, ...] = argument("BODY.toml|BOARD...", required=True),
-    output: str = out("OUT", "The drawing: .pdf, .svg or .png."),
+    output: str = out("OUT", "The drawing: .pdf, .svg or .png.", kind="%PDF|<svg|PNG"),
     paper: str = option("", default="a4", type=click.Choice(list(PAPERS), case_sensitive=False)),
     split: bool = option("Split a drawing larger than the paper into several overlapping sheets."),
     dpi: int = option("Resolution of a .png, pixels per inch.", default=600, min=72, max=2400),

@@ -70,6 +70,7 @@ def command(
 
         written = str(report.write(Path(output), {"budget.json": report.json_text(), **to_build(found)}))
         draw_body([found.plan.body or Path(output) / "body.toml"], Path(output) / "body.pdf", split=True)
+        Path(written).touch()  # last, as what is newer was changed since
     return report.echo(as_json=as_json, written=written) or int(not found.reached(found.moving))
 
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import click
 
-from armsight.app.options import DETECTIONS, JSON, declared, option, out
+from armsight.app.options import DETECTIONS, IS_RIG, JSON, declared, option, out
 from armsight.app.show.messages import UNTRUSTED
 from armsight.errors import InputError
 from armsight.files import check_folder, check_outputs, check_writable
@@ -35,9 +36,11 @@ class CalibrateOptions:
     lens_model: str | None = option("Distortion model; by default the held-out error chooses.", choices=MODELS)
     flat_target: bool = option("Do not estimate the target's deviation from its drawing.")
     cameras: Path | None = option("Intrinsics of both cameras, with detections.", metavar="CAMERAS.json")
-    refine_body: Path | None = out("OUT.csv", "Estimate the body's points too, and write them here.", "--refine-body")
+    refine_body: Path | None = out(
+        "OUT.csv", "Estimate the body's points too, and write them here.", "--refine-body", kind="^marker,"
+    )
     folds: int = option("Parts for the held-out errors.", min=2, default=FOLDS)
-    output: Path = out("RIG.json", "The rig to write.")
+    output: Path = out("RIG.json", "The rig to write.", kind=IS_RIG)
     report: Path | None = out(
         "DIR", "Write an HTML report with figures; needs armsight[report].", "--report", report=True
     )
@@ -69,20 +72,21 @@ def command(o: CalibrateOptions) -> int:
     from armsight.vision.calibrate.weak import contradicted, require_order
     from armsight.vision.markers.board import open_board
 
-    def check_report(*apart: Path | None) -> None:
+    def check_report(outputs: Sequence[Path | None], inputs: Sequence[Path] = ()) -> None:
         if o.report is not None:
-            check_folder(o.report, holding=REPORT_FILES, apart_from=apart, problem="no report can be written here")
+            problem = "no report can be written here"
+            check_folder(o.report, holding=REPORT_FILES, apart_from=inputs, outputs=outputs, problem=problem)
 
     if o.report is not None:
         require_matplotlib()
     if images:  # before a person shows it to cameras
         open_board(o.target)
         check_writable(o.output)
-        check_report(o.output)
+        check_report([o.output])
     with contextlib.closing(GivenImages(o) if images else GivenDetections(o)) as opened:
         outputs = (o.output, o.refine_body, opened.board_file)
         check_outputs(outputs, opened.files)
-        check_report(*outputs, *opened.files)
+        check_report(outputs, opened.files)
         started = time.perf_counter()
         calibration = opened.calibrated()
     require_order(calibration)

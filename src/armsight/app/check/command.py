@@ -112,7 +112,9 @@ def plan(
     ),
     speed: float = option("Speed on paths, mm/s.", min=1.0, max=1e4, default=100.0),
     visible_in: Path | None = option("An earlier run; both of its cameras must see the whole test.", metavar="RUN"),
-    output: Path | None = out("FILE", "check.toml for armsight run --motion; .csv: the poses alone."),
+    output: Path | None = out(
+        "FILE", "check.toml for armsight run --motion; .csv: the poses alone.", kind=r"^\[\[motion|^pose,"
+    ),
     as_json: bool = JSON,
 ) -> None:
     """Plan a test in the largest cube the arm reaches, clear of its limits and of singularities.

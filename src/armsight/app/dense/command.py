@@ -69,7 +69,7 @@ def match(
     from armsight.vision.sources import open_source
 
     form, pair = _arguments(paths, source, max_disparity, near)
-    check_folder(output, holding=RESULT_FILES, apart_from=paths, advice="; give a folder")
+    check_folder(output, holding=RESULT_FILES, signs=("sigma.pfm",), apart_from=paths)
     if form is not None and near is not None:
         check_near(form, near)
     method = open_method(name)
@@ -147,7 +147,7 @@ def evaluate(
     from armsight.vision.dense.middlebury import find_scenes, load_scene
 
     if output is not None:
-        check_folder(output, advice="; give a folder")
+        check_folder(output)
     scenes, chosen = find_scenes(folder), names or tuple(METHODS)
     for path in scenes:
         load_scene(path)  # all can be read, before anything is written

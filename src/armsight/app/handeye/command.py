@@ -71,13 +71,15 @@ def command(options: Options) -> int:
 
     from armsight.app.handeye.report import handeye_report, plan_csv
     from armsight.app.progress import steps
+    from armsight.app.show.page import PAGE
     from armsight.app.show.plotting import require_matplotlib
     from armsight.files import check_folder
 
     folder = None
     if options.output is not None:
         require_matplotlib()
-        folder = check_folder(options.output, problem="no report can be written here")
+        holding = ("handeye.json", "plan.csv", PAGE)
+        folder = check_folder(options.output, holding=holding, problem="no report can be written here")
     with steps() as progress:
         run = calibrate(options, progress)
         report = handeye_report(run)

@@ -104,7 +104,7 @@ def plan(
     rig: Path | None = option("The cameras that must see the poses.", metavar="RIG.json"),
     count: int = option("Number of poses.", "-n", min=1, max=200, default=20),
     seed: int = SEED,
-    output: Path | None = out("PLAN.csv", "Write the poses here."),
+    output: Path | None = out("PLAN.csv", "Write the poses here.", kind="approach1"),
     as_json: bool = JSON,
 ) -> None:
     """Choose the most informative poses for an identification, and predict the error after each.

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from armsight.app.options import DETECTIONS, FIXED, STREAM, argument, declared, option, out
+from armsight.app.options import DETECTIONS, FIXED, IS_RIG, STREAM, argument, declared, option, out
 from armsight.app.show.messages import UNTRUSTED
 
 
@@ -35,8 +35,9 @@ class MeasureOptions:
         "RIG2.json",
         "Write the rig with the skew and readout found, and the noise of a moved body's discs.",
         "--save-rig",
+        kind=IS_RIG,
     )
-    output: Path | None = out("POSES.csv", "Write the poses as CSV.")
+    output: Path | None = out("POSES.csv", "Write the poses as CSV.", kind="^shot,status,")
     stream: tuple[str, ...] = STREAM
     board: str | None = option(
         "Publish this board's joint readings, too: serial:, feetech: or ar4:PORT, emulated:.", metavar="BOARD"

@@ -108,13 +108,14 @@ def measure_shots(options: MeasureOptions) -> tuple[HealthFinding, ...]:
 def _checked_outputs(options: MeasureOptions) -> Path | None:
     """Check that what is written can be; return the folder of the pictures, None without any."""
     if options.save_rig is not None:
-        check_writable(options.save_rig, apart_from=(options.rig, options.target, options.output))
+        check_writable(options.save_rig, apart_from=(options.rig, options.target), outputs=(options.output,))
     folder = None if options.view_dir is None else view_folder(options.view_dir)
     if options.output is not None:
         chart = folder and folder / CHART
         check_writable(
             options.output,
-            apart_from=(options.rig, options.target, options.source.removeprefix(DETECTIONS), folder, chart),
+            apart_from=(options.rig, options.target, options.source.removeprefix(DETECTIONS)),
+            outputs=(folder, chart),
         )
     return folder
 

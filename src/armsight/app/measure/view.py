@@ -225,7 +225,7 @@ def view_folder(directory: str | Path) -> Path:
         '--view plots a chart with matplotlib, which is not installed: pip install "armsight[report]"', InputError
     ):
         require_matplotlib()
-    return check_folder(directory, problem="no pictures can be written here", advice="; give a folder")
+    return check_folder(directory, problem="no pictures can be written here")
 
 
 class PictureFolder:

@@ -95,10 +95,8 @@ def unused_folder(directory: str | Path) -> Path:
     folder = Path(directory).expanduser()
     try:
         names = os.listdir(folder)
-    except FileNotFoundError:
-        names = []
-    except OSError as error:
-        raise InputError(f"{folder}: no recording can be made here: {error.strerror}") from None
+    except OSError:
+        names = []  # said below
     if INDEX in names:
         raise InputError(f"{folder}: already holds a recording; record into a new folder")
     if names:

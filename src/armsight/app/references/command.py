@@ -66,7 +66,7 @@ def check(path: Path = argument("REFERENCES.toml"), as_json: bool = JSON) -> Non
 def calibrate(
     path: Path = argument("REFERENCES.toml"),
     poses: str = option("Poses of the tool in the base, with times t_s.", metavar="POSES.csv"),
-    output: Path | None = out("OUT.toml", "Where to write the result."),
+    output: Path | None = out("OUT.toml", "Where to write the result.", kind="^(delay_s|live|source) *="),
     as_json: bool = JSON,
 ) -> None:
     """Find mounting, biases, scales, iron, anchor and delay from one sweep with poses by vision or by the arm."""

@@ -46,7 +46,9 @@ def command(
     from armsight.files import check_folder
 
     if output is not None:
-        check_folder(output, holding=(POSES, LIVE), apart_from=(other and other / POSES, other and other / LIVE))
+        check_folder(
+            output, holding=(POSES, LIVE), signs=(LIVE,), apart_from=[other and other / name for name in (POSES, LIVE)]
+        )
     request = Request(recording, rig, target, arm, estimator, rate, references, stream)
     replayed = replay(request, lambda line: click.echo(line, err=True))
     answer, lines = described(recording, replayed)

@@ -5,18 +5,22 @@ from __future__ import annotations
 import json
 import math
 import re
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from armsight.app.options import JSON, argument, declared, option, out
+from armsight.app.options import IS_RIG, JSON, argument, declared, kept, option, out
 from armsight.errors import InputError
 from armsight.files import check_outputs, check_writable
 from armsight.vision.rigfiles import ASSUMED_SIGMA_PX, EXPORTED, FORMATS, export_rig, import_rig, open_format
 
 if TYPE_CHECKING:
     from armsight.vision.rig import StereoRig
+
+#: How the files of another program begin.
+_FOREIGN = "^(%YAML|image_width:|cam0:)"
 
 
 @click.group("rig")
@@ -44,7 +48,7 @@ def show(path: str = argument("RIG.json"), as_json: bool = JSON) -> None:
 @declared
 def import_(
     files: tuple[str, ...] = argument(required=True),
-    output: str = out("RIG.json", "The rig file to write."),
+    output: str = out("RIG.json", "The rig file to write.", kind=IS_RIG),
     name: str | None = option("The other program; by default found by content.", "--format", choices=FORMATS),
     unit_m: float | None = option("Length of the file's unit of translation, m; OpenCV files need it."),
     pair: str | None = option(
@@ -74,8 +78,8 @@ def import_(
 @declared
 def export(
     path: str = argument("RIG.json"),
-    more: tuple[str, ...] = argument("[OUT]..."),
-    output: tuple[str, ...] = out("OUT", "File to write; may be repeated.", required=True),
+    more: tuple[str, ...] = argument("[OUT]...", callback=partial(kept, kind=_FOREIGN)),
+    output: tuple[str, ...] = out("OUT", "File to write; may be repeated.", kind=_FOREIGN, required=True),
     name: str = option("The other program.", "--format", choices=EXPORTED),
     as_json: bool = JSON,
 ) -> None:
@@ -106,7 +110,7 @@ def export(
 @declared
 def update_(
     run: Path = argument(),
-    output: str = out("RIG.json", "The rig file to write."),
+    output: str = out("RIG.json", "The rig file to write.", kind=IS_RIG),
     since: float | None = option(
         "Use shots from this time on, board's clock, s; by default from when the run found that the cameras had moved.",
         metavar="S",

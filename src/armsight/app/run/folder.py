@@ -275,7 +275,8 @@ def write_shots(folder: Path, shots: Sequence[Shot]) -> None:
 @contextlib.contextmanager
 def open_folder(folder: Path) -> Iterator[None]:
     """Keep a folder to one run, and check that it can be written there, before the long work begins."""
-    check_folder(folder, problem="no run can be written here")
+    holding = (*_names(), "rig.json", "body.toml", "motion.toml", REFERENCES)
+    check_folder(folder, holding=holding, signs=(PAGE, "summary.json"), problem="no run can be written here")
     moved = (folder / "summary.json").exists() and (folder / "motion.toml").exists()
     if moved and not (folder / "truth.csv").exists():
         raise InputError(f"{folder}: holds an earlier run of an arm; move it away, or name another folder with -o")
@@ -285,16 +286,20 @@ def open_folder(folder: Path) -> Iterator[None]:
         yield
 
 
+def _names() -> list[str]:
+    """Return which files a run writes; of the others its inputs are copies."""
+    names = [f"{name}.png" for name in (*_FIGURES, "pose", "workcell", "cell")]
+    names += [f"{name}.{kind}" for name in _TABLES for kind in ("csv", "parquet")]
+    return [*names, PAGE, "run.log", "poses.csv", DETECTIONS, _FOLLOWED, "handeye.json", "handeye_poses.csv", RUN_MCAP]
+
+
 def make_room(folder: Path) -> None:
     """Make a run's folder; remove the files of an earlier run from it, so that they are not mixed with this run's."""
     writable_folder(folder, "no run")
-    names = [f"{name}.png" for name in (*_FIGURES, "pose", "workcell", "cell")]
-    names += [f"{name}.{kind}" for name in _TABLES for kind in ("csv", "parquet")]
-    names += [PAGE, "run.log", "poses.csv", DETECTIONS, _FOLLOWED, "handeye.json", "handeye_poses.csv", RUN_MCAP]
     try:
         if (folder / _SHOTS).is_dir():
             shutil.rmtree(folder / _SHOTS)
-        for name in (*names, "summary.json"):  # last, as an earlier run is recognised by it
+        for name in (*_names(), "summary.json"):  # last, as an earlier run is recognised by it
             (folder / name).unlink(missing_ok=True)
     except OSError as error:
         raise InputError(f"{error.filename}: an earlier run's file cannot be removed: {error.strerror}") from None
