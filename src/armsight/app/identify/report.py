@@ -251,7 +251,7 @@ def assess(run: Identification) -> tuple[Grade, str]:
     if weak or 2 * after > before:
         why = "read the notes below first" if weak else "a part of the error is of a kind that was not found"
         return "fair", f"Usable: {said}; {why}."
-    return "good", f"Good: {said}; give corrected.toml as --arm."
+    return "good", f"Good: {said}; give the corrected.toml that -o writes as --arm."
 
 
 class ParameterRow(NamedTuple):

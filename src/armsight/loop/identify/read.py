@@ -213,7 +213,7 @@ def _joints(table: Columns, arm: ArmJoints | None) -> list[str]:
         most = 6 if arm is None else len(arm.joint_names)
         raise InputError(
             f"{table.path}: line 1: no joint angles; columns q1_rad .. q{most}_rad or q1_deg .. q{most}_deg are needed, "
-            f"there are {table.near('q1_deg')}"
+            f"there are {table.near('q1_deg')}; --columns q1_deg=COLUMN,... says which they are"
         )
     if not FEWEST_JOINTS <= len(joints) <= MOST_JOINTS:
         raise InputError(
