@@ -320,8 +320,8 @@ with mock.patch("{module}.{name}", waiting):
     ids=["adjusting", "reading", "writing"],
 )
 def test_an_interrupt_leaves_nothing(rendered, tmp_path, module, name, wait):
-    out = tmp_path / "rig.json"
-    out.write_text("what stood there")
+    out, before = tmp_path / "rig.json", rendered.rig.read_text()
+    out.write_text(before)
     script = INTERRUPTED.format(module=module, name=name, wait=wait)
     process = subprocess.Popen(
         [sys.executable, "-c", script, "calibrate", *rendered.board, *QUICK, "-o", out],
@@ -333,7 +333,7 @@ def test_an_interrupt_leaves_nothing(rendered, tmp_path, module, name, wait):
     assert process.returncode == 130, complained
     assert complained.splitlines() == ["armsight: interrupted"]
     assert printed == ""
-    assert out.read_text() == "what stood there"
+    assert out.read_text() == before
     assert os.listdir(tmp_path) == ["rig.json"]
 
 
