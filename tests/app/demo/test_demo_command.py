@@ -148,7 +148,7 @@ def test_a_body_out_of_view_at_the_start(tmp_path, monkeypatch):
 
 
 def test_a_camera_that_is_gone(tmp_path, monkeypatch):
-    for stale in ("report.html", "truth.csv", "errors.png", "summary.json"):  # of an earlier run
+    for stale in ("truth.csv", "errors.png", "summary.json", "report.html"):  # of an earlier run, its page last
         (tmp_path / stale).write_text("{}")
     (tmp_path / "mine.txt").write_text("mine")
     said = broken(tmp_path, monkeypatch, lambda workcell: workcell.source.unplug(3.0, "left camera: unplugged"))
