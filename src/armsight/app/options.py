@@ -12,7 +12,6 @@ many commands have, and the kinds of sources and boards that commands open thems
 from __future__ import annotations
 
 import contextlib
-import html
 import json
 import os
 import re
@@ -140,6 +139,8 @@ def _command(context: click.Context) -> str:
 
 def _written_by(folder: Path) -> str:
     """Return the command whose report is in a folder, also of version 0.2; empty where there is none."""
+    import html  # `measure` starts without it
+
     if (folder / "summary.json").is_file():
         return "run"
     with contextlib.suppress(OSError), open(folder / "report.html", encoding="utf-8", errors="replace") as report:

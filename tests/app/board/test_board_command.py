@@ -192,7 +192,7 @@ def test_without_a_programmer_the_message_says_what_to_install_and_where_the_ima
     piece = tmp_path / "out" / "stm32f4-08000000.bin"
     assert_rejected(said, "none of st-flash, openocd, dfu-util is installed", "apt install", f"{piece} (to 0x08000000)")
     assert piece.stat().st_size > 0
-    said = armsight("board", "flash", "-o", tmp_path / "out", "--programmer", "openocd")
+    said = armsight("board", "flash", "-o", tmp_path / "again", "--programmer", "openocd")
     assert_rejected(said, "openocd is not installed")
 
 

@@ -298,7 +298,8 @@ def test_a_range_is_fused_and_recorded_and_said_to_agree_or_not(armsight, run, t
     answer = beside(z).lines[0]["reference"]
     assert answer["agrees"] is True
     assert 0.0 < answer["moved_rms_m"] < 1e-3
-    assert answer["sigma_rms_m"] < 1.001 * answer["sigma_without_rms_m"]
+    # Joints that change their side count as uncertain until they are learnt anew: one wire does not see all directions.
+    assert answer["sigma_rms_m"] < 1.2 * answer["sigma_without_rms_m"]
     assert beside(z + 0.05).lines[0]["reference"]["agrees"] is False
     answer = beside(z[np.minimum(np.arange(len(z)), 12)]).lines[0]["reference"]
     assert "stood still while the tool moved" in answer["losses"][0]

@@ -646,7 +646,7 @@ class KalmanEstimator:
         """Return the state after a reading of a reference, None where it is an outlier; report it."""
         (reference, reading), t_s = taken, max(taken.t_s, before.t_s)
         before, joints = self._anew(self._felt(before, t_s, report=report), np.array([t_s]))
-        step = self._model.moved(before, joints, np.array([t_s]))  # one number does not teach what a change of side did
+        step = self._model.moved(before, joints, np.array([t_s]), learning=LEARNING)
         kept, added = step.kept[0], step.added[0]
         x, P = self._propagated(before, step)
         (T,), (by_state,) = self._model.poses(x, joints.q, joints.unseen)
