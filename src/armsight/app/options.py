@@ -50,6 +50,7 @@ _TITLES = {
     "hand-eye calibration": "handeye",
     "identification of an arm": "identify",
 }
+_LISTED = 8  # replaced files by name; half: a budget's are counted, double: a run's fill the screen
 _KINDS = {int: "N", float: "X"}  #: in help; a file or a text is called as its option, where no better is declared
 
 
@@ -166,8 +167,9 @@ def _state(path: str) -> dict[str, tuple[int, int]]:
 
 def _say_replaced(before: Mapping[str, tuple[int, int]]) -> None:
     there = ((file, os.stat(file)) for file in sorted(before) if os.path.exists(file))
-    if changed := ", ".join(file for file, now in there if (now.st_ino, now.st_mtime_ns) != before[file]):
-        click.echo(f"note: replaced: {changed}", err=True)
+    if changed := [file for file, now in there if (now.st_ino, now.st_mtime_ns) != before[file]]:
+        more = f" and {len(changed) - _LISTED} more" if len(changed) > _LISTED else ""
+        click.echo(f"note: replaced: {', '.join(changed[:_LISTED])}{more}", err=True)
 
 
 def _parameters(of: Any) -> Iterator[click.Parameter]:  # noqa: ANN401 - a function or a class

@@ -21,8 +21,9 @@ from armsight.files import opened, read_bytes
 from armsight.tables.document import documents_in, matrix_of
 
 Record: TypeAlias = dict[str, str]
+#: What stands before what ``--columns`` says of a side.
+PREFIX = {"robot": "", "seen": "seen:"}
 #: Words in the names of poses that say whose they are.
-PREFIX = {"robot": "", "seen": "seen:"}  #: what stands before what ``--columns`` says of a side
 SIDES = {
     "robot": re.compile("robot|hand|gripper|effector|eef|flange|tcp|arm|wrist|o_t_ee|end"),
     "seen": re.compile("track|target|marker|object|board|optical|sensor|camera|cam|tag|pattern|calib"),

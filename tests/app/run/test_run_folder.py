@@ -180,6 +180,17 @@ def test_a_run_of_a_real_arm_is_never_written_over_and_a_simulated_one_is(tmp_pa
         pass
 
 
+def test_what_a_killed_demo_left_is_written_over_and_what_a_run_measured_is_not(tmp_path):
+    (tmp_path / "run.mcap").write_bytes(b"measured")
+    with pytest.raises(InputError, match=r"holds run\.mcap"):
+        open_folder(tmp_path, simulated=True).__enter__()  # a stranger's
+    (tmp_path / "in_use.lock").write_text("run")  # a process that is killed leaves it
+    with pytest.raises(InputError, match=r"holds run\.mcap"):
+        open_folder(tmp_path).__enter__()
+    with open_folder(tmp_path, simulated=True):
+        pass
+
+
 def test_two_runs_into_one_folder_at_the_same_time_are_rejected(tmp_path, armsight):
     with open_folder(tmp_path / "here"):
         said = armsight("demo", "--quick", "-o", tmp_path / "here")

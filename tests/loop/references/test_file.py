@@ -70,6 +70,7 @@ def test_a_recording_most_of_whose_lines_are_no_readings_is_rejected(wire):
     ("kind", "head", "factors"),
     [
         (Distance, "t_s range_mm", [1, 1e-3]),
+        (Distance, "t_s range_in", [1, 0.0254]),
         (Distance, "t_ms,Range [cm]", [1e-3, 1e-2]),
         (Magnetometer, "t_us field_x_ut field_y_ut field_z_gauss", [1e-6, 1e-6, 1e-6, 1e-4]),
         (

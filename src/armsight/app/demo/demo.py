@@ -321,7 +321,7 @@ def run_demo(demo: Demo, *, progress: Progress = lambda line: None) -> Report:
     folder = demo.folder
     progress("building the workcell")
     cameras = demo.cameras or (_SLOW_CAMERAS if demo.model in CONTROLLED else _CAMERAS)
-    with open_folder(folder), _workcell(demo, cameras) as workcell:
+    with open_folder(folder, simulated=True), _workcell(demo, cameras) as workcell:
         own = demo.model != DEFAULT_ARM
         motion = _MOTIONS[demo.quick].read_text(encoding="utf-8")
         if own:

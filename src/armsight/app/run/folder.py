@@ -273,10 +273,14 @@ def write_shots(folder: Path, shots: Sequence[Shot]) -> None:
 
 
 @contextlib.contextmanager
-def open_folder(folder: Path) -> Iterator[None]:
-    """Keep a folder to one run, and check that it can be written there, before the long work begins."""
+def open_folder(folder: Path, *, simulated: bool = False) -> Iterator[None]:
+    """Keep a folder to one run, and check that it can be written there, before the long work begins.
+
+    ``simulated``: what a run that was killed left there, beside its lock, may be written over.
+    """
     holding = (*_names(), "rig.json", "body.toml", "motion.toml", REFERENCES)
-    check_folder(folder, holding=holding, signs=(PAGE, "summary.json"), problem="no run can be written here")
+    signs = (PAGE, "summary.json", *["in_use.lock"] * simulated)
+    check_folder(folder, holding=holding, signs=signs, problem="no run can be written here")
     moved = (folder / "summary.json").exists() and (folder / "motion.toml").exists()
     if moved and not (folder / "truth.csv").exists():
         raise InputError(f"{folder}: holds an earlier run of an arm; move it away, or name another folder with -o")

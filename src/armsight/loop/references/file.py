@@ -61,7 +61,7 @@ _UNITS = {
     "rad_s": {"rad_s": 1.0, "deg_s": np.pi / 180, "dps": np.pi / 180},
     "m_s2": {"m_s2": 1.0, "g": STANDARD_GRAVITY_M_S2, "mg": 1e-3 * STANDARD_GRAVITY_M_S2},
     "t": {"t": 1.0, "mt": 1e-3, "ut": 1e-6, "nt": 1e-9, "gauss": 1e-4, "mgauss": 1e-7},
-    "m": {"m": 1.0} | UNITS_M,
+    "m": {"m": 1.0, "in": UNITS_M["inches"]} | UNITS_M,
     "s": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
 }
 #: Slower readings, Hz, that last long have no times in s; half: 5 kHz in ms pass, double: a unit at 10 Hz is rejected.
