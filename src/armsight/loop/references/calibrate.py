@@ -296,12 +296,9 @@ class PosePath:
         """Return the motion at a time, s."""
         t = self._t
         k = int(np.searchsorted(t, t_s))
-        low, high = max(k - LEAST_POSES // 2, 0), min(k + LEAST_POSES // 2, len(t))
-        low, high = min(low, max(high - LEAST_POSES, 0)), max(high, min(low + LEAST_POSES, len(t)))
-        low, high = (
-            min(low, int(np.searchsorted(t, t_s - SPAN_S / 2))),
-            max(high, int(np.searchsorted(t, t_s + SPAN_S / 2))),
-        )
+        first = min(max(k - LEAST_POSES // 2, 0), len(t) - LEAST_POSES)
+        low, high = np.searchsorted(t, [t_s - SPAN_S / 2, t_s + SPAN_S / 2])
+        low, high = min(low, first), max(high, first + LEAST_POSES)
         if not t[0] <= t_s <= t[-1] or np.diff(t[max(k - 1, 0) : k + 1]).max(initial=0.0) > GAP_S:
             raise InputError(f"no pose within {GAP_S:g} s of {t_s:.3f} s; they are from {t[0]:.3f} to {t[-1]:.3f} s")
         u, T = t[low:high] - t_s, self._Ts[min(k, len(t) - 1)]

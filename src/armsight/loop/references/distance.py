@@ -20,7 +20,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from armsight.data import Array, Record
+from armsight.data import Array
 from armsight.errors import InputError
 from armsight.geometry.rotation import skew
 from armsight.loop.references.reference import ExpectedReading, Reading, Reference, ToolMotion
@@ -103,12 +103,9 @@ class Distance(Reference):
             a, far = 2 * x[use].mean(axis=0) - a, across
         for rows in spells:
             if np.ptp(far[rows]) > STILL_M:
-                said = (
-                    f"its value stands still from {t_s[rows[0]]:.2f} to {t_s[rows[-1]]:.2f} s, while the range changes"
-                )
-                raise InputError(
-                    f"{self.name}: {said} by {np.ptp(far[rows]):.2g} m: is the sensor alive, the wire fast?"
-                )
+                still = f"its value stands still from {t_s[rows[0]]:.2f} to {t_s[rows[-1]]:.2f} s, while the range"
+                moves = f"changes by {np.ptp(far[rows]):.2g} m: is the sensor alive, the wire fast?"
+                raise InputError(f"{self.name}: {still} {moves}")
         return replace(self, anchors=a[None], p_tool=c, offset=np.array([np.median((z - far)[use])]))
 
     @property
@@ -131,22 +128,16 @@ class Distance(Reference):
         far = float(np.linalg.norm(apart))
         u, scale = apart / far, self.scale[channel]
         in_tool = scale * u @ T[:3, :3]
-        by = np.zeros(3 + len(EACH) * len(self.anchors))
-        by[:3] = in_tool
-        by[3 + len(EACH) * channel : 3 + len(EACH) * (channel + 1)] = [*(-scale * u), 1.0, far]
+        by, first = np.zeros(len(self.cov)), 3 + len(EACH) * channel
+        by[:3], by[first : first + len(EACH)] = in_tool, [*(-scale * u), 1.0, far]
         by_tool = np.concatenate([in_tool, -in_tool @ skew(self.p_tool)])
         return ExpectedReading(np.array([scale * far + self.offset[channel]]), by_tool[None], by[None])
 
     def moved(self, step: Array) -> Self:
         """Return it with its parameters moved."""
-        each = step[3:].reshape(-1, len(EACH))
-        return replace(
-            self,
-            p_tool=self.p_tool + step[:3],
-            anchors=self.anchors + each[:, :3],
-            offset=self.offset + each[:, 3],
-            scale=self.scale + each[:, 4],
-        )
+        p, (x, y, z, b, s) = self.p_tool + step[:3], step[3:].reshape(-1, len(EACH)).T
+        anchors = self.anchors + np.column_stack([x, y, z])
+        return replace(self, p_tool=p, anchors=anchors, offset=self.offset + b, scale=self.scale + s)
 
 
 def _closed_form(R: Array, p: Array, z: Array) -> tuple[Array, Array]:
@@ -158,10 +149,8 @@ def _closed_form(R: Array, p: Array, z: Array) -> tuple[Array, Array]:
     return found[3:6], found[:3]
 
 
-LONG, SHORT = (
-    2.0,
-    4.0,
-)  # sigmas beyond which a range loses weight, too long and too short; half: good ranges lose theirs
+#: Sigmas beyond which a range loses weight, too long and too short; half: good ranges lose theirs.
+LONG, SHORT = 2.0, 4.0
 PASSES = 3  # of the smoother; half: the first linearisation stays
 START_M, START_M_S = 5.0, 1.0  # sigma of the first position and velocity; half, double: nothing after some seconds
 
@@ -173,25 +162,18 @@ class RangeNoise(NamedTuple):
     bias_m: float = 0.2  #: of an anchor's bias, m
     fade_s: float = 20.0  #: in which a bias fades, s
     acceleration: float = 0.7  #: density of the body's acceleration, m/s2 per root of Hz
+    upright: float = 0.1  #: acceleration along z over that in the plane; 1 for what flies
 
 
-@dataclass(frozen=True, eq=False)
-class RangePath(Record):
+class RangePath(NamedTuple):
     """A path: at the time of each range, position (N, 3), m, and its covariance (N, 3, 3)."""
 
-    t_s: Array
     p: Array
     cov: Array
 
 
 def follow_ranges(
-    anchors: Distance,
-    t_s: Array,
-    channel: NDArray[np.int64],
-    z: Array,
-    start: Array,
-    noise: RangeNoise | None = None,
-    upright: float = 0.1,
+    anchors: Distance, t_s: Array, channel: NDArray[np.int64], z: Array, start: Array, noise: RangeNoise | None = None
 ) -> RangePath:
     """Follow a point by ranges.
 
@@ -202,77 +184,39 @@ def follow_ranges(
         z: (N,) ranges, m.
         start: (3,) about where it begins, m.
         noise: of the sensor and the body; None: ultra-wideband on something that drives.
-        upright: acceleration along z over that in the plane; 1 for what flies.
     """
-    smoother = _Smoother(anchors, t_s, channel, z, start, upright)
-    path, noise = None, noise or RangeNoise()
+    noise, n = noise or RangeNoise(), 6 + len(anchors.anchors)
+    steps = [_transition(float(dt), n, noise) for dt in np.diff(t_s, prepend=t_s[0])]
+    sigma, path = np.repeat([START_M, START_M_S, noise.bias_m], [3, 3, n - 6]), np.zeros((0, n))
     for _ in range(PASSES):
-        path = smoother.smoothed(noise, path)
-    assert path is not None  # for the type checker: PASSES is above zero
-    x, P = path
-    return RangePath(t_s, x[:, :3], P[:, :3, :3])
+        now, ahead, found = (np.append(start, np.zeros(n - 3)), np.diag(sigma**2)), [], []
+        for k, ((F, Q), c, read) in enumerate(zip(steps, channel, z, strict=True)):
+            x, P = F @ now[0], F @ now[1] @ F.T + Q
+            ahead.append((x, P))
+            at = path[k] if len(path) else x  # linearised where the pass before found it
+            apart = at[:3] - anchors.anchors[c]
+            far, H = float(np.linalg.norm(apart)), np.zeros(n)
+            H[:3], H[6 + c] = anchors.scale[c] * apart / far, 1.0
+            left = read - anchors.scale[c] * far - anchors.offset[c] - at[6 + c]
+            e, known = left - H @ (x - at), float(H @ P @ H)
+            size = noise.range_m if len(path) else np.sqrt(known + noise.range_m**2)
+            R = noise.range_m**2 * (1.0 + (left / ((LONG if left > 0.0 else SHORT) * size)) ** 2)
+            gain = P @ H / (known + R)
+            now = x + gain * e, P - np.outer(gain, H @ P)
+            found.append(now)
+        for k in range(len(found) - 2, -1, -1):  # all ranges (Rauch, Tung and Striebel, AIAA J. 3, 1965)
+            (x, P), (x_ahead, P_ahead), (x_after, P_after) = found[k], ahead[k + 1], found[k + 1]
+            gain = np.linalg.solve(P_ahead, steps[k + 1][0] @ P).T
+            found[k] = x + gain @ (x_after - x_ahead), P + gain @ (P_after - P_ahead) @ gain.T
+        path = np.array([x for x, _ in found])
+    return RangePath(path[:, :3], np.array([P[:3, :3] for _, P in found]))
 
 
-_Path = tuple[Array, Array]
-
-
-class _Smoother:
-    """Position, velocity and biases through time."""
-
-    def __init__(
-        self, anchors: Distance, t_s: Array, channel: NDArray[np.int64], z: Array, start: Array, upright: float
-    ) -> None:
-        self._anchors, self._t, self._channel, self._z = anchors, t_s, channel, z
-        self._size, self._start = 6 + len(anchors.anchors), start
-        self._share = np.array([1.0, 1.0, upright**2])
-
-    def _transition(self, dt: float, noise: RangeNoise) -> tuple[Array, Array]:
-        n = self._size
-        F, Q = np.eye(n), np.zeros((n, n))
-        i = np.arange(3)
-        F[i, i + 3] = dt
-        q = noise.acceleration**2 * self._share
-        Q[i, i], Q[i, i + 3], Q[i + 3, i], Q[i + 3, i + 3] = q * dt**3 / 3, q * dt**2 / 2, q * dt**2 / 2, q * dt
-        kept = np.exp(-dt / noise.fade_s)
-        b = np.arange(6, n)
-        F[b, b], Q[b, b] = kept, noise.bias_m**2 * (1 - kept**2)
-        return F, Q
-
-    def _forward(
-        self, noise: RangeNoise, path: _Path | None
-    ) -> tuple[list[Array], list[Array], list[Array], list[Array]]:
-        """Return filtered and predicted states with covariances, linearised at a path where there is one."""
-        x = np.concatenate([self._start, np.zeros(self._size - 3)])
-        P = np.diag(np.repeat([START_M**2, START_M_S**2, noise.bias_m**2], [3, 3, self._size - 6]))
-        out: tuple[list[Array], list[Array], list[Array], list[Array]] = ([], [], [], [])
-        before = self._t[0]
-        for k, (t, c, z) in enumerate(zip(self._t, self._channel, self._z, strict=True)):
-            F, Q = self._transition(float(t - before), noise)
-            before, x, P = t, F @ x, F @ P @ F.T + Q
-            out[2].append(x)
-            out[3].append(P)
-            at = x if path is None else path[0][k]
-            apart = at[:3] - self._anchors.anchors[c]
-            far, scale = float(np.linalg.norm(apart)), float(self._anchors.scale[c])
-            H = np.zeros(self._size)
-            H[:3], H[6 + c] = scale * apart / far, 1.0
-            left = z - scale * far - self._anchors.offset[c] - at[6 + c]
-            e = left - H @ (x - at)
-            S = H @ P @ H + noise.range_m**2
-            off, size = (e, np.sqrt(S)) if path is None else (left, noise.range_m)
-            R = noise.range_m**2 * (1 + (off / ((LONG if off > 0 else SHORT) * size)) ** 2)
-            gain = P @ H / (S - noise.range_m**2 + R)
-            x, P = x + gain * e, P - np.outer(gain, H @ P)
-            out[0].append(x)
-            out[1].append(P)
-        return out
-
-    def smoothed(self, noise: RangeNoise, path: _Path | None) -> _Path:
-        """Return states (N, S) and covariances (N, S, S) by all ranges (Rauch, Tung and Striebel, AIAA J. 3, 1965)."""
-        x, P, ahead, P_ahead = self._forward(noise, path)
-        for k in range(len(x) - 2, -1, -1):
-            F, _ = self._transition(float(self._t[k + 1] - self._t[k]), noise)
-            gain = np.linalg.solve(P_ahead[k + 1], F @ P[k]).T
-            x[k] = x[k] + gain @ (x[k + 1] - ahead[k + 1])
-            P[k] = P[k] + gain @ (P[k + 1] - P_ahead[k + 1]) @ gain.T
-        return np.array(x), np.array(P)
+def _transition(dt: float, n: int, noise: RangeNoise) -> tuple[Array, Array]:
+    """Return what a time, s, keeps of position, velocity and biases, and what it adds to their covariance (n, n)."""
+    F, Q, i, b = np.eye(n), np.zeros((n, n)), np.arange(3), np.arange(6, n)
+    q = noise.acceleration**2 * np.array([1.0, 1.0, noise.upright**2])
+    F[i, i + 3], F[b, b] = dt, np.exp(-dt / noise.fade_s)
+    Q[i, i], Q[i, i + 3], Q[i + 3, i], Q[i + 3, i + 3] = q * dt**3 / 3, q * dt**2 / 2, q * dt**2 / 2, q * dt
+    Q[b, b] = noise.bias_m**2 * (1 - F[b, b] ** 2)
+    return F, Q

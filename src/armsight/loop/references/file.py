@@ -76,25 +76,16 @@ _NUMBERS = {MESSAGES[Inertial]: (37 * 8, np.r_[13:16, 25:28]), MESSAGES[Magnetom
 
 @dataclass(frozen=True, eq=False)
 class Entry(Record):
-    """A reference of the file.
-
-    Attributes:
-        sensor_class: what an inertial unit is like.
-        live: where it is read in a run; None where that is not said.
-        rate_hz: readings a second, as the file says; None where it does not.
-        calibrated: whether the file has its parameters.
-        where: the file and the name of its table, for messages.
-        noise_m: of a range.
-    """
+    """A reference of the file."""
 
     reference: Sensor
-    sensor_class: str
+    sensor_class: str  #: what an inertial unit is like
     source: Path | None
-    live: str | None
-    rate_hz: float | None
-    calibrated: bool
-    where: str = ""
-    noise_m: float = 1e-3
+    live: str | None  #: where it is read in a run; None where that is not said
+    rate_hz: float | None  #: readings a second, as the file says; None where it does not
+    calibrated: bool  #: whether the file has its parameters
+    where: str = ""  #: the file and the name of its table, for messages
+    noise_m: float = 1e-3  #: of a range
 
 
 def read_references(path: Path) -> list[Entry]:

@@ -46,31 +46,20 @@ _SYMMETRIC = np.maximum(_SYMMETRIC, _SYMMETRIC.transpose(0, 2, 1))
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Magnetometer(Reference):
-    """A magnetometer.
+    """A magnetometer."""
 
-    Attributes:
-        R_tool_sensor: (3, 3) its mounting.
-        soft: (3, 3) soft iron and scale, symmetric.
-        hard_t: (3,) hard iron, T.
-        field_t: (3,) the field in the base, T.
-    """
-
-    R_tool_sensor: Array
-    soft: Array
-    hard_t: Array
-    field_t: Array
+    R_tool_sensor: Array  #: (3, 3) its mounting
+    soft: Array  #: (3, 3) soft iron and scale, symmetric
+    hard_t: Array  #: (3,) hard iron, T
+    field_t: Array  #: (3,) the field in the base, T
 
     @staticmethod
     def of(name: str) -> Magnetometer:
         """Return one of which nothing is known."""
         cov = np.diag(np.repeat([np.pi, _SOFT, _HARD_T, _FIELD_T], [3, 6, 3, 3]) ** 2)
-        given = {
-            "R_tool_sensor": np.eye(3),
-            "soft": np.eye(3),
-            "hard_t": np.zeros(3),
-            "field_t": EARTH_T * np.eye(3)[0],
-        }
-        return Magnetometer(name=name, cov=cov, sigma_delay_s=0.02, **given)
+        eye, field = np.eye(3), EARTH_T * np.eye(3)[0]
+        given = Magnetometer(name=name, cov=cov, R_tool_sensor=eye, soft=eye, hard_t=np.zeros(3), field_t=field)
+        return replace(given, sigma_delay_s=0.02)
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -99,13 +88,8 @@ class Magnetometer(Reference):
     def moved(self, step: Array) -> Self:
         """Return it with a mounting rotated on the right by ``step[:3]``, the other parameters added."""
         rotation, soft, hard, field = np.split(step, [3, 9, 12])
-        return replace(
-            self,
-            R_tool_sensor=self.R_tool_sensor @ exp_so3(rotation),
-            soft=self.soft + np.tensordot(soft, _SYMMETRIC, 1),
-            hard_t=self.hard_t + hard,
-            field_t=self.field_t + field,
-        )
+        R, soft = self.R_tool_sensor @ exp_so3(rotation), self.soft + np.tensordot(soft, _SYMMETRIC, 1)
+        return replace(self, R_tool_sensor=R, soft=soft, hard_t=self.hard_t + hard, field_t=self.field_t + field)
 
     def begun(self, readings: Sequence[Reading], motion: Callable[[float], ToolMotion]) -> Self:
         """Return it with parameters near the truth, in closed form, for ``calibrate``.
@@ -146,17 +130,11 @@ def check_unit(where: str, z: Array) -> None:
 
 @dataclass(frozen=True, eq=False)
 class HeadingOff(Record):
-    """By how much the field says that the arm's heading is off: joint 1's zero, or the base was rotated.
+    """By how much the field says that the arm's heading is off: joint 1's zero, or the base was rotated."""
 
-    Attributes:
-        angle_rad: rotation of the base about its z since the calibration.
-        sigma_rad: its standard deviation, disturbances and calibration included; infinite at one attitude alone.
-        disturbance_t: (N,) field of motors and iron at each reading, T, as far as it shows.
-    """
-
-    angle_rad: float
-    sigma_rad: float
-    disturbance_t: Array
+    angle_rad: float  #: rotation of the base about its z since the calibration
+    sigma_rad: float  #: standard deviation, disturbances and calibration included; infinite at one attitude alone
+    disturbance_t: Array  #: (N,) field of motors and iron at each reading, T, as far as it shows
 
 
 def _attitudes(R: Array) -> Array:

@@ -22,13 +22,7 @@ from armsight.data import Array
 from armsight.errors import InputError
 from armsight.geometry.pose import exp_se3, left_jacobian, pose
 from armsight.geometry.rotation import exp_so3, log_so3, nearest_rotation, skew
-from armsight.loop.references.reference import (
-    STANDARD_GRAVITY_M_S2,
-    ExpectedReading,
-    Reading,
-    Reference,
-    ToolMotion,
-)
+from armsight.loop.references.reference import STANDARD_GRAVITY_M_S2, ExpectedReading, Reading, Reference, ToolMotion
 
 GYRO, ACCELEROMETER = 0, 1
 _UPPER = np.triu_indices(3)

@@ -57,24 +57,16 @@ COEFFICIENTS: dict[str, Callable[[Array], Array]] = {
 
 @dataclass(frozen=True, eq=False)
 class StreamCheck(Record):
-    """What a stream is like.
+    """What a stream is like."""
 
-    Attributes:
-        rate_hz: readings a second, by the median period.
-        doubled: share of the rows that repeat the row before.
-        frozen_s: the longest time in which no column changed, s.
-        saturated: columns that stand at their greatest or least value for a while, and no coarse step apart from the next.
-        rests: rows of the rests; empty where there are none, or where one number's step hides them.
-    """
-
-    rate_hz: float
-    jitter_s: float
+    rate_hz: float  #: readings a second, by the median period
+    jitter_s: float  #: half of what 68 % of the periods lie within
     gaps: int
     longest_gap_s: float
-    doubled: float
-    frozen_s: float
-    saturated: tuple[int, ...]
-    rests: tuple[slice, ...]
+    doubled: float  #: share of the rows that repeat the row before
+    frozen_s: float  #: the longest time in which no column changed, s
+    saturated: tuple[int, ...]  #: columns that stand at their greatest or least value for a while
+    rests: tuple[slice, ...]  #: rows of the rests; empty where there are none, or where one number's step hides them
 
     @property
     def rest(self) -> slice:
@@ -83,20 +75,13 @@ class StreamCheck(Record):
 
 
 class Settling(NamedTuple):
-    """How a tool settles after its stops, the median of them.
+    """How a tool settles after its stops, the median of them."""
 
-    Attributes:
-        stops: after which a vibration was seen.
-        frequency_hz: of it.
-        damping: of critical.
-        time_s: from the stop until the amplitude is below ``SETTLED_M``.
-    """
-
-    stops: int
+    stops: int  #: after which a vibration was seen
     frequency_hz: float
-    damping: float
+    damping: float  #: of critical
     amplitude_m: float
-    time_s: float
+    time_s: float  #: from the stop until the amplitude is below ``SETTLED_M``
 
 
 def check_stream(t_s: Array, z: Array, source: str) -> StreamCheck:
