@@ -2,10 +2,9 @@
 
 In: what a router heard. Out: JSON for the page, numbers for metrics, rows for the store.
 
-Whether a number drifts: the slope of its recent means, against the slopes of its past and of its siblings. The scatter
-about one line does not say how steep lines are by chance: air, lamps and a warm board move means for minutes. The slopes
-of windows that do not overlap, of this cell before and of the other cells now, do. Their median size is the scale, so that
-a few cells that do drift hardly change it, and the chance is Student's with their number.
+Whether a number drifts: the slope of its recent means is compared with slopes of windows that do not overlap, of its own
+past and of its siblings. The scatter about one line does not say how steep lines are by chance: air, lamps and a warm
+board move means for minutes. The median size of those slopes is the scale; the chance is Student's with their number.
 """
 
 from __future__ import annotations
@@ -23,24 +22,20 @@ from armsight.app.stream.cell_file import STATE_S
 from armsight.estimate.chance import chance_among
 from armsight.files import natural_key
 
-#: s without a state after which a connected cell is frozen, or its network cut; half: a busy computer is red now and
-#: then, double: a cut cable shows later.
+#: s without a state until a connected cell is frozen or cut off; half: a busy computer is red, double: shown later.
 _SILENT_S = 3 * STATE_S
 #: s of a bar of the sparkline, and bars of a day; half: finer, double: coarser.
 _BAR_S = 300.0
 _BARS = round(86400 / _BAR_S)
-#: sigmas of a slope that count as much as an error at its limit, in the order of cells that are well; half: slopes
-#: first, double: errors first.
+#: sigmas of a slope that rank like an error at its limit, of cells that are well; half: slopes first, double: errors.
 _STEEP = 4.0
 #: s after which a cell that is gone is not shown; half: a cell of a holiday is missing, double: dismantled ones stay.
 _FORGOTTEN_S = 14 * 86400.0
 #: s for which a message that cannot be read is worth a look; half: missed by who looks away, double: long past.
 REJECTED_S = 60.0
-#: s by which a cell's clock may differ from the hub's; half: a slow network is called a clock, double: times are
-#: compared wrongly.
+#: s that a cell's clock may be off the hub's; half: a slow network is called a clock, double: times are wrong.
 _CLOCK_S = 2.0
-#: share of shots without a measurement that is worth a look; half: a body that leaves the view now and then, double: a
-#: lamp is off.
+#: share of missed shots that is worth a look; half: a body that leaves the view now and then, double: a lamp is off.
 _MISSED = 0.5
 #: Numbers of a state that are stored, with what is shown of them.
 NUMBERS = ("rate_hz", "shots", "missed", "error_mm", "sigma_mm", "tilt_mdeg", "size_ppm", "temperature_c")
@@ -57,8 +52,7 @@ BLOCK_S, BLOCKS = 10.0, 60
 _LEAST = BLOCKS // 4
 #: s between two looks for drifts; half: chance is checked twice as often, double: named a minute later.
 LOOK_S = 60.0
-#: Chance of one look at one of two numbers: a false one a cell and week at most. Half: a drift is named later, double:
-#: two false alarms a week.
+#: Chance of a look at one of two numbers: a false alarm a cell and week. Half: drifts are named later, double: two alarms.
 CHANCE = LOOK_S / (2 * 7 * 86400)
 #: slopes that a scale needs; half: a scale that is a third off, double: a single cell says nothing for four hours.
 _SLOPES = 8
@@ -206,8 +200,7 @@ class CellView:
         state = self.state
         if state.get("health"):
             return FINDING, float(len(state["health"])), state["health"][-1]
-        significant = [(each.chance, key, each) for key, each in self.drifts.items() if each.chance < CHANCE]
-        if significant:
+        if significant := [(each.chance, key, each) for key, each in self.drifts.items() if each.chance < CHANCE]:
             chance, key, found = min(significant)
             unit, text = DRIFTS[key]
             per_h, sigma = float(f"{found.per_h:.3g}"), float(f"{found.sigma_per_h:.2g}")
@@ -235,12 +228,8 @@ class CellView:
     def to_json(self, now_s: float) -> dict[str, Any]:
         """Return what the page shows."""
         (level, size, why), first = self.need(now_s), int(now_s // _BAR_S) - _BARS + 1
-        return {
-            "site": self.site,
-            "name": self.name,
-            "level": level,
-            "size": round(size, 3),
-            "why": why,
+        who = {"site": self.site, "name": self.name, "level": level, "size": round(size, 3), "why": why}
+        return who | {
             "up": bool(self.sessions) and level < LOST,
             "about": self.about,
             "state": {key: value for key, value in self.state.items() if key != "health"},

@@ -3,11 +3,19 @@
 from __future__ import annotations
 
 import json
+import threading
+from dataclasses import asdict
 from pathlib import Path
 
 import click
 
 from armsight.app.options import JSON, argument, declared, option, out
+from armsight.app.progress import steps
+from armsight.app.show.http import host_and_port
+from armsight.app.show.messages import require
+from armsight.app.stream.cell_file import endpoint, read_cell
+from armsight.errors import ArmsightError
+from armsight.files import check_folder
 
 _HUB = option(
     "Where cells find the hub; port 7447 where none is given.", "--hub", default="127.0.0.1:7447", metavar="HOST[:PORT]"
@@ -40,26 +48,18 @@ def command(
     """
     if ctx.invoked_subcommand is not None:
         return
-    import threading
-
-    from armsight.app.show.http import host_and_port
-    from armsight.app.show.messages import require
-    from armsight.app.stream.cell_file import endpoint
-    from armsight.files import check_folder
-
     require("a hub", "cells", "zenoh", "pyarrow", "cryptography")
     from armsight.app.hub.router import rejected
     from armsight.app.hub.service import Hub
 
     check_folder(output, problem="no hub can be kept here")
     host_and_port(http, "--http")
-    note = lambda line: click.echo(f"note: {line}", err=True)  # noqa: E731
-    hub = Hub(output, endpoint(listen, "--listen"), http, keys, note, mqtt)
+    at = endpoint(listen, "--listen")
+    hub = Hub(output, at, http, keys, lambda line: click.echo(f"note: {line}", err=True), mqtt)
     try:
-        if as_json:
-            click.echo(json.dumps({"address": hub.pages.address, "listen": listen, "directory": str(output)}))
-        else:
-            click.echo(f"open {hub.pages.address} in a browser; cells connect to {listen}; Ctrl-C ends the hub")
+        answer = json.dumps({"address": hub.pages.address, "listen": listen, "directory": str(output)})
+        line = f"open {hub.pages.address} in a browser; cells connect to {listen}; Ctrl-C ends the hub"
+        click.echo(answer if as_json else line)
         with rejected(hub.rejected):
             threading.Event().wait()
     finally:
@@ -80,23 +80,16 @@ def keys_command(
     Typed again it adds cells and renews what ends within 30 days. Start the hub again after it. DIR/ca.key must stay
     secret: who has it can make cells, and ask cells to hold.
     """
-    from armsight.app.show.http import host_and_port
-    from armsight.app.show.messages import require
-    from armsight.files import check_folder
-
     require("keys", "cells", "cryptography")
     from armsight.app.hub.keys import make_keys
 
     host, port = host_and_port(address if ":" in address.rpartition("]")[2] else f"{address}:7447", "--hub", least=1)
     made = make_keys(check_folder(output, problem="no keys can be made here"), site, cells, host, port)
-    if as_json:
-        click.echo(json.dumps({"directory": str(output), "cells": [str(each) for each in made]}))
-        return
-    for each in made:
-        click.echo(
-            f"{each.parent}: copy this folder to the cell's computer; there: --stream cell:{each.parent.name}/cell.toml"
-        )
-    click.echo(f"{output}: start the hub with armsight hub --listen tls/0.0.0.0:{port} --keys {output}")
+    there = "copy this folder to the cell's computer; there: --stream cell:"
+    lines = [f"{each.parent}: {there}{each.parent.name}/cell.toml" for each in made]
+    lines.append(f"{output}: start the hub with armsight hub --listen tls/0.0.0.0:{port} --keys {output}")
+    answer = {"directory": str(output), "cells": list(map(str, made))}
+    click.echo(json.dumps(answer) if as_json else "\n".join(lines))
 
 
 @command.command("hold")
@@ -113,9 +106,6 @@ def hold_command(
     A cell does so only where its cell.toml says holds = true, and the request is signed by the site's key. The
     cell keeps an event of it. Exit code 2: it did not.
     """
-    from armsight.app.show.messages import require
-    from armsight.errors import ArmsightError
-
     require("a request to hold", "cells", "zenoh", "cryptography")
     from armsight.app.hub.router import hold
 
@@ -158,14 +148,9 @@ def push_command(
     Each goes to STORE/SITE/DAY/CELL/RUN, with a manifest of sizes and SHA-256 written last. It begins only while no
     command of the cell runs.
     """
-    from dataclasses import asdict
-
-    from armsight.app.hub.push import push
-    from armsight.app.progress import steps
-    from armsight.app.show.messages import require
-    from armsight.app.stream.cell_file import read_cell
-
     require("pushing", "cells", "fsspec")
+    from armsight.app.hub.push import push
+
     cell = read_cell(spec)
     with steps() as say:
         done = push(cell, runs, store, rate, lambda sent: say(f"pushing: {sent / 1e6:.1f} MB"))

@@ -19,8 +19,7 @@ from armsight.app.stream.cell_file import certificate, check_name, hold_bytes
 from armsight.errors import InputError
 from armsight.files import as_input_error, read_bytes, read_text, replacing, write_text
 
-#: days that certificates are valid: of cells and hub, and of the authority; half: renewed twice as often, double: a
-#: stolen key works longer.
+#: days that certificates of cells and hub, and of the site, are valid; half: renewed more often, double: stolen longer.
 _DAYS, _CA_DAYS = 397, 3650
 #: days before its end in which a certificate is made anew; half: less warning, double: made anew more often.
 _RENEW_DAYS = 30
@@ -42,12 +41,8 @@ def make_keys(folder: Path, site: str, cells: Sequence[str], host: str, port: in
     """Make what a site lacks: the authority, the hub's certificate, and a folder a cell with its cell.toml.
 
     Cells that have a valid certificate keep it; host and port are where they find the hub. ``ca.key`` must stay secret.
-
-    Returns:
-        The files of cells that are new or changed, each to be carried to its cell.
-
-    Raises:
-        InputError: a name that cannot be part of a key, or a folder of another site.
+    Returned are the files of cells that are new or changed, each to be carried to its cell. An InputError says that a
+    name cannot be part of a key, or that the folder is another site's.
     """
     for name in (site, *cells):
         check_name(name, "the name of a site or a cell")
@@ -62,11 +57,9 @@ def make_keys(folder: Path, site: str, cells: Sequence[str], host: str, port: in
     router = f'router = "tls/[{host}]:{port}"' if ":" in host else f'router = "tls/{host}:{port}"'
     made = []
     for name in cells:
-        at = folder / "cells" / name
-        toml = at / "cell.toml"
-        new = _ensure(at / "cell", authority, f"{site}.{name}", [])
-        if new:
-            write_text(at / "ca.pem", read_text(folder / "ca.pem"))
+        toml = folder / "cells" / name / "cell.toml"
+        if new := _ensure(toml.with_name("cell"), authority, f"{site}.{name}", []):
+            write_text(toml.with_name("ca.pem"), read_text(folder / "ca.pem"))
         before = read_text(toml) if toml.exists() else _CELL.format(name, site)  # what its owner changed in it stays
         now = re.sub(r"(?m)^router = .*$", router, before)
         if new or now != before:
@@ -76,11 +69,7 @@ def make_keys(folder: Path, site: str, cells: Sequence[str], host: str, port: in
 
 
 def site_of(folder: Path) -> tuple[str, list[str]]:
-    """Return the name of a folder's site, and of its cells.
-
-    Raises:
-        InputError: it holds no keys, or a certificate has ended.
-    """
+    """Return the name of a folder's site, and of its cells; an InputError: it has no keys, or a certificate has ended."""
     if not (folder / "ca.pem").is_file():
         raise InputError(
             f"{folder}: no keys of a site are here: make them with `armsight hub keys SITE CELL ... -o {folder}`"
@@ -122,8 +111,7 @@ def _ensure(path: Path, authority: _Pair | None, name: str, hosts: list[str]) ->
         uses = [ExtendedKeyUsageOID.CLIENT_AUTH, *([ExtendedKeyUsageOID.SERVER_AUTH] if hosts else [])]
         builder = builder.add_extension(x509.ExtendedKeyUsage(uses), critical=False)
     if hosts:
-        known = x509.SubjectAlternativeName([_alternative(each) for each in hosts])
-        builder = builder.add_extension(known, critical=False)
+        builder = builder.add_extension(x509.SubjectAlternativeName(list(map(_alternative, hosts))), critical=False)
     made = builder.sign(signing, hashes.SHA256())
     encoding, pkcs8 = serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8
     with replacing(path.with_suffix(".key"), "wb") as file:

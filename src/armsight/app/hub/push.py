@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import hashlib
 import json
-import queue
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import Future, wait
+from contextlib import closing
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import partial
@@ -24,13 +25,11 @@ from armsight.errors import ArmsightError, InputError
 
 #: bytes that are read and sent at once; half: more calls, double: a coarser limit of the rate.
 _CHUNK = 1 << 20
-#: bytes of which a store makes a part, and parts that S3 takes; half: S3 takes no less but the last, double: a slow network
-#: is silent for twice as long.
+#: bytes of a part of a store, and parts that S3 takes; half: S3 takes no less, double: slow networks are silent longer.
 _PART, _PARTS = 5 << 20, 10_000
 #: s that a store may take for an answer; half: a slow one is not used, double: a dead one keeps the cell longer.
 _ANSWER_S = 30.0
-#: bytes a second that a network carries at least; half: a store that is silent is given up later, double: 1 Mbit/s is no
-#: network.
+#: bytes a second of the slowest network; half: a silent store is given up later, double: 1 Mbit/s is no network.
 _SLOWEST = 50e3
 _MANIFEST = "manifest.json"
 
@@ -48,20 +47,17 @@ class Pushed:
 def push(cell: Cell, folder: Path, store: str, rate_mb_s: float, advance: Callable[[int], None]) -> Pushed:
     """Copy the runs of a folder; one that is complete in the store is passed over.
 
-    No command of the cell may run meanwhile; ``advance`` is called with the bytes sent so far.
-
-    Raises:
-        InputError: no runs are there, the store is unknown, or the cell is running.
-        ArmsightError: the store is full or cannot be written; what is complete stays.
+    No command of the cell may run meanwhile; ``advance`` is called with the bytes sent so far. An InputError says that no
+    runs are there, that the store is unknown, or that the cell is running; another ArmsightError that the store is full
+    or cannot be written: what is complete stays.
     """
     import fsspec
 
     try:
         fsspec.get_filesystem_class(fsspec.utils.get_protocol(store))
-    except ImportError as error:  # its words say what to install
-        raise InputError(f"{store}: {error}") from None
-    except ValueError as error:
-        raise InputError(f"{store}: {error}; expected a folder, or such as s3://bucket") from None
+    except (ImportError, ValueError) as error:  # the words of an ImportError say what to install
+        known = "" if isinstance(error, ImportError) else "; expected a folder, or such as s3://bucket"
+        raise InputError(f"{store}: {error}{known}") from None
     names = "run.mcap", "summary.json", "shots.csv"
     runs = sorted({path.parent for name in names for path in folder.glob(f"*/{name}")})
     if not runs:
@@ -69,32 +65,29 @@ def push(cell: Cell, folder: Path, store: str, rate_mb_s: float, advance: Callab
     done, due_s = Pushed(), time.monotonic()
 
     def pace(count: int) -> None:
-        """Wait until so many bytes more may be sent, and count them."""
         nonlocal due_s
         time.sleep(max(0.0, due_s - time.monotonic()))
         due_s = max(due_s, time.monotonic()) + count / (1e6 * rate_mb_s)
         done.sent_bytes += count
         advance(done.sent_bytes)
 
-    resting = Outbox(state_folder() / "cells" / cell.site / cell.name, cell.name)
-    try:
-        fs, root = fsspec.core.url_to_fs(store)
-        # s3fs makes a bucket of a mistyped name.
-        if (bucket := root.partition("/")[0]) and not _answer(fs.exists, bucket):
-            raise InputError(f"{store}: no {bucket!r} is there, or it cannot be reached: is its name right?")
-        for run in runs:
-            day = datetime.fromtimestamp(min(each.stat().st_mtime for each in _files(run)), UTC)
-            _push_run(fs, f"{root}/{cell.site}/{day:%Y-%m-%d}/{cell.name}/{run.name}", run, done, pace)
-        return done
-    except InputError:
-        raise
-    except ValueError as error:
-        raise InputError(f"{store}: {error}") from None
-    except Exception as error:  # noqa: BLE001 - a store's library has errors of its own; our own code has its tests
-        why = getattr(error, "strerror", None) or str(error) or type(error).__name__
-        raise ArmsightError(f"{store}: {why}; started again it goes on where it was") from None
-    finally:
-        resting.close()
+    with closing(Outbox(state_folder() / "cells" / cell.site / cell.name, cell.name)):
+        try:
+            fs, root = fsspec.core.url_to_fs(store)
+            # s3fs makes a bucket of a mistyped name.
+            if (bucket := root.partition("/")[0]) and not _answer(fs.exists, bucket):
+                raise InputError(f"{store}: no {bucket!r} is there, or it cannot be reached: is its name right?")
+            for run in runs:
+                day = datetime.fromtimestamp(min(each.stat().st_mtime for each in _files(run)), UTC)
+                _push_run(fs, f"{root}/{cell.site}/{day:%Y-%m-%d}/{cell.name}/{run.name}", run, done, pace)
+            return done
+        except InputError:
+            raise
+        except ValueError as error:
+            raise InputError(f"{store}: {error}") from None
+        except Exception as error:  # noqa: BLE001 - a store's library has errors of its own; our own code has its tests
+            why = getattr(error, "strerror", None) or str(error) or type(error).__name__
+            raise ArmsightError(f"{store}: {why}; started again it goes on where it was") from None
 
 
 def _push_run(fs: Any, at: str, run: Path, done: Pushed, pace: Callable[[int], None]) -> None:  # noqa: ANN401 - of fsspec
@@ -129,26 +122,21 @@ def _push_run(fs: Any, at: str, run: Path, done: Pushed, pace: Callable[[int], N
 def _answer(call: Callable[..., Any], *given: Any, within_s: float | None = None, **named: Any) -> Any:  # noqa: ANN401 - of fsspec
     """Return what a call to the store returns; by themselves s3fs and its like wait for many minutes.
 
-    Raises:
-        TimeoutError: the store is silent; the call is left alone in its thread.
+    A TimeoutError says that the store is silent; the call is left alone in its thread.
     """
-    answers: queue.SimpleQueue[tuple[Any, BaseException | None]] = queue.SimpleQueue()
+    answer = Future[Any]()
 
     def work() -> None:
         try:
-            answers.put((call(*given, **named), None))
+            answer.set_result(call(*given, **named))
         except BaseException as error:  # noqa: BLE001 - raised below
-            answers.put((None, error))
+            answer.set_exception(error)
 
     threading.Thread(target=work, daemon=True).start()
     limit_s = within_s or _ANSWER_S
-    try:
-        value, error = answers.get(timeout=limit_s)
-    except queue.Empty:
-        raise TimeoutError(f"no answer for {limit_s:.0f} s") from None
-    if error is not None:
-        raise error
-    return value
+    if not wait([answer], limit_s).done:
+        raise TimeoutError(f"no answer for {limit_s:.0f} s")
+    return answer.result()
 
 
 def _files(run: Path) -> list[Path]:

@@ -24,6 +24,8 @@ from armsight.app.stream.cell_file import ANSWER_S, LONGEST, NAME, Cell, endpoin
 from armsight.errors import InputError
 from armsight.files import as_input_error
 
+#: The site's certificate, and the hub's own and its key.
+_FILES = ("ca.pem", "hub.pem", "hub.key")
 _ALLOWED = (
     "put", "delete", "declare_subscriber", "query", "reply", "declare_queryable", "liveliness_token",
     "liveliness_query", "declare_liveliness_subscriber",
@@ -56,7 +58,7 @@ class Router:
             config = zenoh_config("router", listen)
         elif listen.startswith("tls/"):
             access = _access(*site_of(keys))
-            config = zenoh_config("router", listen, _files(keys))
+            config = zenoh_config("router", listen, [keys / name for name in _FILES])
             config.insert_json5("access_control", json.dumps(access))
         else:
             raise InputError(f"--listen {listen}: with --keys it is tls/HOST:PORT")
@@ -122,11 +124,6 @@ def parsed(data: bytes) -> Any:  # noqa: ANN401 - whatever JSON holds
         return "a message that is no JSON"
 
 
-def _files(keys: Path) -> list[Path]:
-    """Return the site's certificate, and the hub's own and its key."""
-    return [keys / name for name in ("ca.pem", "hub.pem", "hub.key")]
-
-
 def _access(site: str, cells: Sequence[str]) -> dict[str, Any]:
     """Return zenoh's access control: a cell below its own name, the hub's key to ask for a hold, whoever else nothing."""
     below = [(name, f"{name}/**", _ALLOWED) for name in cells] + [(HUB, "*/hold", ("query", "reply"))]
@@ -150,7 +147,9 @@ def hold(keys: Path, cell: str, reason: str, address: str) -> str:
     if cell not in cells:
         raise InputError(f"{cell!r} is no cell of site {site}; it has {', '.join(cells) or 'none'}")
     with as_input_error(f"--hub {address}: no hub with the keys of {keys} answers there", zenoh.ZError):
-        session = zenoh.open(zenoh_config("client", endpoint(f"tls/{address}", "--hub"), _files(keys)))
+        session = zenoh.open(
+            zenoh_config("client", endpoint(f"tls/{address}", "--hub"), [keys / name for name in _FILES])
+        )
     with closing(session):
         return _answer(session, Cell(cell, site).topic("hold"), sign_hold(keys, cell, reason)).decode()
 

@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -79,8 +80,8 @@ class Hub:
             "/": lambda _: (200, "text/html; charset=utf-8", page),
             "/state": self._state,
             "/events": self._events,
-            "/image": self._asked("image", "image/jpeg"),
-            "/shots": self._asked("shots", "application/json"),
+            "/image": partial(self._asked, "image", "image/jpeg"),
+            "/shots": partial(self._asked, "shots", "application/json"),
             "/metrics": self._metrics,
         }
         with ExitStack() as opened:
@@ -108,11 +109,9 @@ class Hub:
     def rejected(self, why: str) -> None:
         """Say and keep that a connection was rejected, and how many were since the last time."""
         self._rejected += 1
-        if time.monotonic() - self._rejected_s < REJECTED_S:
-            return
-        text = f"{self._rejected} connections rejected: no valid key of this site (the last: {why})"
-        self._rejected, self._rejected_s = 0, time.monotonic()
-        self._reject(text)
+        if time.monotonic() - self._rejected_s > REJECTED_S:
+            self._reject(f"{self._rejected} connections rejected: no valid key of this site (the last: {why})")
+            self._rejected, self._rejected_s = 0, time.monotonic()
 
     def _reject(self, text: str) -> None:
         now = time.time()
@@ -235,23 +234,21 @@ class Hub:
         found = self._store.events(*(query.get(key, "") for key in ("q", "site", "cell")))
         return 200, "application/json", json.dumps(found).encode()
 
-    def _asked(self, what: str, kind: str) -> Callable[[dict[str, str]], Answer]:
-        """Return a page of what a cell answers."""
-
-        def answer(query: dict[str, str]) -> Answer:
-            key = query.get("site", ""), query.get("cell", "")
-            data = self._router.ask(*key, what) if key in self._cells else b""
-            return (200, kind, data) if data else (404, "text/plain", b"no such cell is there, or it has none\n")
-
-        return answer
+    def _asked(self, what: str, kind: str, query: dict[str, str]) -> Answer:
+        """Return what a cell answers."""
+        key = query.get("site", ""), query.get("cell", "")
+        data = self._router.ask(*key, what) if key in self._cells else b""
+        return (200, kind, data) if data else (404, "text/plain", b"no such cell is there, or it has none\n")
 
     def _metrics(self, _: dict[str, str]) -> Answer:
         found = self.snapshot()
-        rows = {"hub_events": {"": float(found["events"])}, "hub_dropped_total": {"": float(found["dropped"])}}
-        for cell in found["cells"]:
-            labels, values = f'{{site="{cell["site"]}",cell="{cell["name"]}"}}', {**cell["state"], **cell}
-            for name, (key, _help) in _GAUGES.items():
-                if values.get(key) is not None:
-                    rows.setdefault(name, {})[labels] = float(values[key])
+        cells = {
+            f'{{site="{each["site"]}",cell="{each["name"]}"}}': {**each["state"], **each} for each in found["cells"]
+        }
+        rows = {
+            name: {labels: float(of[key]) for labels, of in cells.items() if of.get(key) is not None}
+            for name, (key, _) in _GAUGES.items()
+        }
+        rows |= {"hub_events": {"": float(found["events"])}, "hub_dropped_total": {"": float(found["dropped"])}}
         kinds = {gauge: ("gauge", text) for gauge, (_, text) in _GAUGES.items()} | _OF_HUB
         return 200, "text/plain; version=0.0.4", metrics_text(kinds, rows)

@@ -51,11 +51,7 @@ def check_address(address: str) -> tuple[str, str | None, str, int]:
 
 
 def _varint(n: int) -> bytes:
-    out = bytearray()
-    while n > 127:
-        out.append(n & 127 | 128)
-        n >>= 7
-    return bytes([*out, n])
+    return bytes([n]) if n < 128 else bytes([n & 127 | 128]) + _varint(n >> 7)
 
 
 def _field(number: int, value: bool | int | float | bytes) -> bytes:
@@ -97,8 +93,7 @@ class Node:
         import paho.mqtt.client as mqtt
 
         self._site, self._say, self._said, self._seq = site, say, "", 0
-        # The bdSeq of a hub that was killed is another one: the broker may send its death after this one's birth.
-        self._bd = int(time.time()) % 256
+        self._bd = int(time.time()) % 256  # a killed hub's is another: the broker may send its death after this birth
         self._born: dict[str, dict[str, tuple[type, Value]]] = {}
         self._connected, self._birth = threading.Event(), threading.Event()
         self._client = mqtt.Client(mqtt.CallbackAPIVersion.VERSION2, f"armsight-{site}-{HUB}")
@@ -106,31 +101,29 @@ class Node:
             self._client.username_pw_set(user, os.environ.get(_PASSWORD))
         if scheme == "mqtts":
             self._client.tls_set_context(ssl.create_default_context())
-        self._client.on_connect, self._client.on_disconnect = self._came, self._went
+        heard = self._came, self._went, self._asked
+        self._client.on_connect, self._client.on_disconnect, self._client.on_message = heard
         self._client.on_connect_fail = lambda *_: self._note(f"no MQTT broker answers at {address}")
-        self._client.on_message = self._asked
         self._client.will_set(self._topic("NDEATH"), self._death_payload(), qos=1)
         self._client.connect_async(host, port)
         self._client.loop_start()
 
     def update(self, cells: Sequence[Mapping[str, Any]]) -> None:
         """Publish what changed since the last time."""
-        if not self._connected.is_set():
-            return
-        if self._birth.is_set():
+        if self._connected.is_set() and self._birth.is_set():
             self._birth.clear()
             self._born, self._seq = {}, 0
             self._publish("NBIRTH", "", {"bdSeq": (int, self._bd), _REBIRTH: (bool, False)})
-        for cell in cells:
+        for cell in cells if self._connected.is_set() else ():
             name, now = cell["name"], metrics(cell)
-            before = self._born.get(name)
-            if cell["up"]:
-                if changed := {key: value for key, value in now.items() if before is None or before[key] != value}:
-                    self._publish("DBIRTH" if before is None else "DDATA", name, changed)
-                self._born[name] = now
-            elif before is not None:
-                del self._born[name]
-                self._publish("DDEATH", name, {})
+            if not cell["up"]:
+                if self._born.pop(name, None) is not None:
+                    self._publish("DDEATH", name, {})
+                continue
+            before = self._born.get(name, {})
+            if changed := {key: value for key, value in now.items() if before.get(key) != value}:
+                self._publish("DDATA" if before else "DBIRTH", name, changed)
+            self._born[name] = now
 
     def close(self) -> None:
         """Publish the death, and leave."""

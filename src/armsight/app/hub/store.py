@@ -28,12 +28,12 @@ _SEARCH_S = 1.0
 _FOUND = 200
 #: events that are kept; half: half the history and disk (0.3 GB), double: both twice.
 _MOST = 1_000_000
-_TABLES = (
-    "CREATE TABLE IF NOT EXISTS events (site TEXT, cell TEXT, outbox TEXT, n INTEGER, t REAL, arrived REAL, kind TEXT,"
-    " level TEXT, text TEXT, PRIMARY KEY (site, cell, outbox, n)) WITHOUT ROWID",
-    "CREATE INDEX IF NOT EXISTS by_arrival ON events (arrived)",
-    "CREATE TABLE IF NOT EXISTS cells (site TEXT, cell TEXT, about TEXT, PRIMARY KEY (site, cell))",
-)
+#: Who reads does not wait, other programs too.
+_BEGIN = """PRAGMA journal_mode = WAL;
+CREATE TABLE IF NOT EXISTS events (site TEXT, cell TEXT, outbox TEXT, n INTEGER, t REAL, arrived REAL, kind TEXT,
+    level TEXT, text TEXT, PRIMARY KEY (site, cell, outbox, n)) WITHOUT ROWID;
+CREATE INDEX IF NOT EXISTS by_arrival ON events (arrived);
+CREATE TABLE IF NOT EXISTS cells (site TEXT, cell TEXT, about TEXT, PRIMARY KEY (site, cell))"""
 
 
 class Store:
@@ -48,10 +48,7 @@ class Store:
                 opened.enter_context(alone_in(folder, "hub"))
                 self._db = sqlite3.connect(folder / "events.sqlite", timeout=5.0, check_same_thread=False)
                 opened.callback(self._db.close)
-                self._db.execute("PRAGMA journal_mode = WAL")  # who reads does not wait, other programs too
-                for table in _TABLES:
-                    self._db.execute(table)
-                self._db.commit()
+                self._db.executescript(_BEGIN)
             self._opened = opened.pop_all()
 
     @property
