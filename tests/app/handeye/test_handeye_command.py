@@ -54,9 +54,14 @@ def seen(tmp_path):
     return matrices(tmp_path / "seen.txt", motion()[2])
 
 
+def asked(armsight, robot, seen, *more, eye="in-hand"):
+    """A run of the command."""
+    return armsight("handeye", "--robot", robot, "--seen", seen, "--eye", eye, *more)
+
+
 def found(armsight, robot, seen, *more, eye="in-hand"):
     """The JSON of a run that must succeed."""
-    said = armsight("handeye", "--robot", robot, "--seen", seen, "--eye", eye, "--json", *more).done()
+    said = asked(armsight, robot, seen, "--json", *more, eye=eye).done()
     return said.lines[0], said.err
 
 
@@ -162,9 +167,7 @@ def test_people_read_sigma_whose_error_blunders_and_a_plan_and_get_a_page(armsig
     _, A, B = motion(20)
     B[7] = B[7] @ exp_se3(np.array([0.05, 0, 0, 0.3, 0, 0]))
     robot, seen = matrices(tmp_path / "robot.txt", A), matrices(tmp_path / "seen.txt", B)
-    said = armsight(
-        "handeye", "--robot", robot, "--seen", seen, "--eye", "in_hand", "--plan", 2, "-o", tmp_path / "out"
-    ).done()
+    said = asked(armsight, robot, seen, "--plan", 2, "-o", tmp_path / "out", eye="in_hand").done()
     assert "T_flange_rig" in said.out
     assert " ± " in said.out
     assert "poses left out:" in said.out
@@ -230,7 +233,7 @@ def test_streams_with_an_unknown_clock_offset(armsight, tmp_path):
     document, _ = found(armsight, robot, seen, "--streams")
     assert_right(document)
     assert abs(document["clock_offset_s"] - 0.123) < 4 * document["clock_offset_sigma_s"] < 4e-3
-    other = armsight("handeye", "--robot", robot, "--seen", seen, "--eye", "to-hand", "--streams")
+    other = asked(armsight, robot, seen, "--streams", eye="to-hand")
     assert_rejected(other, robot, "these poses fit --eye in-hand, not to-hand")
     large = named(tmp_path / "c.csv", head, np.hstack([t_hand[:, None], 39.37 * A[:, :3, 3], quaternions(A)]))
     document, notes = found(armsight, large, seen, "--streams", "--columns", "units=detect")
@@ -243,9 +246,7 @@ def test_millimetres_are_rejected_or_detected(armsight, tmp_path, seen):
     A = A.copy()
     A[:, :3, 3] *= 1e3
     robot = matrices(tmp_path / "robot.txt", A)
-    assert_rejected(
-        armsight("handeye", "--robot", robot, "--seen", seen, "--eye", "in-hand"), robot, "millimetres", "units=mm"
-    )
+    assert_rejected(asked(armsight, robot, seen), robot, "millimetres", "units=mm")
     document, notes = found(armsight, robot, seen, "--columns", "units=detect")
     assert "read as millimetres" in notes
     assert_right(document)
@@ -253,18 +254,8 @@ def test_millimetres_are_rejected_or_detected(armsight, tmp_path, seen):
     cm[:, :3, 3] *= 10  # of a world a tenth as large: no length is beyond what metres may be
     tenth = A.copy()
     tenth[:, :3, 3] *= 1e-4
-    given = (
-        "handeye",
-        "--robot",
-        matrices(robot, tenth),
-        "--seen",
-        matrices(tmp_path / "cm.txt", cm),
-        "--eye",
-        "in-hand",
-    )
-    assert_rejected(
-        armsight(*given), "centimetres taken for metres: correct seen:units, or give --columns units=detect"
-    )
+    said = asked(armsight, matrices(robot, tenth), matrices(tmp_path / "cm.txt", cm))
+    assert_rejected(said, "centimetres taken for metres: correct seen:units, or give --columns units=detect")
     document, notes = found(armsight, robot, tmp_path / "cm.txt", "--columns", "units=detect")
     assert "the target's lengths are centimetres taken for metres; converted" in notes
     np.testing.assert_allclose(np.array(document["T_flange_rig"])[:3, 3], X[:3, 3] / 10, atol=1e-3)
@@ -274,8 +265,7 @@ def test_millimetres_are_rejected_or_detected(armsight, tmp_path, seen):
     B = B.copy()
     B[:, :3, 3] *= 0.5
     half = matrices(tmp_path / "half.txt", B)
-    given = ("handeye", "--robot", matrices(robot, motion()[1]), "--seen", half, "--eye", "in-hand")
-    assert_rejected(armsight(*given), "2 times as large as given", "--scale")
+    assert_rejected(asked(armsight, matrices(robot, motion()[1]), half), "2 times as large as given", "--scale")
     document, _ = found(armsight, robot, half, "--scale")
     assert document["target_scale"] == pytest.approx(2.0, rel=0.01)
 
@@ -284,7 +274,7 @@ def test_what_does_not_fit_is_named(armsight, tmp_path, seen):
     q, A, _ = motion()
 
     def rejected(robot, *words, more=(), eye="in-hand", by=seen):
-        assert_rejected(armsight("handeye", "--robot", robot, "--seen", by, "--eye", eye, *more), robot, *words)
+        assert_rejected(asked(armsight, robot, by, *more, eye=eye), robot, *words)
 
     path = tmp_path / "robot.txt"
     rejected(matrices(path, np.roll(A, 1, axis=0)), "shifted by 1 against the images")
@@ -340,7 +330,7 @@ def test_motions_that_leave_a_direction_open_are_rejected_as_such(armsight, tmp_
     two[:, :3, 3] += rng.normal(0, 0.1, (16, 3))
     for Ts, said in ((shifted, "hardly rotates"), (about_z, "about one axis only"), (two, "about one axis only")):
         seen = matrices(tmp_path / "seen.txt", inverse(Ts @ X) @ Z @ noise)
-        assert_rejected(armsight("handeye", "--robot", matrices(path, Ts), "--seen", seen, "--eye", "in-hand"), said)
+        assert_rejected(asked(armsight, matrices(path, Ts), seen), said)
 
 
 def test_many_blunders_ask_whether_the_rows_belong_together(armsight, tmp_path):
@@ -348,11 +338,11 @@ def test_many_blunders_ask_whether_the_rows_belong_together(armsight, tmp_path):
     for k, off in zip((2, 5, 8, 11, 14, 17), np.random.default_rng(3).normal(0, 1, (6, 6)), strict=True):
         B[k] = B[k] @ exp_se3(off * np.repeat([0.1, 0.5], 3))
     robot, seen = matrices(tmp_path / "robot.txt", A), matrices(tmp_path / "seen.txt", B)
-    said = armsight("handeye", "--robot", robot, "--seen", seen, "--eye", "in-hand")
+    said = asked(armsight, robot, seen)
     assert said.code == 3
     assert "blunders, left out: 6" in said.out
     assert "do not trust this result: 6 of 20 poses are blunders, more than slips: do the rows belong" in said.out
-    said = armsight("handeye", "--robot", robot, "--seen", seen, "--eye", "in-hand", "--json", "-o", tmp_path / "out")
+    said = asked(armsight, robot, seen, "--json", "-o", tmp_path / "out")
     assert said.code == 3
     assert said.lines[0]["untrusted"][0].startswith("6 of 20 poses are blunders")
     assert "do not trust this result: 6 of 20" in (tmp_path / "out" / "report.html").read_text()
@@ -387,7 +377,7 @@ def test_rows_shifted_where_an_arm_moves_in_equal_steps_are_no_blunders(armsight
     seen, path = matrices(tmp_path / "seen.txt", B), tmp_path / "robot.txt"
 
     def rejected(Ts, *words):
-        said = armsight("handeye", "--robot", matrices(path, Ts), "--seen", seen, "--eye", "in-hand")
+        said = asked(armsight, matrices(path, Ts), seen)
         assert_rejected(said, path, *words)
 
     rejected(np.roll(A, 1, axis=0), "shifted by 1 against the images; robot.txt line 2 belongs to line 1")
@@ -402,7 +392,7 @@ def test_readings_of_rotations_axes_and_units(armsight, tmp_path, seen):
     path = tmp_path / "robot.txt"
 
     def rejected(robot, *words, more=(), by=seen):
-        said = armsight("handeye", "--robot", robot, "--seen", by, "--eye", "in-hand", *more)
+        said = asked(armsight, robot, by, *more)
         assert_rejected(said, *words)
 
     other = A.copy()
@@ -433,19 +423,14 @@ def test_readings_of_rotations_axes_and_units(armsight, tmp_path, seen):
     rejected(
         matrices(path, other),
         "are some rows in millimetres?",
-        more=(
-            "--columns",
-            "units=detect",
-        ),
+        more=("--columns", "units=detect"),
     )
     head, arm = ",".join(f"q{i}_deg" for i in range(1, 7)), ("--model", "six_r")
     rejected(named(path, head, np.degrees(q + np.pi / 2 * np.eye(6)[2])), "another zero", "add -90 deg to q3", more=arm)
     ur = open_arm("ur3").home + q
     flange = open_arm("ur3").forward(ur)
     by = matrices(tmp_path / "ur.txt", inverse(flange @ X) @ Z @ exp_se3(np.full((14, 6), 1e-4)))
-    said = armsight(
-        "handeye", "--robot", named(path, head, np.degrees(ur)), "--seen", by, "--eye", "in-hand", "--model", "ur3e"
-    )
+    said = asked(armsight, named(path, head, np.degrees(ur)), by, "--model", "ur3e")
     assert "fit --model ur3" in said.err
     half = np.loadtxt(by).reshape(-1, 4, 4)
     half[:, :3, 3] *= 0.5
@@ -551,12 +536,10 @@ def test_a_tcp_taken_for_the_flange_is_noted_where_the_joints_are_known(armsight
 def test_a_damaged_table_is_one_line(armsight, tmp_path, seen, text, words):
     robot = tmp_path / "robot.csv"
     robot.write_text(text)
-    assert_rejected(armsight("handeye", "--robot", robot, "--seen", seen, "--eye", "in-hand"), robot, *words)
+    assert_rejected(asked(armsight, robot, seen), robot, *words)
     if "rotation=wxyz" in words[0]:  # the option that names the table which is meant
         said = [f"seen:{word}" for word in words[0].split(" or ")]
-        assert_rejected(
-            armsight("handeye", "--robot", seen, "--seen", robot, "--eye", "in-hand"), robot, " or ".join(said)
-        )
+        assert_rejected(asked(armsight, seen, robot), robot, " or ".join(said))
 
 
 @pytest.mark.parametrize(
@@ -654,7 +637,7 @@ def test_a_mounting_that_is_hardly_known_is_answered_and_not_to_be_trusted(armsi
     A = exp_se3(w)
     B = inverse(A @ X) @ Z @ exp_se3(rng.normal(0, [1.5e-3] * 3 + [6e-3] * 3, (8, 6)))
     robot, seen = matrices(tmp_path / "robot.txt", A), matrices(tmp_path / "seen.txt", B)
-    said = armsight("handeye", "--robot", robot, "--seen", seen, "--eye", "in-hand", "--json")
+    said = asked(armsight, robot, seen, "--json")
     assert said.code == 3
     assert 0.02 < said.lines[0]["worst_sigma_m"] < 0.5
     assert re.match(

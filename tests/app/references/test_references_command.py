@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from armsight.app.references import command
+from armsight.app.references import report
 from armsight.errors import InputError
 from armsight.geometry.pose import exp_se3, inverse, log_se3
 from armsight.geometry.rotation import quaternion_wxyz
@@ -110,7 +110,7 @@ def test_calibrate_finds_the_sensor_and_writes_what_check_reads(sweep, capsys, t
 
 def test_a_sweep_that_rotates_the_tool_little_is_said(sweep, capsys, monkeypatch):
     folder, _, _ = sweep
-    monkeypatch.setattr(command, "SMALL_DEG", 200.0)
+    monkeypatch.setattr(report, "SMALL_DEG", 200.0)
     given = "references", "calibrate", folder / "references.toml", "--poses", folder / "poses.csv", "--json"
     (weak,) = said_of(capsys, *given, kind="inertial").lines[0]["weak"]
     assert re.search(
@@ -209,7 +209,7 @@ def test_a_magnetometer_is_checked_and_calibrated_and_other_units_are_named(caps
     assert found["left_out_over_sigma"] == pytest.approx(1.0, abs=0.3)
     assert found["noise_factor"]["field"] > 0.9
     assert run("references", "check", tmp_path / "out.toml") == 0
-    monkeypatch.setattr(command, "SMALL_DEG", 200.0)
+    monkeypatch.setattr(report, "SMALL_DEG", 200.0)
     said = said_of(capsys, "references", "calibrate", tmp_path / "out.toml", *given[:2])
     assert "the iron of m may be off by more than sigma" in said.out + said.err  # it has no lever
     said = said_of(capsys, "references", "calibrate", tmp_path / "micro.toml", *given[:2])
@@ -267,7 +267,7 @@ def test_a_range_is_checked_and_calibrated_and_what_is_wrong_with_it_is_named(ca
     both = "".join((tmp_path / f"{name}_found.toml").read_text() for name in ("wire", "other"))
     swapped = both.replace("wire.csv", "that.csv").replace("other.csv", "wire.csv").replace("that.csv", "other.csv")
     (tmp_path / "swapped.toml").write_text(swapped)
-    monkeypatch.setattr(command, "SMALL_DEG", 200.0)
+    monkeypatch.setattr(report, "SMALL_DEG", 200.0)
     (tmp_path / "both.toml").write_text(both)
     (weak, *_) = calibrate("both").done().lines[0]["weak"]
     assert "the tool's point of wire and the tool's point of other may be off" in weak
@@ -285,7 +285,7 @@ def test_a_range_is_checked_and_calibrated_and_what_is_wrong_with_it_is_named(ca
         assert text in said.err
     said = said_of(capsys, "references", "check", tmp_path / "coarse.toml", "--json", kind="range").lines[0]
     assert said["weak"] == []  # at rest a step of 10 mm repeats, and a noise of 50 mm is no drift
-    assert said["references"][0]["drift_m"][0] > command.RESTS["range"][2]
+    assert said["references"][0]["drift_m"][0] > report.RESTS["range"][2]
     said = said_of(capsys, "references", "check", tmp_path / "mm.toml")
     assert (said.code, "as if in mm; give m" in said.err) == (2, True)
 

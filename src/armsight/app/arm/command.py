@@ -12,7 +12,7 @@ import click
 
 from armsight.app.options import JSON, SEED, argument, declared, option, out
 from armsight.errors import InputError
-from armsight.files import as_input_error, check_suffix, check_writable, read_text, write_text
+from armsight.files import as_input_error, check_folder, check_suffix, check_writable, read_text, read_toml, write_text
 
 if TYPE_CHECKING:
     from armsight.app.arm.description import Shown
@@ -30,6 +30,12 @@ _ANGLES = argument("Q1 Q2 ...")
 
 def _print(shown: Shown, as_json: bool) -> None:
     click.echo(json.dumps(shown[0]) if as_json else "\n".join(shown[1]))
+
+
+def _open(name: str) -> Arm:
+    from armsight.robot.arm_file import open_arm
+
+    return open_arm(name)
 
 
 def _note(text: str) -> None:
@@ -76,9 +82,8 @@ def show(
 
     from armsight.app.arm import description
     from armsight.app.arm.figure import write_arm_figure
-    from armsight.robot.arm_file import open_arm
 
-    arm = open_arm(arm_name)
+    arm = _open(arm_name)
     if output is not None:
         write_arm_figure(arm, output)
     _print(description.show(arm), as_json)
@@ -93,9 +98,8 @@ def fk(arm_name: str = _ARM, angles: tuple[str, ...] = _ANGLES, as_json: bool = 
     """
     from armsight.app.arm import description
     from armsight.loop.identify.corrected import is_corrected, open_corrected
-    from armsight.robot.arm_file import open_arm
 
-    arm = open_arm(arm_name)
+    arm = _open(arm_name)
     q = _joints(arm, angles)
     T = arm.forward(q)
     if is_corrected(arm_name):
@@ -112,9 +116,8 @@ def fk(arm_name: str = _ARM, angles: tuple[str, ...] = _ANGLES, as_json: bool = 
 def jacobian(arm_name: str = _ARM, angles: tuple[str, ...] = _ANGLES, as_json: bool = JSON) -> None:
     """Print the Jacobian of the tool's point in base axes at joint angles, in degrees."""
     from armsight.app.arm import description
-    from armsight.robot.arm_file import open_arm
 
-    arm = open_arm(arm_name)
+    arm = _open(arm_name)
     _print(description.jacobian(arm, _joints(arm, angles)), as_json)
 
 
@@ -133,9 +136,8 @@ def ik(
     from armsight.app.arm import description
     from armsight.geometry.pose import pose
     from armsight.geometry.rotation import from_euler_zyx
-    from armsight.robot.arm_file import open_arm
 
-    arm = open_arm(arm_name)
+    arm = _open(arm_name)
     if len(_no_options(numbers)) != len(_POSE):
         raise InputError(f"a pose is six numbers, {' '.join(_POSE)} (mm, degrees); {len(numbers)} were given")
     x, y, z, *euler = (_number(text, name) for text, name in zip(numbers, _POSE, strict=True))
@@ -153,10 +155,9 @@ def urdf(
     """Write an arm as a URDF file."""
     _check_written(output, arm_name, suffix=".urdf", what="an arm")
 
-    from armsight.robot.arm_file import open_arm
     from armsight.robot.urdf.write import write_urdf
 
-    arm = open_arm(arm_name)
+    arm = _open(arm_name)
     write_urdf(arm, output)
     _print(({"arm": arm.name, "output": str(output)}, [str(output)]), as_json)
 
@@ -181,8 +182,7 @@ def calibrated(
     a corrected.toml of `armsight identify`, or another arm's file.
     """
     from armsight.app.arm import description
-    from armsight.files import read_toml
-    from armsight.robot.arm_file import open_arm, tool_moved
+    from armsight.robot.arm_file import tool_moved
     from armsight.robot.calibration_file import difference, read_calibration, with_tool_of, write_calibration
     from armsight.robot.urdf.write import write_urdf
 
@@ -190,8 +190,8 @@ def calibrated(
         if output.suffix not in (".urdf", ".yaml"):
             raise InputError(f"{output}: an arm is written as .urdf or .yaml")
         _check_written(output, arm_name, file)
-    nominal = open_arm(arm_name)
-    arm = read_calibration(file, nominal) if file.lower().endswith((".yaml", ".yml", ".conf")) else open_arm(file)
+    nominal = _open(arm_name)
+    arm = read_calibration(file, nominal) if file.lower().endswith((".yaml", ".yml", ".conf")) else _open(file)
     sigma_m = None
     if arm.source.startswith("identified:"):
         known = tool_moved(file, read_toml(file))[1]
@@ -231,9 +231,8 @@ def plan(
 
     from armsight.app.arm.evaluate import plan_report, seen_angles
     from armsight.app.check.plan import seen_by
-    from armsight.robot.arm_file import open_arm
 
-    arm = open_arm(arm_name)
+    arm = _open(arm_name)
     text, extent = plan_report(arm, seen_angles(around, arm), seen_by(around), poses=poses, cycles=cycles, seed=seed)
     write_text(output, text)
     size = " x ".join(f"{100 * each:.0f}" for each in extent) + " cm"
@@ -264,7 +263,6 @@ def report(
     from armsight.app.arm.report import FILES, arm_report, read_report, write_report
     from armsight.app.progress import steps
     from armsight.app.show.plotting import require_matplotlib
-    from armsight.files import check_folder
 
     if output is not None:
         require_matplotlib()

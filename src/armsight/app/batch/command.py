@@ -8,6 +8,7 @@ from pathlib import Path
 import click
 
 from armsight.app.options import ESTIMATOR, JSON, argument, declared, option, out
+from armsight.errors import InputError
 
 OPERATIONS = ("measure", "replay", "identify", "check")
 REPORT = "report"
@@ -43,7 +44,6 @@ def command(
     """
     from armsight.app.batch.run import Batch, run_batch
     from armsight.app.batch.work import BatchOptions
-    from armsight.errors import InputError
 
     if operation == REPORT:
         _report(recordings, as_json)
@@ -76,7 +76,6 @@ def _report(folders: tuple[str, ...], as_json: bool) -> None:
     """Print which cells of a batch differ."""
     from armsight.app.batch.report import lines, report, to_json
     from armsight.app.batch.run import require_dask
-    from armsight.errors import InputError
 
     require_dask()
     if len(folders) != 1:

@@ -14,10 +14,12 @@ from typing import TYPE_CHECKING
 import click
 from click.core import ParameterSource
 
-from armsight.app.board.flash import FLASHED, PROGRAMMERS
+from armsight.app.board.flash import FLASHED, PROGRAMMERS, build_firmware, flash, package_build
 from armsight.app.options import JSON, SECONDS, argument, declared, option, out
+from armsight.app.progress import steps
 from armsight.app.show.messages import UNTRUSTED
 from armsight.errors import DeviceError, InputError
+from armsight.files import check_folder, unused, write_text
 
 if TYPE_CHECKING:
     from armsight.app.board.bringup import Operator
@@ -41,8 +43,6 @@ STEPS = {
 
 def _new_offsets_file() -> Path:
     """Return where old offsets are kept: a file that is not there yet."""
-    from armsight.files import unused
-
     return unused(Path("old_offsets.json"))
 
 
@@ -108,8 +108,6 @@ def build_(
     """Build the firmware: for the emulated boards where armsight finds it, or a real board's image into a folder."""
     from armsight import firmware
     from armsight.app.board import text
-    from armsight.app.board.flash import build_firmware, package_build
-    from armsight.app.progress import steps
     from armsight.firmware import build
 
     with steps() as progress:
@@ -131,8 +129,6 @@ def flash_(
 ) -> None:
     """Build a board's firmware and write it to the board; what the board stored stays."""
     from armsight.app.board import text
-    from armsight.app.board.flash import build_firmware, flash
-    from armsight.app.progress import steps
 
     with steps() as progress:
         progress("compiling")
@@ -222,7 +218,6 @@ def selftest_(
     """
     from armsight.app.board import text
     from armsight.app.board.selftest import selftest
-    from armsight.app.progress import steps
     from armsight.robot.board_registry import SERIAL
 
     if name.startswith(SERIAL):
@@ -267,7 +262,6 @@ def bringup(
     from armsight.app.board.bringup import CONFIG_FILE, FOUND_FILE, Bringup, TerminalOperator
     from armsight.app.show.page import PAGE, writable_folder
     from armsight.app.show.plotting import require_matplotlib
-    from armsight.files import check_folder
     from armsight.robot.board_registry import SERIAL, emulator_name
     from armsight.robot.boards.board import Board
     from armsight.robot.boards.emulated import EmulatedLink
@@ -499,7 +493,6 @@ def get(
     name: str = _BOARD, output: Path | None = out("FILE", "Write it there.", kind="^board *="), as_json: bool = JSON
 ) -> None:
     """Print the configuration in use as a board.toml, or write it to a file."""
-    from armsight.files import write_text
     from armsight.robot.boards.board_file import configuration_text, entries
 
     with _open(name) as board:

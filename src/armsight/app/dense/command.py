@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from armsight.app.options import JSON, argument, declared, option, out
+from armsight.app.progress import bar
 from armsight.errors import ArmsightError, InputError
 from armsight.files import check_folder
 from armsight.vision.dense import METHODS, open_method
@@ -65,7 +66,6 @@ def match(
     """
     from armsight.app.dense.files import RESULT_FILES
     from armsight.app.dense.run import check_near, problem_line, read_pair, result_line, run_shot, search_of
-    from armsight.app.progress import bar
     from armsight.vision.sources import open_source
 
     form, pair = _arguments(paths, source, max_disparity, near)
@@ -143,7 +143,6 @@ def evaluate(
     With OUT: table.csv, and for each scene and method an error map and the disparities in colour.
     """
     from armsight.app.dense.evaluate import evaluate_scene, evaluation_json, table_text, write_evaluation
-    from armsight.app.progress import bar
     from armsight.vision.dense.middlebury import find_scenes, load_scene
 
     if output is not None:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import click
 
 from armsight.app.options import JSON, SEED, declared, option, out
+from armsight.app.progress import steps
 from armsight.errors import InputError
 from armsight.files import as_input_error, check_folder, check_writable, write_text
 
@@ -56,7 +57,6 @@ def command(
 
     from armsight.app.identify.report import identify_report, write_results
     from armsight.app.identify.run import FILES, run_identify
-    from armsight.app.progress import steps
     from armsight.app.show.plotting import require_matplotlib
     from armsight.loop.identify.read import read_measured
     from armsight.robot.arm_file import open_arm, split_arm
@@ -119,7 +119,6 @@ def plan(
             raise InputError(f"{output}: poses are written as .csv; name it so")
         check_writable(output, apart_from=(data, rig))
 
-    from armsight.app.progress import steps
     from armsight.loop.identify.plan import plan_joints
     from armsight.loop.identify.read import read_poses
     from armsight.robot.arm_file import open_arm

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from armsight.app.options import ARM, CELL, FOLLOW_RIG, JSON, SEED, STREAM, declared, option, out
+from armsight.app.options import ARM, CELL, FOLLOW_RIG, JSON, SEED, SIM, STREAM, declared, option, out
 from armsight.app.show.messages import require
 from armsight.errors import InputError
 
@@ -70,7 +70,6 @@ def command(
     from armsight.app.live.server import LiveServer
     from armsight.app.live.session import LiveSession
     from armsight.app.live.step import SessionOptions
-    from armsight.app.options import SIM
     from armsight.app.show.http import HERE, host_and_port
     from armsight.app.stream.datum import Published
     from armsight.app.stream.streams import open_streams

@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING
 import click
 
 from armsight.app.options import ARM, FIXED, FOLLOW_RIG, JSON, LOGGED, REFERENCES, SIM, STREAM, declared, option, out
-from armsight.app.show.messages import UNTRUSTED, require
+from armsight.app.progress import steps
+from armsight.app.show.messages import UNTRUSTED, colour, require, weak
 from armsight.errors import InputError
-from armsight.files import read_text, write_text
+from armsight.files import columns_unused, read_text, write_text
 
 if TYPE_CHECKING:
     from armsight.robot.kinematics.arm import Arm
@@ -78,7 +79,6 @@ def command(
         )
         return
 
-    from armsight.app.progress import steps
     from armsight.app.run.devices import Devices, open_devices, planned_for
     from armsight.app.run.experiment import require_followed, require_start
     from armsight.app.run.folder import finish, open_folder, run_in
@@ -150,13 +150,10 @@ def _run_logged(
     """Calibrate hand and eye from a recording and the joint angles that were logged beside it."""
     import contextlib
 
-    from armsight.app.progress import steps
     from armsight.app.run.angles import read_angles
     from armsight.app.run.folder import open_folder
     from armsight.app.run.logged import run_logged, summary_lines, write_logged
-    from armsight.app.show.messages import colour, weak
     from armsight.app.show.plotting import require_matplotlib
-    from armsight.files import columns_unused
     from armsight.robot.arm_file import open_arm
     from armsight.vision.markers.targets import open_target
     from armsight.vision.rig import StereoRig
