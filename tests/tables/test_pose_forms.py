@@ -4,6 +4,7 @@ Every text is built here from the same poses by SciPy's rotations, in the form t
 """
 
 import json
+import math
 
 import numpy as np
 import pytest
@@ -605,8 +606,14 @@ def test_each_program_gives_the_same_joints(tmp_path, form):
         ),
         (
             "a.json",
-            '[{"T": [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}, {"T": null}]',
+            '[{"T": [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}, {"T": "none"}]',
             "record 2 of 2 holds a mapping of T, and no pose",
+        ),
+        ("a.json", '[{"T": null}, null]', "and no poses"),
+        (
+            "a.csv",
+            "x_m,y_m,z_m,qw,qx,qy,qz\n,,,,,,\nnan,1,2,1,0,0,0\n",
+            "none of 2 rows has a pose; line 2: x_m is empty",
         ),
         (
             "a.json",
@@ -661,3 +668,24 @@ def test_arrays_of_both_sides_are_enough_alone(tmp_path):
     np.savez(one, **sides)
     assert has_both(both)
     assert not has_both(one)
+
+
+@pytest.mark.parametrize("form", ["json", "records", "sixteen", "columns of sixteen", "units", "four lines"])
+def test_a_row_without_a_pose_stays_a_row_in_every_form(tmp_path, form):
+    path, gone = tmp_path / "a.txt", 1
+    nan = [math.nan] * 16
+    if form in ("json", "records"):
+        path = tmp_path / "a.json"
+        each = [None if k == gone else T.tolist() for k, T in enumerate(A)]
+        path.write_text(json.dumps(each if form == "json" else [{"t_s": k, "T": T} for k, T in enumerate(each)]))
+    elif form == "units":
+        cells = [",,,,,," if k == gone else f"{p[0]} mm,{p[1]} mm,{p[2]} mm," + "{},{},{},{}" for k, p in enumerate(MM)]
+        lines = [cell.format(*q) for cell, q in zip(cells, WXYZ, strict=True)]
+        path.write_text("\n".join(["x,y,z,qw,qx,qy,qz", *lines]))
+    else:
+        Ts = [nan if k == gone else (T.T if "columns" in form else T).ravel() for k, T in enumerate(A)]
+        np.savetxt(path, np.reshape(Ts, (-1, 4) if form == "four lines" else (-1, 16)), fmt="%.12f")
+    table = read_pose_table(path, keep_missed=True)
+    assert [k for k, why in enumerate(table.missed) if why] == [gone]
+    kept = np.delete(np.arange(len(A)), gone)
+    np.testing.assert_allclose(table.Ts[kept], A[kept], atol=1e-9)

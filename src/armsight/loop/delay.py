@@ -187,11 +187,10 @@ def time_between(first: PoseTable, second: PoseTable) -> Delay:
 
 
 def _positions(table: PoseTable) -> tuple[Array, Array]:
-    """Return the times (N,) and the positions (N, 3) of the poses of a table that were measured."""
+    """Return the times (N,) and the positions (N, 3) of the poses of a table."""
     if table.t_s is None:
         raise InputError(f"{table.path}: a column t_s is needed")
-    rows = np.array([not why for why in table.missed]) if table.missed else np.ones(len(table.Ts), np.bool_)
-    t, p = table.t_s[rows], table.Ts[rows, :3, 3]
+    t, p = table.t_s, table.Ts[:, :3, 3]
     if len(t) < MIN_MEASUREMENTS or not (np.diff(t) > 0).all():
         raise InputError(f"{table.path}: {MIN_MEASUREMENTS} or more poses in order of time are needed, it has {len(t)}")
     return t, p

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from armsight.errors import InputError
-from armsight.tables.lengths import number
+from armsight.tables.lengths import NO_NUMBER, number
 from armsight.tables.nested import PREFIX
 from armsight.tables.programs import ProgramPoints
 
@@ -31,7 +31,6 @@ _ADVICE = {
 }
 #: Motive's names of units, and Vicon's.
 _UNITS_M = {"meters": 1.0, "centimeters": 0.01, "millimeters": 1e-3, "inches": 0.0254, "m": 1.0, "cm": 0.01, "mm": 1e-3}
-_NONE = ("", "null", "nan")  # a cell, in small letters, of a frame in which the body was not seen
 _LISTED = 5  # damaged lines that a note names; half: one more look at the file, double: a longer note
 _Bodies = dict[str, dict[str, int]]  # name of a body -> our name -> its column
 _Line = tuple[int, list[str]]  # its number and its cells
@@ -50,13 +49,13 @@ class _Export(NamedTuple):
 def capture_rows(path: Path, text: str, side: str, whose: str | None) -> ProgramPoints | None:
     """Return the times and poses of a rigid body; None where the text is no such export.
 
-    Frames that lack it have a status, as the shots of ``armsight measure``; lines that are damaged are left out, and named.
+    The cells of frames that lack it are empty; lines that are damaged are left out, and named.
 
     ``whose``: the name of the body; None: the only one. ``side``: "robot" or "seen", for the option in messages.
 
     Raises:
         InputError: no rigid body, rotations that are not unambiguous, or several bodies; the program and what to export.
-            Frames without a rate.
+            Frames without a rate, or none that is readable.
     """
     if (export := _export(path, text)) is None:
         return None
@@ -77,33 +76,26 @@ def capture_rows(path: Path, text: str, side: str, whose: str | None) -> Program
     columns = [at[name] for name in (*_POSITION, *rotation)]
     read = [(line, _pose(row, columns, unit_m, export.rate_hz)) for line, row in export.frames]
     rows = [(line, cells) for line, cells in read if cells]
-    if not any("ok" in cells for _, cells in rows):
-        raise InputError(f"{said}: none of its {len(read)} frames has a pose of the body")
-    note = f"{path}: read as {program}'s, lengths in {export.unit}{_left_out(read)}"
-    return ProgramPoints(["status", "reason", "t_s", *_POSITION, *rotation], rows, None, (note,))
-
-
-def _left_out(read: list[tuple[int, list[str] | None]]) -> str:
-    """Return in how many frames the body is, and which lines are damaged, for a note."""
-    seen, damaged = sum("ok" in (cells or ()) for _, cells in read), [str(line) for line, cells in read if not cells]
-    text = f"; the body is in {seen} of {len(read)} frames" if seen < len(read) else ""
-    if damaged:
+    if not rows:
+        raise InputError(f"{said}: none of its {len(read)} frames is readable: export it again")
+    note = f"{path}: read as {program}'s, lengths in {export.unit}"
+    if damaged := [str(line) for line, cells in read if not cells]:
         more = f" and {len(damaged) - _LISTED} more" if len(damaged) > _LISTED else ""
-        text += f"; damaged: line {', '.join(damaged[:_LISTED])}{more}"
-    return text
+        note += f"; damaged: line {', '.join(damaged[:_LISTED])}{more}"
+    return ProgramPoints(["t_s", *_POSITION, *rotation], rows, None, (note,))
 
 
 def _pose(row: list[str], columns: list[int], unit_m: float, rate_hz: float | None) -> list[str] | None:
-    """Return a frame's status, reason, time, position, m, and rotation; None where the line is damaged."""
+    """Return a frame's time, position, m, and rotation, empty without the body; None where the line is damaged."""
     cells = [row[k] if k < len(row) else "" for k in columns]
-    seen = [cell for cell in cells if cell.lower() not in _NONE]
+    seen = [cell for cell in cells if cell.lower() not in NO_NUMBER]
     found = [value for cell in (*row[:2], *seen) if (value := number(cell)) is not None and math.isfinite(value)]
     if len(found) < 2 + len(seen):
         return None
     t_s = found[1] if rate_hz is None else found[0] / rate_hz
     if len(seen) < len(cells) or not any(found[5:]):
-        return ["missed", "the body was not seen", repr(t_s), *[""] * len(cells)]
-    return ["ok", "", repr(t_s), *(repr(unit_m * value) for value in found[2:5]), *cells[3:]]
+        return [repr(t_s), *[""] * len(cells)]
+    return [repr(t_s), *(repr(unit_m * value) for value in found[2:5]), *cells[3:]]
 
 
 def _export(path: Path, text: str) -> _Export | None:

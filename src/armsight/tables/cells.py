@@ -12,7 +12,7 @@ import numpy as np
 from armsight.errors import InputError, nearest
 from armsight.files import DECIMAL_COMMA, TABLE_MB, natural_key, read_table, read_text
 from armsight.tables.capture import capture_rows
-from armsight.tables.lengths import NUMBER, number
+from armsight.tables.lengths import NO_NUMBER, NUMBER, number
 from armsight.tables.nested import BY_COUNT, PACKED, document_rows, is_document, is_packed
 from armsight.tables.programs import program_rows
 
@@ -218,10 +218,17 @@ def _is_head(head: list[str], rows: Rows) -> bool:
 
 
 def _with_content(cells: list[list[str]]) -> list[tuple[int, list[str]]]:
-    """Return the rows that are neither empty nor comments, with their lines; without an empty cell behind the last."""
+    """Return the rows that are neither blank nor comments, with their lines; without an empty cell behind the last.
+
+    A row of separators alone is one without a pose; above the first row with content, and beneath the last, it is none.
+    """
     rows = [(line, [cell.strip() for cell in row]) for line, row in enumerate(cells, 1)]
-    rows = [(line, row) for line, row in rows if any(row) and not row[0].startswith("#")]
+    rows = [(line, row) for line, row in rows if len(row) > 1 or any(row)]
+    rows = [(line, row) for line, row in rows if not row[0].startswith("#")]
+    filled = [k for k, (_, row) in enumerate(rows) if any(row)]
+    rows = rows[filled[0] : filled[-1] + 1] if filled else []
     count = len(rows[0][1]) - (rows[0][1][-1] == "") if rows else 0
+    rows = [(line, row if any(row) else [""] * count) for line, row in rows]
     return [(line, row[:-1] if len(row) == count + 1 and row[-1] == "" else row) for line, row in rows]
 
 
@@ -264,7 +271,7 @@ def _lists(path: Path, written: list[tuple[int, str]]) -> Rows:
 def _without_names(path: Path, rows: Rows) -> Cells:
     """Return columns that have no names, named by how many they are."""
     if len(rows[0][1]) == 4:
-        rows = _matrices(path, _even(path, rows, 4))
+        rows = _matrices(path, _even(path, [each for each in rows if any(each[1])], 4))
     count = len(rows[0][1])
     if head := _echoed(rows):
         times = [f"{row[0]}.{row[1]:0>9}" for _, row in _even(path, rows, count)]
@@ -295,15 +302,15 @@ def _echoed(rows: Rows) -> list[str]:
 
 
 def _is_last(cells: list[str]) -> bool | None:
-    """Return whether cells are the last row of a matrix, 0 0 0 1; None where one is no number."""
-    numbers = [number(cell) for cell in cells]
-    return None if None in numbers else bool(np.allclose(np.array(numbers, float), [0, 0, 0, 1], atol=1e-6))
+    """Return whether cells are the last row of a matrix, 0 0 0 1; None where one is no finite number."""
+    numbers = np.array([number(cell) for cell in cells], float)
+    return bool(np.allclose(numbers, [0, 0, 0, 1], atol=1e-6)) if np.isfinite(numbers).all() else None
 
 
 def _row_major(path: Path, cells: Cells) -> Cells:
     """Return matrices of 16 numbers row by row; those of Franka's O_T_EE, Eigen's and MATLAB's are column by column."""
     rowwise = [_is_last(row[12:]) for _, row in cells.rows]
-    if not all(rowwise) and all(_is_last(row[3::4]) for _, row in cells.rows):
+    if False in rowwise and False not in [_is_last(row[3::4]) for _, row in cells.rows]:
         order = np.arange(16).reshape(4, 4).T.ravel()
         note = f"{path}: its matrices are column by column (0 0 0 1 is the last of every four numbers), and read so"
         return cells._replace(rows=[(line, [row[k] for k in order]) for line, row in cells.rows], notes=(note,))
@@ -323,7 +330,7 @@ def _matrices(path: Path, rows: Rows) -> Rows:
     )
     count = 4 if columnwise or any(_is_last(row) for _, row in rows) else 3  # three of [R p] never end so
     for line, row in rows[3::4] if count == 4 and not columnwise else ():
-        if not _is_last(row):
+        if _is_last(row) is False:
             raise InputError(
                 f"{path}: line {line}: expected 0 0 0 1, the last of a matrix's four lines, found {' '.join(row)[:40]!r}"
             )
@@ -369,14 +376,15 @@ def _without_units(path: Path, cells: Cells) -> Cells:
         found = [_WITH_UNIT.fullmatch(cell) for cell in column]
         if not any(found):
             continue
-        units = {one[2].replace("\N{DEGREE SIGN}", "deg") if one else "" for one in found}
+        filled = [one for one, cell in zip(found, column, strict=True) if cell.lower() not in NO_NUMBER]
+        units = {one[2].replace("\N{DEGREE SIGN}", "deg") if one else "" for one in filled}
         if len(units) > 1:
             raise InputError(
                 f"{path}: column {head[k] or k + 1} has numbers in several units ({', '.join(sorted(units)) or 'none'}): "
                 "write one"
             )
         unit = units.pop()
-        columns[k] = tuple(one[1].replace(",", ".") for one in found if one)
+        columns[k] = tuple("" if one is None else one[1].replace(",", ".") for one in found)
         bare = re.sub(r"\s*[\[(]\w+[\])]$", "", head[k])
         head[k] = (
             head[k] if bare.endswith(f"_{unit}") else {"n1": "rx", "n2": "ry", "n3": "rz"}.get(bare, bare) + f"_{unit}"

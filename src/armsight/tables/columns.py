@@ -24,7 +24,7 @@ from armsight.errors import InputError, nearest
 from armsight.files import is_long, long_rows, read_table
 from armsight.geometry.rotation import nearest_rotation
 from armsight.tables.cells import Rows, renamed
-from armsight.tables.lengths import number
+from armsight.tables.lengths import NO_NUMBER, number
 from armsight.tables.rotations import QUATERNION_OFF, rotations_by
 
 NAMES = ("image", "name", "shot")  # columns whose cells name the rows
@@ -238,6 +238,8 @@ class Columns:
         self.at = {name: k for k, name in enumerate(head) if name}
         self.used: set[str] = set()
         self.links = links
+        #: Why each row has no pose, "" where it has one: such hold another row's numbers; None: they are rejected.
+        self.missed: list[str] | None = None
 
     @classmethod
     def of_csv(cls, path: Path, columns: Mapping[str, str] | Sequence[str] = ()) -> Columns:
@@ -282,7 +284,10 @@ class Columns:
         return ["" if at is None else sys.intern(row[at]) for _, row in self.rows]
 
     def numbers(self, names: Sequence[str], *, gaps: bool = False, empty: bool = False, text: bool = False) -> Array:
-        """Return columns (N, K); NaN with ``empty`` where a cell is empty, ``gaps`` also not finite, ``text`` no number."""
+        """Return columns (N, K); NaN with ``empty`` where a cell is empty, ``gaps`` also not finite, ``text`` no number.
+
+        Where ``missed`` says why rows have no pose, those with gaps are added to it.
+        """
         self.require(*names)
         if len(self.rows) * len(names) > _MOST_NUMBERS:
             raise InputError(
@@ -295,16 +300,33 @@ class Columns:
             values = [math.nan if value is None else value for value in map(number, cells)]
             if not all(map(math.isfinite, values)):
                 if not text:
-                    self._check(line, dict(zip(names, cells, strict=True)), gaps=gaps, empty=empty or gaps)
+                    lax = gaps or self.missed is not None
+                    self._check(line, dict(zip(names, cells, strict=True)), gaps=lax, empty=empty or lax)
                 values = [value if math.isfinite(value) else math.nan for value in values]
             out[i] = values
-        return out
+        return out if gaps or empty or text else self._filled(names, out)
+
+    def _filled(self, names: Sequence[str], numbers: Array) -> Array:
+        """Return numbers (N, K) with those of some row in rows that have gaps, or a rotation of zeros; note why."""
+        if self.missed is None:
+            return numbers
+        good = np.asarray(np.isfinite(numbers).all(axis=1))
+        if {"r11", "qw", "n4"} & set(names):
+            good &= np.asarray(numbers.any(axis=1))
+        for row in np.flatnonzero(~good).tolist():
+            name = names[int(np.argmin(np.isfinite(numbers[row])))]
+            cell = self.rows[row][1][self.at[name]]
+            self.missed[row] = self.missed[row] or f"{self.given[self.at[name]]} is {cell or 'empty'}"
+        if not good.any():
+            raise InputError(f"{self.path}: none of {len(good)} rows has a pose; line {self.line(0)}: {self.missed[0]}")
+        return np.asarray(np.where(good[:, None], numbers, numbers[np.argmax(good)]))
 
     def _check(self, line: int, cells: Mapping[str, str], *, gaps: bool, empty: bool) -> None:
         """Reject a row's cell that is no number, or with no ``gaps`` not finite; ``empty``: it may be empty."""
         for name, cell in cells.items():
             value = number(cell)
-            if (cell or not empty) and (value is None or not (gaps or math.isfinite(value))):
+            blank = cell.lower() in NO_NUMBER if gaps else empty and not cell
+            if not blank and (value is None or not (gaps or math.isfinite(value))):
                 raise InputError(
                     f"{self.path}: line {line}: {self.given[self.at[name]]} is {cell[:40]!r}, not a number; finite numbers "
                     "are needed: correct or remove the line"
@@ -369,7 +391,7 @@ class Columns:
             return None
         self.used.add(key)
         found = tuple(row[self.at[key]] for _, row in self.rows)
-        twice = next((name for name, count in Counter(found).items() if count > 1), None)
+        twice = next((name for name, count in Counter(filter(None, found)).items() if count > 1), None)
         if twice is not None:
             raise InputError(f"{self.path}: {key} {twice!r} names two rows; a row belongs to one image")
         return found

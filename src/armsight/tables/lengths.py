@@ -86,6 +86,10 @@ NUMBER = r"[+\-\u2212]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eEdD][+\-\u2212]?\d+)?"
 _NUMBER = re.compile(NUMBER)
 
 
+#: What stands where a number is missing, in small letters: pandas', SQL's and people's.
+NO_NUMBER = ("", "nan", "null", "none", "na", "n/a", "<na>", "-", "--")
+
+
 def number(text: str) -> float | None:
     """Return a number; NaN and infinities too; None where it is none."""
     try:

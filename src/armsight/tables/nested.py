@@ -99,6 +99,9 @@ def _records(path: Path, document: Any, side: str, whose: str | None) -> list[Re
     records, items = list[Record](), _items(document)
     for k, (item, name) in enumerate(items, 1):
         groups = dict(_poses(item))
+        if not groups and (item is None or (isinstance(item, Mapping) and None in item.values())):
+            records.append({**({} if name is None else {"name": name}), **_beside(item)})
+            continue
         if not groups and records:
             raise InputError(
                 f"{path}: record {k} of {len(items)} holds {_content(item)}, and no pose, as those before it do"
@@ -112,7 +115,7 @@ def _records(path: Path, document: Any, side: str, whose: str | None) -> list[Re
             joints = (one for one in groups.values() if poses and _is_joints(one, r"q\d_(deg|rad)"))
             record |= next(joints, {})
             records.append({**record, **({} if name is None else {"name": name}), **_beside(item)})
-    if not records:
+    if not any(records):
         raise InputError(
             f"{path}: holds {_content(document)}, and no poses: expected a list of matrices, of 6 or 7 numbers, or of "
             "positions beside rotations (translation, rotation), or a table such as x_mm,y_mm,z_mm,qw,qx,qy,qz"
@@ -163,7 +166,7 @@ def _items(node: Any) -> list[tuple[Any, str | None]]:  # noqa: ANN401
         whole = array.ndim < 2 or array.shape in ((4, 4), (3, 4))
         return [(one.tolist(), None) for one in ([array] if whole else array)]
     if isinstance(node, list):
-        found: list[tuple[Any, str | None]] = [(one, None) for one in node if isinstance(one, Mapping | list)]
+        found: list[tuple[Any, str | None]] = [(one, None) for one in node if isinstance(one, Mapping | list | None)]
         return found if len(found) != 1 else _items(found[0][0])
     return _items_of_mapping(node) if isinstance(node, Mapping) else []
 

@@ -4,14 +4,16 @@ In: a file of any form that ``cells.py`` reads. Out: :class:`PoseTable`. The col
 order: ``x_m y_m z_m`` (or ``x_mm``, or ``x`` with ``unit``); ``qw qx qy qz``; or ``rx_deg ry_deg rz_deg`` (or ``rx_rad``,
 or ``rx``); or ``r11 .. r33``; or joints ``q1_deg ..`` (``q1_rad``) of an arm, also by their names. ``t_s`` is a time,
 ``image`` the image that belongs to a row, ``name`` (``shot`` in what ``armsight measure`` writes) a name that both tables
-share; rows whose ``status`` is missed count as shots without a pose. Without names: 16 (or 12) numbers a row, a matrix; 7:
-x, y, z and a quaternion; 6: x, y, z and three numbers of a rotation, whose convention the option ``rotation`` names.
+share. A row whose pose is empty, not finite or a rotation of zeros, or whose ``status`` is not ok, was missed: it counts
+where rows of two tables belong together by their order, and is left out. Without names: 16 (or 12) numbers a row, a
+matrix; 7: x, y, z and a quaternion; 6: x, y, z and three numbers of a rotation, whose convention ``rotation`` names.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Protocol
 
@@ -34,7 +36,8 @@ _, NEAR_M, FAR_M = REACH
 REACH_M = 3.0
 MOST_DEG = 360.0  # an angle in degrees is not larger
 MIXED = 200.0  # lengths that differ by more than this factor in one table are not in one unit
-_MEASURED = {"status", "reason", "x_m"}  # columns of poses of which some may be missed, as of `armsight measure`
+_MEASURED = {"status", "reason", "x_m"}  # columns of what `armsight measure` writes
+_LISTED = 3  # rows that a note names; half: one more look at the file, double: a longer note
 
 
 class ArmJoints(Protocol):
@@ -69,10 +72,30 @@ class PoseTable(Record):
     names: tuple[str, ...] | None = None  #: of the rows, or of their images; None where there are none
     unit_m: float = 1.0  #: the unit that lengths were read in, m
     notes: tuple[str, ...] = ()  #: what was found out while reading
-    #: (N,) why a shot that `armsight measure` wrote has no pose, and another's stands there; "" where it has one
-    missed: tuple[str, ...] = ()
+    missed: tuple[str, ...] = ()  #: (N,) why a row has no pose, and another's stands there; "" where it has one
     of_joints: bool = False  #: whether the poses are those of the joints by the model
     unused: tuple[str, ...] = ()  #: the columns that were not read
+
+    def without_missed(self) -> PoseTable:
+        """Return the rows that have a pose, with a note on the others."""
+        if not any(self.missed):
+            return self
+        gone = [f"line {line} ({why})" for line, why in zip(self.lines, self.missed, strict=True) if why]
+        kept = np.array([not why for why in self.missed])
+        where = ", ".join(gone[:_LISTED]) + (", .." if len(gone) > _LISTED else "")
+        note = f"{self.path}: {len(gone)} of {len(kept)} rows have no pose, and are left out: {where}"
+        return replace(
+            self,
+            lines=self.lines[kept],
+            Ts=self.Ts[kept],
+            numbers=self.numbers[kept],
+            written=self.written[kept],
+            q=None if self.q is None else self.q[kept],
+            t_s=None if self.t_s is None else self.t_s[kept],
+            names=None if self.names is None else tuple(itertools.compress(self.names, kept)),
+            notes=(*self.notes, note),
+            missed=("",) * int(kept.sum()),
+        )
 
 
 def read_pose_table(
@@ -107,7 +130,7 @@ def read_pose_table(
         InputError: the file, the line and what was expected.
     """
     path = Path(path)
-    table, rotation, notes, missed = _table(path, rotation, unit, columns, arm, side, keep_missed)
+    table, rotation, notes = _table(path, rotation, unit, columns, arm, side)
     names = table.joint_names(*((len(arm.joint_names), arm.name) if arm is not None else (None, "")))
     q = table.joints(names) if names else None
     if only_joints and q is None:
@@ -137,9 +160,11 @@ def read_pose_table(
         notes = (*notes, f"{path}: has no joint angles: --model {arm.name} is not used")
     if unused and not only_joints and not set(table.at) >= _MEASURED:
         notes = (*notes, f"{path}: {columns_unused(unused)}")
-    return PoseTable(
+    missed = tuple(table.missed or ())
+    found = PoseTable(
         path, lines, Ts, numbers, written, convention, q, t_s, row_names, unit_m, notes, missed, of_joints, unused
     )
+    return found if keep_missed else found.without_missed()
 
 
 def _table(
@@ -149,9 +174,8 @@ def _table(
     columns: Renames | None,
     arm: ArmJoints | None,
     side: str,
-    keep_missed: bool,
-) -> tuple[Columns, str | None, tuple[str, ...], tuple[str, ...]]:
-    """Return the columns of a file, the convention of its rotations, notes, and why rows of it have no pose."""
+) -> tuple[Columns, str | None, tuple[str, ...]]:
+    """Return the columns of a file, the convention of its rotations, and notes."""
     if rotation is not None and rotation not in CONVENTIONS:
         raise InputError(f"the rotation convention is {rotation!r}; known are {', '.join(CONVENTIONS)}")
     links = () if arm is None else arm.joint_names
@@ -161,16 +185,12 @@ def _table(
         names = ["x", "y", "z", "rx_rad", "ry_rad", "rz_rad"] if len(cells.head) == 6 else cells.head
         cells = cells._replace(head=names, notes=(*cells.notes, *notes))
     table, rotation, notes = columns_in(path, cells, links, unit, rotation)
-    if not set(table.at) >= _MEASURED:
-        return table, rotation, notes, ("",) * len(table.rows)
-    rows, missed = _shown(path, table.head, table.rows)
-    if not keep_missed and any(missed):
-        notes = (*notes, f"{path}: {sum(map(bool, missed))} of {len(rows)} rows have no pose, and are left out")
-        rows = [row for row, why in zip(rows, missed, strict=True) if not why]
-        missed = ("",) * len(rows)
-    table = Columns(path, table.head, rows, table.links, table.given)
-    table.used |= {"status", "reason"}
-    return table, rotation, notes, missed
+    table.missed = [""] * len(table.rows)
+    if set(table.at) >= _MEASURED:
+        table.used |= {"status", "reason"}
+        said = zip(table.texts("status"), table.texts("reason"), strict=True)
+        table.missed = ["" if status == "ok" else reason or status or "no status" for status, reason in said]
+    return table, rotation, notes
 
 
 def columns_in(
@@ -185,17 +205,6 @@ def columns_in(
     head, convention, notes = understood(path, head, links, unit, rotation or cells.rotation)
     rows: Rows = [(line, row) for (line, _), row in zip(cells.rows, body, strict=True)]
     return Columns(path, head, rows, links, cells.head), convention, (*cells.notes, *notes)
-
-
-def _shown(path: Path, head: list[str], rows: Rows) -> tuple[Rows, tuple[str, ...]]:
-    """Return the rows, some pose in those that were missed, and why these have none."""
-    status, reason, first = head.index("status"), head.index("reason"), head.index("x_m")
-    some = next((row for _, row in rows if row[status] == "ok"), None)
-    if some is None:
-        raise InputError(f"{path}: none of {len(rows)} shots was measured; {rows[0][1][reason]}")
-    missed = tuple("" if row[status] == "ok" else row[reason] or row[status] for _, row in rows)
-    filled = [row[:first] + some[first:] if why else row for (_, row), why in zip(rows, missed, strict=True)]
-    return [(line, row) for (line, _), row in zip(rows, filled, strict=True)], missed
 
 
 def _notes_of_lists(

@@ -618,7 +618,7 @@ def test_what_measure_wrote_is_joined_by_the_names_of_its_shots(tmp_path):
     path = named(tmp_path / "measured.csv", "shot,status,reason,t_s,x_m,y_m,z_m,qw,qx,qy,qz", rows)
     found = read_pose_table(path)  # no other shot's pose stands for one that was missed
     np.testing.assert_allclose(found.Ts, np.delete(B, 4, axis=0), atol=1e-9)
-    assert found.notes == (f"{path}: 1 of 14 rows have no pose, and are left out",)
+    assert found.notes == (f"{path}: 1 of 14 rows have no pose, and are left out: line 6 (no body)",)
     assert not any(found.missed)
     table = read_pose_table(path, keep_missed=True)
     np.testing.assert_allclose(np.delete(table.Ts, 4, axis=0), np.delete(B, 4, axis=0), atol=1e-9)
@@ -629,6 +629,28 @@ def test_what_measure_wrote_is_joined_by_the_names_of_its_shots(tmp_path):
     of_robot, of_seen = matched_rows(images, table.names)
     assert [table.names[k] for k in of_seen] == [Path(images.names[k]).stem for k in of_robot]
     assert of_seen[0] == 13
+
+
+@pytest.mark.parametrize("gap", [",,,,,,", "nan,nan,nan,nan,nan,nan,nan", "0.1,0.2,0.3,0,0,0,0", "1,2,3,NULL,,-,N/A"])
+def test_rows_without_a_pose_on_either_side_are_left_out_and_the_others_stay_paired(tmp_path, gap):
+    """By order: a tracker that lost the body, a robot that was not asked."""
+    A, B = motion()[1:]
+    tables = []
+    for name, Ts, gone in (("robot.csv", A, (2, 7)), ("seen.csv", B, (4, 7))):
+        rows = [",".join(map(repr, row)) for row in np.hstack([Ts[:, :3, 3], quaternions(Ts)]).tolist()]
+        path = tmp_path / name
+        path.write_text("\n".join(["x_m,y_m,z_m,qw,qx,qy,qz", *(gap if k in gone else r for k, r in enumerate(rows))]))
+        tables.append(read_pose_table(path, side=name[:-4], keep_missed=True))
+    robot, seen = tables
+    pairs = paired(robot, seen_in_table(seen), True, None)
+    kept = [k for k in range(14) if k not in (2, 4, 7)]
+    np.testing.assert_array_equal(pairs.rows, kept)
+    np.testing.assert_allclose(pairs.poses.A, A[kept], atol=1e-9)
+    np.testing.assert_allclose(pairs.poses.B, B[kept], atol=1e-9)
+    said = "\n".join(pairs.notes)
+    assert f"{robot.path}: no pose in line 4 (" in said
+    assert "no target in line 6 (" in said
+    assert len(read_pose_table(robot.path).Ts) == 12
 
 
 def test_a_mounting_that_is_hardly_known_is_answered_and_not_to_be_trusted(armsight, tmp_path):

@@ -165,11 +165,24 @@ def test_motion_is_not_for_logged_poses(armsight, setting, tmp_path):
     assert_rejected(run(armsight, tmp_path), "angles.csv: no such file")
 
 
+def test_a_row_without_angles_is_a_shot_without_and_the_others_stay_in_order(tmp_path):
+    path = table(tmp_path / "a.csv", DEG, [[10.0] * 6, ["nan"] * 6, [""] * 6, [30.0] * 6])
+    angles = read_angles(path, open_arm("six_r"))
+    found = angles.at(["a", "b", "c", "d"], [None] * 4)
+    assert [q is None for q in found] == [False, True, True, False]
+    np.testing.assert_allclose(np.degrees([found[0], found[3]]), [[10.0] * 6, [30.0] * 6])
+    assert (
+        "2 of 4 rows have no pose, and are left out: line 3 (q1_deg is nan), line 4 (q1_deg is empty)"
+        in angles.notes[0]
+    )
+
+
 def test_angles_far_apart_in_time_are_not_interpolated(tmp_path):
     rows = [[0.0, *[0.0] * 6, 1], [1.0, *[10.0] * 6, 2], [1.1, *[20.0] * 6, 3]]
     path = table(tmp_path / "a.csv", ["t_s", *DEG, "elbow_flex.pos"], rows)
     angles = read_angles(path, open_arm("six_r"))
-    assert angles.unused == ("elbow_flex.pos",)
+    assert len(angles.notes) == 1
+    assert "elbow_flex.pos" in angles.notes[0]
     before, within, exact = angles.at(["a", "b", "c"], [0.5, 1.05, 1.0])
     assert before is None
     assert np.degrees(within) == pytest.approx(15.0)

@@ -87,7 +87,7 @@ def test_lines_of_a_serial_port_may_be_cut(board, monkeypatch):
 def fed(board, monkeypatch):
     """Return what gives a sensor lines (arrival, s, line), after which its port is lost: times (N,), s, and the losses."""
 
-    def feed(lines):
+    def feed(lines, values=False):
         now, left = [lines[0][0]], iter(lines)
 
         def read():
@@ -99,11 +99,12 @@ def fed(board, monkeypatch):
         monkeypatch.setattr(LiveReadings, "_opened", lambda self, spec: read)
         readings = LiveReadings(replace(ENTRY, live="udp:1"), board, lambda: now[0])
         readings._thread.join()
-        t_s = readings(np.inf)[0] + 5.0  # of the board's clock
+        t_s, z = readings(np.inf)
+        t_s += 5.0  # of the board's clock
         assert readings.losses.pop("it was lost: unplugged") == 1
         unit = Fused(ENTRY, readings, readings.losses)
         readings.close()
-        return t_s, unit.losses
+        return (t_s, z) if values else (t_s, unit.losses)
 
     return feed
 
@@ -160,6 +161,17 @@ def test_lines_that_are_late_do_not_move_the_clock(fed):
     t_s, losses = fed([(105.0, line(7.0)), (106.9, line(8.9)), *late, (109.1, line(11.1))])
     np.testing.assert_allclose(t_s, [105.0, 106.9, *np.arange(108.105, 108.95, 0.1), 109.1], atol=2e-3)
     assert losses == ("a stamp was more than 1 s off (11 times)",)
+
+
+def test_lines_may_have_the_units_of_recordings(fed):
+    given = {"Gyro X (deg/s)": 180.0, "gyro_y_dps": 90.0, "gyro_z_rad_s": 1.0} | {
+        f"accelerometer_{a}_g": 1 for a in "xyz"
+    }
+    arrivals = 105.0 + 0.01 * np.arange(5)
+    sent = [(t, json.dumps({"t_ms": 1e3 * (t - 98.0), **given}).encode()) for t in arrivals]
+    t_s, z = fed(sent, values=True)
+    np.testing.assert_allclose(t_s, arrivals, atol=1e-3)
+    np.testing.assert_allclose(z, np.tile([np.pi, np.pi / 2, 1.0, *[9.80665] * 3], (5, 1)))
 
 
 @pytest.mark.parametrize(

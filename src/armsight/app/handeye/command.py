@@ -177,7 +177,7 @@ def _table(options: Options, side: str, arm: Arm | None = None) -> PoseTable:
         columns=said.columns,
         arm=arm,
         side=side,
-        keep_missed=side == "seen",
+        keep_missed=True,
     )
 
 
@@ -213,6 +213,8 @@ def _streams(
             raise InputError(f"{path}: --streams needs times: a column t_s in line 1, seconds, or a recording")
     assert robot.t_s is not None
     assert seen.t_s is not None
+    robot = robot.without_missed()
+    assert robot.t_s is not None
     shown = np.array([not why for why in seen.missed])
     names = tuple(name for name, why in zip(seen.names, seen.missed, strict=True) if not why)
     Ts, t_s = steady(seen.Ts[shown], seen.symmetries), seen.t_s[shown]

@@ -16,6 +16,7 @@ import numpy as np
 
 from armsight.data import Array, Record
 from armsight.errors import InputError
+from armsight.files import columns_unused
 from armsight.robot.kinematics.arm import Arm
 from armsight.tables.poses import read_pose_table
 
@@ -28,10 +29,10 @@ class LoggedAngles(Record):
     """The rows of a file."""
 
     path: Path  #: of the file, for errors
-    q: Array  #: (N, n) joint angles, rad
+    q: Array  #: (N, n) joint angles, rad; NaN in a row without, which is kept where rows belong together by order
     shots: tuple[str, ...] | None  #: names of the shots the rows belong to; None where no column has them
     t_s: Array | None  #: (N,) times of the rows, s, rising; None where no column has them
-    unused: tuple[str, ...] = ()  #: the columns that were not read
+    notes: tuple[str, ...] = ()  #: what was found out while reading
 
     def at(self, names: Sequence[str], times_s: Sequence[float | None]) -> list[Array | None]:
         """Return the joint angles (n,), rad, at each shot; None at a shot that no row belongs to."""
@@ -50,7 +51,7 @@ class LoggedAngles(Record):
                 f"{self.path}: {len(self.q)} rows, but {len(names)} shots: give a column shot or t_s, or"
                 " a row for each shot"
             )
-        return list(self.q)
+        return [q if np.isfinite(q).all() else None for q in self.q]
 
     def _interpolated(self, times_s: Sequence[float | None]) -> list[Array | None]:
         assert self.t_s is not None
@@ -85,9 +86,14 @@ def read_angles(path: str | Path, arm: Arm) -> LoggedAngles:
         InputError: unreadable, a joint is missing or too many, a field is no number, degrees came as radians, or times
             fall.
     """
-    table = read_pose_table(Path(path), arm=arm, only_joints=True)
+    kept = read_pose_table(Path(path), arm=arm, only_joints=True, keep_missed=True)
+    table = kept.without_missed()
+    assert kept.q is not None
     assert table.q is not None
     t_s = table.t_s if table.names is None else None
+    by_order = table.names is None and t_s is None
+    q = np.where(np.array([[not why] for why in kept.missed]), kept.q, np.nan) if by_order else table.q
     if t_s is not None and len(fallen := np.flatnonzero(np.diff(t_s) <= 0)):
         raise InputError(f"{path}: line {table.lines[fallen[0] + 1]}: t_s does not rise: {t_s[fallen[0] + 1]:g} s")
-    return LoggedAngles(table.path, table.q, table.names, t_s, table.unused)
+    notes = (f"{path}: {columns_unused(table.unused)}",) if table.unused else ()
+    return LoggedAngles(table.path, q, table.names, t_s, (*table.notes, *notes))

@@ -162,8 +162,8 @@ def _run_logged(
     require_matplotlib()
     arm, rig, target = open_arm(arm_spec), StereoRig.load_trusted(rig_path), open_target(target_spec)
     angles = read_angles(path, arm)
-    if angles.unused:
-        click.echo(f"note: {path}: {columns_unused(angles.unused)}", err=True)
+    for note in angles.notes:
+        click.echo(f"note: {note}", err=True)
     with open_folder(output), contextlib.closing(open_source(source_spec)) as source, steps() as progress:
         result = run_logged(source, rig, target, arm, angles, progress)
         progress("writing and plotting")

@@ -21,7 +21,7 @@ from armsight.app.options import SIM
 from armsight.data import Array
 from armsight.errors import DeviceError, InputError
 from armsight.loop.references.distance import Distance
-from armsight.loop.references.file import COLUMNS, Entry
+from armsight.loop.references.file import COLUMNS, Entry, columns_of
 from armsight.loop.references.inertial import INERTIAL_CLASSES, Inertial
 from armsight.loop.running.beside import Fused, fused
 from armsight.loop.running.setup import HostClock, LiveShots, Setup
@@ -68,7 +68,8 @@ class LiveReadings:
     """
 
     def __init__(self, entry: Entry, clock: HostClock, now: Callable[[], float] = time.monotonic) -> None:
-        self._where, self._columns = f"[{entry.reference.name}]: live", COLUMNS[type(entry.reference)]
+        self._where, self._kind = f"[{entry.reference.name}]: live", type(entry.reference)
+        self._names = list[tuple[str, float]]()  # of the time and the values in a line, and the factors to SI
         self._board, self._own, self._now = clock, HostClock(now), now
         self._lock, self._ended, self._problem = threading.Lock(), threading.Event(), ""
         self._rows: list[tuple[float, list[float]]] = []  # time, s, on the computer's clock; values
@@ -136,10 +137,12 @@ class LiveReadings:
         now = self._now()
         try:
             record = json.loads(line)
-            t_s, *values = (float(record[name]) for name in ("t_s", *self._columns))
-        except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
-            kind = f"{error.args[0]} is missing" if isinstance(error, KeyError) else "is no JSON object of numbers"
-            self._problem = f"expected lines of JSON with t_s, {', '.join(self._columns)}; {line[:40]!r} {kind}"
+            self._names = self._names or columns_of(self._kind, list(record), f"{line[:40]!r}")
+            t_s, *values = (factor * float(record[name]) for name, factor in self._names)
+        except (InputError, ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
+            expected = f"expected lines of JSON with t_s, {', '.join(COLUMNS[self._kind])}"
+            missing = str(error) if isinstance(error, InputError) else f"{line[:40]!r} is no JSON object of numbers"
+            self._problem = f"{expected}; {missing}"
             self.losses["a line was no reading"] += 1
             return
         # No time is known of a stamp whose last digit is longer than JUMP_S; NaN and infinity are among them.
@@ -169,7 +172,7 @@ class LiveReadings:
         t_s = np.array([t for t, _ in rows]) - (self._board.offset_s if rows else 0.0)
         rising = t_s > np.maximum.accumulate(np.append(self._newest_s, t_s))[:-1]
         self._newest_s = max(self._newest_s, t_s.max(initial=-np.inf))
-        return t_s[rising], np.array([values for _, values in rows]).reshape(-1, len(self._columns))[rising]
+        return t_s[rising], np.array([values for _, values in rows]).reshape(-1, len(COLUMNS[self._kind]))[rising]
 
     def close(self) -> None:
         """Stop reading."""

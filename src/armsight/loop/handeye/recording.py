@@ -184,10 +184,14 @@ def paired(robot: PoseTable, seen: Seen, in_hand: bool, arm: Arm | None) -> Pair
     notes = [*robot.notes, *seen.notes, *_alone(robot, seen, rows, matched)]
     rows, matched = _once(robot, seen, rows, matched, notes)
     shown = np.array([not seen.missed[k] for k in matched])
+    known = np.array([not robot.missed[r] for r in rows])
     lost = [f"{seen.names[k]} ({seen.missed[k]})" for k in matched[~shown]]
-    if lost:
-        notes.append(f"no target in {', '.join(lost[:3])}{f' and {len(lost) - 3} more' if len(lost) > 3 else ''}")
-    rows, matched = rows[shown], matched[shown]
+    gone = [f"line {robot.lines[r]} ({robot.missed[r]})" for r in rows[~known]]
+    for what, where in (("no target in", lost), (f"{robot.path}: no pose in", gone)):
+        if where:
+            more = f" and {len(where) - 3} more" if len(where) > 3 else ""
+            notes.append(f"{what} {', '.join(where[:3])}{more}: left out")
+    rows, matched = rows[shown & known], matched[shown & known]
     if len(rows) < MIN_POSES:
         raise InputError(f"{len(rows)} poses have both sides; {MIN_POSES} and more are needed, 15 are advised")
     A, B, covs = robot.Ts[rows], seen.Ts[matched], seen.covs[matched]
@@ -316,7 +320,8 @@ def _alone(robot: PoseTable, seen: Seen, rows: Rows, matched: Rows) -> list[str]
 def _once(robot: PoseTable, seen: Seen, rows: Rows, matched: Rows, notes: list[str]) -> tuple[Rows, Rows]:
     """Return the rows without those that repeat another on both sides; views that repeat while the arm moved are noted."""
     hands, eyes = _alike(robot.Ts[rows]), _alike(seen.Ts[matched])
-    eyes = np.where([bool(seen.missed[k]) for k in matched], len(eyes) + np.arange(len(eyes)), eyes)
+    lost = [bool(seen.missed[k] or robot.missed[r]) for r, k in zip(rows, matched, strict=True)]
+    eyes = np.where(lost, len(eyes) + np.arange(len(eyes)), eyes)
     first = np.sort(np.unique(np.stack([hands, eyes], axis=1), axis=0, return_index=True)[1])
     if len(first) < len(rows):
         again = [seen.names[k] for k in np.delete(matched, first)]
@@ -332,6 +337,7 @@ def _once(robot: PoseTable, seen: Seen, rows: Rows, matched: Rows, notes: list[s
 
 def _tcp(robot: PoseTable, arm: Arm | None) -> list[str]:
     """Return a note where the poses are those of a TCP, not of the model's flange."""
+    robot = robot.without_missed()
     if arm is None or robot.q is None or robot.of_joints:
         return []
     offset = inverse(np.asarray(arm.forward(robot.q))) @ robot.Ts
@@ -364,6 +370,8 @@ def links_of(robot: PoseTable, arm: Arm | None, at: Array) -> Callable[[Array], 
     """
     if arm is None or robot.q is None:
         return None
+    at, robot = at[[not why for why in robot.missed]], robot.without_missed()
+    assert robot.q is not None
     at, rows = np.unique(at, return_index=True)
     q, Ts, T_flange_tcp = robot.q[rows], robot.Ts[rows], np.eye(4)
     if not robot.of_joints:

@@ -9,6 +9,7 @@ cov_00 .. cov_55 as ``armsight measure`` writes them; approach1 .. (1, -1, 0). T
 from __future__ import annotations
 
 import re
+from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
 
@@ -85,7 +86,7 @@ def read_measured(
     parts = column_parts(columns)
     own = (*NAMES, *joint_columns(arm.joint_names))
     theirs = [part for part in parts if part.partition("=")[0].strip() in own or re.match(r"\s*q\d+_", part)]
-    table = read_pose_table(joints, columns=theirs, arm=arm, only_joints=True)
+    table = read_pose_table(joints, columns=theirs, arm=arm, only_joints=True, keep_missed=True)
     ours = [part for part in parts if part not in theirs]
     cells, notes = _with_joints(data, read_cells(data, read_columns(ours, COLUMNS), "seen"), table)
     read = _poses_in(data, cells, rotation)
@@ -95,25 +96,29 @@ def read_measured(
 def _with_joints(data: Path, read: Cells, table: PoseTable) -> tuple[Cells, list[str]]:
     """Return a table's cells with the joint angles of each row, without those that have none or no pose, and notes."""
     assert table.q is not None
-    head, rows = read.head, [(line, row) for line, row in read.rows if any(row)]
+    head = read.head
     if own := next((name for name in head if re.fullmatch(r"q\d+_(rad|deg)", name)), None):
         raise InputError(f"{data}: line 1: has joint angles of its own ({own}): leave them out, or --joints")
-    angles, notes = _angles(data, head, rows, table)
-    missed = {line for line, row in rows if "status" in head and row[head.index("status")] == "missed"}
-    if missed:
-        notes.append(f"{len(missed)} of {len(rows)} shots were missed, and are left out")
-    joined = [
-        (line, [*row, *map(repr, angles[line].tolist())]) for line, row in rows if line in angles and line not in missed
-    ]
+    understood = columns_in(data, read, (), None, None)[0]
+    positions = understood.numbers([name for point in _points(understood)[0] for name in point], gaps=True)
+    good = np.asarray(np.isfinite(positions).all(axis=1))
+    shown = {line for (line, _), there in zip(read.rows, good, strict=True) if there}
+    angles, notes = _angles(data, head, read.rows, shown, table)
+    if len(shown) < len(read.rows):
+        notes.append(f"{len(read.rows) - len(shown)} of {len(read.rows)} shots were missed, and are left out")
+    joined = [(line, [*row, *map(repr, angles[line].tolist())]) for line, row in read.rows if line in angles]
     return read._replace(head=[*head, *(f"q{k}_rad" for k in range(1, table.q.shape[1] + 1))], rows=joined), notes
 
 
-def _angles(data: Path, head: list[str], rows: Rows, table: PoseTable) -> tuple[dict[int, Array], list[str]]:
-    """Return the joint angles (J,), rad, of rows by their lines, paired by time, name or order; and notes."""
+def _angles(
+    data: Path, head: list[str], rows: Rows, shown: Collection[int], table: PoseTable
+) -> tuple[dict[int, Array], list[str]]:
+    """Return the joint angles (J,), rad, of the ``shown`` rows by their lines, paired by time, name or order; and notes."""
     assert table.q is not None
     timed = [k for k, name in enumerate(head) if name in TIMES]
     if table.names is None and len(table.q) != len(rows) and table.t_s is not None and timed:
-        return _at_rest(data, [(line, row[timed[0]]) for line, row in rows], table)
+        at = [(line, row[timed[0]]) for line, row in rows if line in shown]
+        return _at_rest(data, at, table.without_missed())
     key = next((name for name in NAMES if name in head), None)
     if table.names is not None and key is None:
         raise InputError(
@@ -121,8 +126,9 @@ def _angles(data: Path, head: list[str], rows: Rows, table: PoseTable) -> tuple[
             f"{', '.join(head)}"
         )
     names = [f"line {line}" if key is None else row[head.index(key)] for line, row in rows]
-    angles = {rows[i][0]: table.q[row] for row, i in zip(*matched_rows(table, names), strict=True)}
-    alone = len(rows) - len(angles)
+    pairs = {rows[i][0]: row for row, i in zip(*matched_rows(table, names), strict=True)}
+    angles = {line: table.q[row] for line, row in pairs.items() if line in shown and not table.missed[row]}
+    alone = len(shown) - len(angles)
     return angles, [f"{alone} of {len(rows)} poses have no row in {table.path}, and are left out"] if alone else []
 
 

@@ -21,7 +21,7 @@ import os
 import re
 import tomllib
 import unicodedata
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array, Record
-from armsight.errors import InputError
+from armsight.errors import InputError, nearest
 from armsight.files import read_text, read_toml
 from armsight.geometry.check import checked
 from armsight.loop.references.distance import Distance
@@ -186,7 +186,7 @@ def read_recording(path: Path, kind: type[Sensor] = Inertial) -> tuple[Array, Ar
             raise InputError(f"{path}: expected one topic of {RANGE}; there are {len(topics)}: {', '.join(topics)}")
         return t_s, z[:, None]
     columns = (_json_lines if path.suffix.lower() in (".jsonl", ".ndjson") else Columns.of_csv)(path)
-    names, factors = zip(*(_column(columns, name) for name in ("t_s", *COLUMNS[kind])), strict=True)
+    names, factors = zip(*columns_of(kind, columns.head, str(path)), strict=True)
     rows = _kept(path, columns.numbers(names, text=True) * factors, "line", columns.line)
     check_seconds(rows[:, 0], _SLOWEST_HZ[kind], f"{path}: {names[0]}")
     return rows[:, 0], rows[:, 1:]
@@ -204,9 +204,17 @@ def _kept(path: str | Path, rows: Array, what: str, number: Callable[[int], int]
     return np.delete(rows, bad, axis=0)
 
 
-def _column(columns: Columns, name: str) -> tuple[str, float]:
-    """Return the file's column for one of ours, whatever its unit, and the factor that makes it ours."""
-    there = {_plain(each): each for each in columns.head if each}
+def columns_of(kind: type[Sensor], head: Sequence[str], where: str) -> list[tuple[str, float]]:
+    """Return the names in ``head`` of a reference's time and columns, whatever their units, and the factors to SI.
+
+    Raises:
+        InputError: ``where`` a column is missing, and which is like it.
+    """
+    return [_column(head, name, where) for name in ("t_s", *COLUMNS[kind])]
+
+
+def _column(head: Sequence[str], name: str, where: str) -> tuple[str, float]:
+    there = {_plain(each): each for each in head if each}
     unit = next(each for each in _UNITS if name.endswith(f"_{each}"))
     stem = name.removesuffix(unit)
     known = {stem + each: factor for each, factor in _UNITS[unit].items()}
@@ -216,7 +224,7 @@ def _column(columns: Columns, name: str) -> tuple[str, float]:
     near = get_close_matches(name, [each for each in there if re.search(like, each)], 1, 0.1)
     meant = f"did you mean {there[near[0]]}? rename it with its unit" if near else "add it"
     missing = f"column {name} is missing, also in another unit ({', '.join(known)})"
-    raise InputError(f"{columns.path}: {missing}; there are {columns.near(name)}: {meant}")
+    raise InputError(f"{where}: {missing}; there are {nearest(name, [each for each in head if each])}: {meant}")
 
 
 def _plain(name: str) -> str:
