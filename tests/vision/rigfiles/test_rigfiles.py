@@ -11,7 +11,21 @@ import numpy as np
 import pytest
 import yaml
 from click.testing import CliRunner
-from program_files import K_LEFT, K_RIGHT, SIZE, T_RIGHT_LEFT, YML, R, T, camera_info, chain, named, storage, write
+from program_files import (
+    K_LEFT,
+    K_RIGHT,
+    SIZE,
+    T_RIGHT_LEFT,
+    YML,
+    R,
+    T,
+    camera_info,
+    chain,
+    named,
+    rectified,
+    storage,
+    write,
+)
 
 from armsight.app.rig.command import command
 from armsight.errors import InputError
@@ -397,6 +411,8 @@ OPENCV_DAMAGE = [
     ({"image_width": 0, "image_height": 3}, "whole pixels"),
     ({"image_width": "wide", "image_height": 3}, "image size must be numbers"),
 ]
+#: What ROS's cameracalibrator writes of fisheye pairs (camera_calibration 1.17.0): K R over P's left columns, findings/.
+KR_RIGHT = np.column_stack([K_RIGHT @ rectified()[1], rectified()[3][:, 3]])
 ROS_DAMAGE = [
     ({"image_width": ..., "image_height": ...}, "holds no image size"),
     ({"camera_matrix": ...}, "has no 'camera_matrix'"),
@@ -419,6 +435,7 @@ ROS_DAMAGE = [
     ({"rectification_matrix": data(*(2 * np.eye(3)).ravel().tolist())}, "rectification_matrix is not a rotation"),
     ({"projection_matrix": data(*([0.0] * 12))}, "projection_matrix must be"),
     ({"projection_matrix": data(*np.eye(3, 4).ravel().tolist())}, "holds no baseline"),
+    ({"projection_matrix": data(*KR_RIGHT.round(5).ravel().tolist())}, "baseline is lost; run armsight calibrate"),
     ({"image_width": 12.5}, "whole pixels"),
     ({"image_width": None}, "image size"),
 ]

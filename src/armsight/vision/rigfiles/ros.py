@@ -91,10 +91,8 @@ def write(rig: StereoRig, paths: Sequence[Path]) -> tuple[str, ...]:
     R1, R2, P1, P2, _ = rectification(rig)
     documents = []
     for name, camera, R, P in (("left", rig.left, R1, P1), ("right", rig.right, R2, P2)):
-        model, d = (
-            {"fisheye": "equidistant", "brown8": "rational_polynomial"}.get(camera.model, "plumb_bob"),
-            camera.distortion,
-        )
+        model = {"fisheye": "equidistant", "brown8": "rational_polynomial"}.get(camera.model, "plumb_bob")
+        d = camera.distortion
         if camera.model in ("none", "brown4"):
             d = np.concatenate([d, np.zeros(5 - d.size)])
             lost.append(f"that the {name} camera's distortion is {camera.model}: plumb_bob has five coefficients")
@@ -128,11 +126,14 @@ def _read_one(document: Document, options: ImportOptions) -> tuple[Camera, Array
     camera, notes = camera_of({**document, "distortion_model": model}, options.image_size_px)
     if not np.any(np.asarray(found(document, _NAMES["camera_matrix"]), float)):
         raise InputError("camera_matrix is zero: the camera that published it was not calibrated")
-    P = _matrix_of(document, "projection_matrix", (3, 4))
-    fx, fy, _, _ = focal_and_centre(P[:, :3], "projection_matrix")
-    if P[2, 3] != 0 or not (fx > 0 and fy > 0):
+    P, R = _matrix_of(document, "projection_matrix", (3, 4)), _matrix_of(document, "rectification_matrix", (3, 3))
+    if (np.eye(3) != R).any() and np.allclose(P[:, :3], camera.matrix @ R, atol=1e-3):
+        raise InputError(
+            "projection_matrix is camera_matrix times rectification_matrix, as ROS's cameracalibrator writes for fisheye "
+            "pairs: the baseline is lost; run armsight calibrate on the images in its calibrationdata.tar.gz"
+        )
+    if P[2, 3] != 0 or focal_and_centre(P[:, :3], "projection_matrix")[:2].min() <= 0:
         raise InputError("projection_matrix must be [[fx, 0, cx, Tx], [0, fy, cy, Ty], [0, 0, 1, 0]]: uncalibrated?")
-    R = _matrix_of(document, "rectification_matrix", (3, 3))
     T_rect_camera, said = rigid(R, -np.linalg.solve(P[:, :3], P[:, 3]), "rectification_matrix")
     if not word:
         said.append("no distortion_model; plumb_bob assumed, as ROS does")
