@@ -220,3 +220,62 @@ def test_an_interrupt_while_it_is_imported_is_said_in_one_line():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (130, "armsight: interrupted\n")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (
+            ["measure", "body.toml", "--source", "shots", "--target", "body.toml"],
+            "body.toml is a body file, which --target",
+        ),
+        (
+            ["measure", "--json", "poses.csv", "--source=x", "--target=b.toml"],
+            "poses.csv is a table, which --data, --robot and --seen",
+        ),
+        (["identify", "--arm", "so101", "--data=rig.json"], "rig.json is a rig, which --rig, armsight measure and"),
+        (["identify", "--arm", "body.toml", "--data", "poses.csv"], "body.toml is a body file, which --target"),
+        (["serve", "rig.json"], "rig.json is a rig"),
+        (["serve", "poses.csv"], "poses.csv is a table"),
+        (["serve", "motion.toml"], "motion.toml is a motion file, which --motion and --volume take"),
+        (["check", "shots"], "shots is a folder of images, which --source, armsight record and"),
+        (
+            ["measure", "run", "--source", "shots", "--target", "b.toml"],
+            "run is a run's folder, which armsight check, armsight replay and",
+        ),
+        (
+            ["measure", "a.png", "--source", "shots", "--target", "b.toml"],
+            "a.png is an image, which --source and armsight dense take",
+        ),
+        (["board", "monitor", "--board", "feetech:/dev/none,rig.json"], "rig.json is a rig"),
+        (["identify", "--arm", "so101", "--data", "so101.urdf"], "so101.urdf is an arm's model (URDF), which --arm"),
+    ],
+)
+def test_a_file_of_another_kind_is_named_with_who_takes_it(armsight, tmp_path, monkeypatch, arguments, said):
+    monkeypatch.chdir(tmp_path)
+    for folder, file in (("shots", "left0.png"), ("run", "run.mcap")):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / file).write_bytes(b"")
+    (tmp_path / "rig.json").write_text('{\n "format": "armsight-rig",\n "version": 1\n}')
+    (tmp_path / "body.toml").write_text('# a plate\nversion = 2\n\n[[markers]]\nname = "A"\n')
+    (tmp_path / "motion.toml").write_text('[[motion]]\nkind = "joints"\n')
+    (tmp_path / "poses.csv").write_text("x_m,y_m,z_m\n1,2,3\n")
+    (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n\0\0")
+    (tmp_path / "so101.urdf").write_text('<?xml version="1.0"?>\n<!-- an arm -->\n<robot name="a"/>')
+    answer = armsight(*arguments)
+    assert answer.code == 2
+    assert said in answer.err
+    assert len(answer.err.splitlines()) == 1
+
+
+def test_a_file_of_the_right_kind_that_is_damaged_is_not_said_to_be_another(armsight, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "rig.json").write_text('{"format": "armsight-rig", "version": 1}')
+    (tmp_path / "poses.csv").write_text("q1_deg,x_m\n1,2\n")
+    for arguments in (
+        ["measure", "--json", "rig.json", "--source", "x"],
+        ["identify", "--arm", "so101", "--data", "poses.csv"],
+    ):
+        answer = armsight(*arguments)
+        assert answer.code == 2
+        assert " which " not in answer.err

@@ -6,12 +6,15 @@ is one line on stderr and exit code 2; a result that must not be trusted is exit
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import importlib
 import os
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
 
 import click
 
@@ -73,6 +76,40 @@ _ALSO = {
     "--folder": ("--source",),
     "--port": ("--board", "--source", "--http"),
 }
+
+
+class _Kind(NamedTuple):
+    """A kind of files: in words, what its beginning matches, the options and commands that take it, usual ones first."""
+
+    what: str
+    begins: str
+    takers: tuple[str, ...]
+
+
+_KINDS = (
+    _Kind("a rig", r'\s*\{\s*"format": "armsight-rig"', ("--rig", "measure", "rig", "budget")),
+    _Kind("a recording", r"\x89MCAP|SQLite format 3|#ROSBAG", ("--source", "replay", "--robot", "bag", "export")),
+    _Kind("an image", r"\x89PNG|\xff\xd8\xff|BM|II\*\0|MM\0\*", ("--source", "dense")),
+    _Kind("an arm's model (URDF)", r"(<\?xml[^>]*>|\s|<!--.*?-->)*<robot\b", ("--arm", "--model", "arm")),
+    _Kind("a file of sensors", r'(?ms).*^kind *= *"(inertial|magnetometer|range)"', ("--references", "references")),
+    _Kind("a motion file", r"(?ms).*^\[\[motion\]\]", ("--motion", "--volume")),
+    _Kind(
+        "a body file", r"(?ms).*^\[\[(markers|tags|boards|grids|discs)\]\]", ("--target", "body", "--fixed", "budget")
+    ),
+    _Kind("a board file", r"(?ms).*^board *= *\"\w+:", ("--target", "body")),
+    _Kind("an arm file", r"(?ms).*^\[\[joint\]\]", ("--arm", "--model", "--identified", "arm")),
+    _Kind("a service's file", r"(?ms).*^\[measure\]", ("serve",)),
+    _Kind(
+        "a table",
+        r"[^\n={}\[\]<>\0]+([,;\t][^\n={}\[\]<>\0]*)+(\n|$)",
+        ("--data", "--robot", "--seen", "--joints", "--poses", "check", "identify", "body check"),
+    ),
+)
+_RUN = _Kind("a run's folder", "", ("check", "replay", "export", "live", "batch", "--rig"))
+_SHOTS = _Kind("a folder of images", "", ("--source", "record", "replay", "dense", "batch"))
+_OPTIONS = {taker for kind in (*_KINDS, _RUN, _SHOTS) for taker in kind.takers if taker[0] == "-"}
+_READ = 5000  # bytes that say what a file is; half: a long comment may hide it, double: the same
+_NAMED = 3  # takers that a message names; half: the right one may lack, double: a longer line
 
 
 class _Sections(click.Group):
@@ -166,7 +203,7 @@ def _run(arguments: list[str], at_exit: list[Callable[[int, str], None]]) -> tup
     except click.ClickException as error:
         return 2, _usage_text(error)
     except ArmsightError as error:
-        return 2, str(error)
+        return 2, f"{error}{_mistaken(str(error), arguments)}"
     except BrokenPipeError:
         silence_stdout()
         return 0, ""
@@ -174,6 +211,35 @@ def _run(arguments: list[str], at_exit: list[Callable[[int, str], None]]) -> tup
         silence_stdout()
         return 2, f"{error.filename or 'the output'}: cannot be written: {error.strerror or error}"
     return 2, ""
+
+
+def _kind_of(path: Path) -> _Kind | None:
+    """Return what a file or a folder is; None where that is not known."""
+    if path.is_dir():
+        names = {each.name for each in path.iterdir()}
+        if names & {"run.mcap", "reference.csv"}:
+            return _RUN
+        return _SHOTS if any(name.endswith((".png", ".jpg", ".tif", ".tiff")) for name in names) else None
+    with path.open("rb") as file:
+        text = file.read(_READ).decode("latin-1").removeprefix("\xef\xbb\xbf")
+    return next((kind for kind in _KINDS if re.match(kind.begins, text)), None)
+
+
+def _mistaken(problem: str, arguments: Sequence[str]) -> str:
+    """Return what the file is that a problem is about, where the option that names it takes another kind; "" else."""
+    option = ""
+    for argument in arguments:
+        given, equals, value = argument.partition("=") if argument.startswith("-") else (option, "", argument)
+        option = "" if equals or given is option else given
+        name = re.sub(r"^(bag|video|folder|feetech|ar4|serial):([^,]*,)?", "", value)
+        with contextlib.suppress(OSError):
+            if name and name in problem and Path(name).exists() and (kind := _kind_of(Path(name))) is not None:
+                by = {given} if given in _OPTIONS else {arguments[0], " ".join(arguments[:2])}  # behind a flag
+                if given not in ("-o", "--output") and not by & {*kind.takers}:
+                    *first, last = [each if each[0] == "-" else f"armsight {each}" for each in kind.takers[:_NAMED]]
+                    who = f"{', '.join(first)} and {last} take" if first else f"{last} takes"
+                    return f"; {name} is {kind.what}, which {who}"
+    return ""
 
 
 def _usage_text(error: click.ClickException) -> str:

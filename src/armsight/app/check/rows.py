@@ -78,7 +78,6 @@ def read_rows(file: Path, columns: str | None = None) -> list[Row]:
     missing = [name for name in NEEDED if name not in table.at]
     if missing:
         hint = "; of a run give the folder" if "phase" in table.at else ""
-        hint = "; a motion file is for armsight run --motion" if file.suffix == ".toml" else hint
         raise InputError(f"{file}: line 1: column {missing[0]} is missing; needed are {', '.join(NEEDED)}{hint}")
     known = [name for name in _NUMBERS if name in table.at]
     numbers, texts = table.numbers(known, empty=True), zip(*map(table.texts, _TEXTS), strict=True)

@@ -14,7 +14,7 @@ from armsight.app.options import ARM, FIXED, FOLLOW_RIG, JSON, LOGGED, REFERENCE
 from armsight.app.progress import steps
 from armsight.app.show.messages import UNTRUSTED, colour, require, weak
 from armsight.errors import InputError
-from armsight.files import columns_unused, read_text, write_text
+from armsight.files import read_text, write_text
 
 if TYPE_CHECKING:
     from armsight.robot.kinematics.arm import Arm
