@@ -60,10 +60,9 @@ figcaption p { margin: .3rem 0; }
   tr > * { border: 0; padding: 0; min-width: 0 !important; white-space: normal !important; } td:empty { display: none; }
   td::before { content: attr(data-column); display: block; color: var(--muted); font-size: .78rem; }
   tbody th, td:last-child:not(.number) { grid-column: 1 / -1; }
-  figure::before { content: "Swipe it: it is wider than the screen."; position: sticky; left: 0; font-size: .85rem;
-    color: var(--muted); }
-  figure { overflow-x: auto; } figure img { width: 46rem; max-width: none; }  /* its letters stay readable: it scrolls */
-  .zoom { width: 46rem; touch-action: pan-x pan-y !important; } figcaption { position: sticky; left: 0; } }
+  figure::before { content: "Tap it to enlarge it."; position: sticky; left: 0; font-size: .85rem; color: var(--muted); }
+  figure:focus-within { overflow-x: auto; } figure:focus-within :is(img, .zoom) { width: 46rem; max-width: none; }
+  .zoom { touch-action: pan-x pan-y !important; } figcaption { position: sticky; left: 0; } }
 @media print { body { max-width: none; padding: 0; } nav { display: none; }
   table, table.headline { font-size: .7rem; } table.headline th { white-space: normal; overflow-wrap: normal; }
   th, td { padding: .25rem .5rem .25rem 0; } figure { break-inside: avoid; }
@@ -108,7 +107,7 @@ def picture(data: bytes, description: str, *, zoom: bool = False) -> str:
     """Return an HTML image that holds its own data."""
     kind = "png" if data.startswith(b"\x89PNG") else "svg+xml"
     source = f"data:image/{kind};base64,{base64.b64encode(data).decode('ascii')}"
-    image = f'<img src="{source}" alt="{text(description)}"{_ZOOMED if zoom else ""}>'
+    image = f'<img src="{source}" alt="{text(description)}" tabindex="0"{_ZOOMED if zoom else ""}>'
     return f'<div class="zoom" style="overflow:hidden;cursor:grab;touch-action:none">{image}</div>' if zoom else image
 
 
