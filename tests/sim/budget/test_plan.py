@@ -28,6 +28,19 @@ def test_a_file_says_the_same_as_options(tmp_path):
         RigPlan.read(str(path))
 
 
+def test_amounts_in_any_order_and_with_blanks():
+    plan = RigPlan(volume="400 mm x 0.4 x 0.3 m", want="0.2 deg, 600um", speed="20deg/s,0.3m/s")
+    np.testing.assert_allclose(plan.size_m, (0.4, 0.4, 0.3))
+    assert plan.requested == pytest.approx((6e-4, np.radians(0.2)))
+    assert plan.speeds == pytest.approx((0.3, np.radians(20.0)))
+
+
+def test_a_temporal_filter_helps_at_rest_alone():
+    still, slow = (RigPlan(camera="webcam-720p-evening", speed=speed)._noise_px() for speed in ("0m/s", "0.001m/s"))
+    assert slow["pixel noise"] == still["pixel noise"]
+    assert still["exposure blur"] == 0.0 < slow["exposure blur"]
+
+
 def test_noise_is_what_the_detector_shows():
     # White noise alone: the fit's sigma falls as the rim grows, with the root of the diameter.
     clean = CameraPipeline.load("clean")
@@ -53,6 +66,7 @@ def test_between_a_chart_that_is_found_and_one_that_is_not_it_is_that_of_the_siz
     [
         ({"volume": "400x400x300m"}, "is it in mm"),
         ({"volume": "0.4x0.4"}, "width x height x depth"),
+        ({"volume": "0.4x0.4x0.3"}, "^volume '0.4x0.4x0.3': side '0.4': expected a length with its unit"),
         ({"volume": "0.2x0.2x0.8m", "distance": "0.3m"}, "behind the cameras; a distance above 0.4 m"),
         ({"volume": "0x0x0m"}, "each side must be above zero"),
         ({"volume": "0.1x0.1x0.1m", "baseline": "1mm"}, "two cameras cannot stand 1 mm apart"),
@@ -60,6 +74,8 @@ def test_between_a_chart_that_is_found_and_one_that_is_not_it_is_that_of_the_siz
         ({"body": "chessboard:9x6:5mm"}, "^a square is "),
         ({"speed": "300m/s"}, "is it in mm/s"),
         ({"want": "0.1"}, "expected 0.1mm or 0.1mm,0.05deg"),
+        ({"want": "0.1mm,0.2mm"}, "expected 0.1mm or 0.1mm,0.05deg"),
+        ({"want": "0.2deg"}, "expected 0.1mm or 0.1mm,0.05deg"),
         ({"want": "0mm"}, "no rig measures without error"),
         ({"speed": "nanm/s"}, "speed 'nanm/s': expected 0.3m/s"),
         ({"volume": "0.1x0.1x0.1m", "handeye": "1"}, "expected 0.1mm,0.02deg"),

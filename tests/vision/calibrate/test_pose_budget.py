@@ -207,9 +207,36 @@ def test_what_stands_in_the_calibration_is_what_boards_determine() -> None:
     board = open_board("chessboard:9x6:30mm").body.points
     Ts = board_poses(np.random.default_rng(3), RIG, chessboard(9, 6, 0.03), 12)
     once, four = (calibration_covariance(RIG, board, np.tile(Ts, (n, 1, 1)), 0.1) for n in (1, 4))
-    np.testing.assert_allclose(np.sqrt(np.diag(four)), np.sqrt(np.diag(once)) / 2, rtol=1e-3)
+    np.testing.assert_allclose(np.sqrt(np.diag(four)), np.sqrt(np.diag(once)) / 2, rtol=0.02)  # of drawn corners
     bent = calibration_covariance(RIG, board, Ts, 0.1, 2e-4)
     assert (np.diag(bent) > np.diag(once)).all()
+
+
+def test_a_calibration_is_as_good_as_the_bundle_of_noisy_corners() -> None:
+    # 60 bundles: the RMS over 22 parameters is known to 1 / sqrt(2 * 60) = 9 % each, to some 3 % together; without the
+    # robust loss's price it was 9 % too small.
+    from armsight.sim.example_rig import board_poses
+    from armsight.sim.render.scene import chessboard
+    from armsight.vision.calibrate.boards import rigid_board
+    from armsight.vision.markers.board import open_board
+    from armsight.vision.pose.bundle import BundleState, Observations, minimise
+
+    board, rng, off = open_board("chessboard:9x6:30mm").body.points, np.random.default_rng(5), []
+    Ts = board_poses(rng, RIG, chessboard(9, 6, 0.03), 12)
+    expected = np.sqrt(np.diag(calibration_covariance(RIG, board, Ts, 0.1)))
+    p = np.einsum("sij,mj->smi", Ts[:, :3, :3], board) + Ts[:, None, :3, 3]
+    true = np.stack([each.reshape(12, -1, 2) for each in RIG.project(p.reshape(-1, 3))], axis=1).reshape(-1, 2)
+    shot, point = np.repeat(np.arange(12), 2 * len(board)), np.tile(np.arange(len(board)), 24)
+    side = np.tile(np.repeat([0, 1], len(board)), 12)
+    for _ in range(60):
+        uv = true + 0.1 * rng.standard_normal(true.shape)
+        seen = Observations(shot, side, point, uv, np.zeros((len(uv), 2, 2)), 12)
+        state = minimise(
+            rigid_board(board), BundleState(RIG.cameras, RIG.T_left_right, Ts, np.zeros(0)), seen, 0.1
+        ).state
+        cameras = [a.parameters - b.parameters for a, b in zip(state.cameras, RIG.cameras, strict=True)]
+        off.append(np.concatenate([*cameras, log_se3(inverse(RIG.T_left_right) @ state.T_left_right)]) / expected)
+    assert np.sqrt(np.mean(np.square(off))) == pytest.approx(1.0, abs=0.06)
 
 
 @pytest.mark.parametrize("sizes", [(1.0, 1.0, 1.0), (1.0, 0.1, 0.1), (2.0, 1.0, 0.0)])

@@ -120,8 +120,7 @@ def _compared(alternatives: Sequence[Alternative]) -> list[TextTable]:
 def _answer(found: RigBudget) -> tuple[Grade, str]:
     """Return the answer in two sentences, and its colour."""
     move, rest, requested = found.moving, found.at_rest, found.plan.requested
-    said = f"95 % within {move.mm:.2g} mm at {found.plan.speed}, {rest.mm:.2g} mm at rest"
-    said += f", {move.deg:.2g} and {rest.deg:.2g} deg"
+    said = f"95 % within {move} at {found.plan.speed}; {rest} at rest"
     if move.lost_share > _SHOWN:
         lost = f"{100 * move.lost_share:.0f} % of the shots in motion are lost where most are"
         said += f"; {lost}: their two images differ by more than the search allows"

@@ -64,7 +64,7 @@ _MOST_OFF_M = 0.01  # m; what a print may be off; half: sagging boards are rejec
 #: Shortest focal length that is chosen where none is given, image widths: 80 degrees; half: lenses that bend the image more
 #: than the model of five coefficients, double: ordinary volumes are rejected.
 _WIDEST = 0.6
-_UNITS = {"um": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0}
+_UNITS = {"um": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0, "deg": math.pi / 180}
 _NUMBER = r"((?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:e-?[0-9]+)?)"
 #: What a rig that there is says itself; and, where it says when its rows are exposed.
 _OF_RIG = ("image", "baseline", "verging_deg", "focal_widths", "board", "pairs", "board_bent")
@@ -113,10 +113,16 @@ def catalogue() -> dict[str, CameraClass]:
 
 def length_m(text: str, what: str) -> float:
     """Read a length with its unit: 0.8m, 300mm."""
-    found = re.fullmatch(rf"{_NUMBER}\s*(um|mm|cm|m)", text.strip())
-    if found is None:
-        raise InputError(f"{what} {text!r}: expected a length with its unit, such as 0.8m or 300mm")
-    return float(found[1]) * _UNITS[found[2]]
+    return _amounts(what, text, "a length with its unit, such as 0.8m or 300mm", most=1)[0]
+
+
+def _amounts(what: str, text: str, form: str, per: str = "", most: int = 2) -> tuple[float, float]:
+    """Read a length, m, and an angle, rad, in either order, each ``per`` that unit; an angle that is left out is 0."""
+    found = [re.fullmatch(rf"{_NUMBER}\s*(um|mm|cm|m|deg){per}", part.strip()) for part in text.split(",")]
+    values = {each[2] == "deg": float(each[1]) * _UNITS[each[2]] for each in found if each}
+    if not len(values) == len(found) <= most or False not in values:
+        raise InputError(f"{what} {text!r}: expected {form}")
+    return values[False], values.get(True, 0.0)
 
 
 def is_board(body: str) -> bool:
@@ -217,12 +223,14 @@ class RigPlan:
     @cached_property
     def size_m(self) -> Array:
         """(3,) width, height, depth."""
-        found = re.fullmatch(rf"{_NUMBER}x{_NUMBER}x{_NUMBER}\s*(mm|cm|m)", self.volume.strip())
-        if found is None:
+        sides = [side.strip() for side in self.volume.split("x")]
+        unit = sides[-1].lstrip("0123456789.e- ")  # of the sides that have none
+        if len(sides) != 3:
             raise InputError(
                 f"volume {self.volume!r}: expected width x height x depth with a unit, such as 0.4x0.4x0.3m"
             )
-        size = np.array([float(n) for n in found.groups()[:3]]) * _UNITS[found[4]]
+        each = (side if side[-1:].isalpha() else side + unit for side in sides)
+        size = np.array([length_m(side, f"volume {self.volume!r}: side") for side in each])
         for wrong, text in (
             (size.max() > _MOST_M, f": {size.max():g} m is no table-top cell: is it in mm?"),
             (not size.min() > 0, ": each side must be above zero"),
@@ -263,7 +271,7 @@ class RigPlan:
         if self.existing:
             return self.existing.left.image_size_px
         found = re.fullmatch(
-            r"([1-9]\d{2,4})x([1-9]\d{2,4})", self.image.strip() or "{}x{}".format(*self.cameras.image_size_px)
+            r"([1-9]\d{2,4})\s*x\s*([1-9]\d{2,4})", self.image.strip() or "{}x{}".format(*self.cameras.image_size_px)
         )
         if found is None:
             raise InputError(f"image {self.image!r}: expected width x height in pixels, such as 1280x720")
@@ -281,17 +289,10 @@ class RigPlan:
             )
         return found
 
-    def _two(self, what: str, text: str, units: tuple[str, str], form: str) -> tuple[float, float]:
-        """Read a length and an angle, rad; the second is 0 where it is left out."""
-        found = re.fullmatch(rf"{_NUMBER}\s*(um|mm|cm|m){units[0]}(?:\s*,\s*{_NUMBER}\s*deg{units[1]})?", text.strip())
-        if found is None:
-            raise InputError(f"{what} {text!r}: expected {form}")
-        return float(found[1]) * _UNITS[found[2]], math.radians(float(found[3] or 0.0))
-
     @cached_property
     def speeds(self) -> tuple[float, float]:
         """m/s and rad/s."""
-        found = self._two("speed", self.speed, ("/s", "/s"), "0.3m/s or 0.3m/s,20deg/s")
+        found = _amounts("speed", self.speed, "0.3m/s or 0.3m/s,20deg/s", "/s")
         if found[0] > _MOST_M:
             raise InputError(f"speed {self.speed}: faster than {_MOST_M:g} m/s: is it in mm/s?")
         return found
@@ -299,13 +300,13 @@ class RigPlan:
     @cached_property
     def handeye_errors(self) -> tuple[float, float]:
         """Metres and rad."""
-        return self._two("handeye", self.handeye, ("", ""), "0.1mm,0.02deg")
+        return _amounts("handeye", self.handeye, "0.1mm,0.02deg")
 
     @cached_property
     def requested(self) -> tuple[float, float] | None:
         """Metres and rad, 0 where it is not asked; None where nothing is."""
         form = "0.1mm or 0.1mm,0.05deg"
-        found = self._two("want", self.want, ("", ""), form) if self.want else None
+        found = _amounts("want", self.want, form) if self.want else None
         if found and not found[0]:
             raise InputError(f"want {self.want!r}: no rig measures without error: expected {form}")
         return found
@@ -495,7 +496,8 @@ class RigPlan:
             if radius := round(self.defocus_px(float(distance))):
                 blurred = replace(self.pipeline, defocus=Defocus(radius))
                 soft += max(marker_noise(blurred, kind, px) ** 2 - sharp, 0.0) / 2
-        moved = max(marker_noise(self.pipeline, kind, px, way) ** 2 - sharp, 0.0)
+        changing = replace(self.pipeline, temporal_denoise=None) if way else self.pipeline  # it has nothing to mix
+        moved = max(marker_noise(changing, kind, px, way) ** 2 - sharp, 0.0)
         return {"pixel noise": math.sqrt(sharp), "defocus": math.sqrt(soft), "exposure blur": math.sqrt(moved)}
 
     @cached_property
