@@ -119,7 +119,7 @@ def board_poses(
                 break
         else:
             raise InputError(
-                "no pose of the board is in full view of both cameras: it is too large, or they look apart"
+                "no pose of the board fills both images: it is too large, too small for their distance, or they look apart"
             )
     return np.array(poses)
 

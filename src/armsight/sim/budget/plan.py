@@ -105,9 +105,10 @@ class CameraClass:
 def catalogue() -> dict[str, CameraClass]:
     """Return the classes by name."""
     tables = read_toml(Path(__file__).with_name("catalogue.toml"))
+    whole = {name: tables.get(values.pop("like", ""), {}) | values for name, values in tables.items()}
     return {
-        name: CameraClass(name, **values | {"image_size_px": tuple(values["image_size_px"])})
-        for name, values in tables.items()
+        name: CameraClass(name, **each | {"image_size_px": tuple(each["image_size_px"])})
+        for name, each in whole.items()
     }
 
 
@@ -223,7 +224,7 @@ class RigPlan:
     @cached_property
     def size_m(self) -> Array:
         """(3,) width, height, depth."""
-        sides = [side.strip() for side in self.volume.split("x")]
+        sides = [side.strip() for side in re.split("[xX]", self.volume)]
         unit = sides[-1].lstrip("0123456789.e- ")  # of the sides that have none
         if len(sides) != 3:
             raise InputError(
@@ -346,18 +347,13 @@ class RigPlan:
     @cached_property
     def timing(self) -> dict[str, float]:
         """exposure, readout, skew, start, stamp, s; rate, Hz."""
-        t = self.pipeline.timing
+        t, known = self.pipeline.timing, self.existing.shutters if self.existing else None
         assert t is not None
-        skew, start = (
-            given if given >= 0 else preset
-            for given, preset in ((self.skew_ms, t.skew_ms), (self.start_ms, t.sync_ms / math.sqrt(3.0)))
-        )
-        readout = t.readout_ms
-        if self.existing and (known := self.existing.shutters):
-            # What was measured is corrected: its uncertainty remains.
-            skew, readout = 1e3 * known.sigmas
-            start = 1e3 * known.jitter_s
-        ms = {"exposure": t.exposure_ms, "readout": readout, "skew": skew, "start": start, "stamp": t.jitter_ms}
+        ms = {"exposure": t.exposure_ms, "readout": t.readout_ms, "skew": t.skew_ms,
+              "start": t.sync_ms / math.sqrt(3.0), "stamp": t.jitter_ms}  # fmt: skip
+        ms |= {name: given for name, given in (("skew", self.skew_ms), ("start", self.start_ms)) if given >= 0}
+        if known:  # what was measured is corrected: its uncertainty remains
+            ms |= dict(zip(("skew", "readout"), 1e3 * known.sigmas, strict=True)) | {"start": 1e3 * known.jitter_s}
         rate = min(t.rate_hz, self._most_hz) if self.rate_hz < 0 else self.rate_hz
         return {name: 1e-3 * value for name, value in ms.items()} | {"rate": rate}
 
@@ -513,21 +509,16 @@ class RigPlan:
             arm = tuple(sigma * float(np.sqrt((part**2).sum() / 3)) for part in (J[:3], J[3:]))  # type: ignore[assignment]
         bent = length_m(self.body_print, "body_print"), length_m(self.body_bent, "body_bent")
         mount, lens = (1e-6 * each * self.warming_k for each in (self.mount_um_per_k, self.lens_ppm_per_k))
-        noise, cov = self._noise_px(), self._cov_calibration()
+        noise, cov, gate = self._noise_px(), self._cov_calibration(), Gates()
+        if self.apart:  # as `run` and `live` search
+            loose, moved_m = replace(self.stereo_rig, cov=cov, sigma_px=LOOSE_PX), math.hypot(t["skew"], t["start"])
+            moved_m *= speed / math.sqrt(3)
+            gate = gates(loose, self.layout, self.views[len(self.views) // 2], math.hypot(*noise.values()), moved_m)
         return Conditions(
             noise, cov, self.board_print, self.marker_of, bent, self.body_size, mount, lens,
-            t["skew"], t["start"], t["readout"], t["stamp"], speed, rotation,
-            self._gates(math.hypot(*noise.values()), cov),
+            t["skew"], t["start"], t["readout"], t["stamp"], speed, rotation, gate,
             self.handeye_errors if self.arm else (0.0, 0.0), arm,
         )  # fmt: skip
-
-    def _gates(self, noise_px: float, cov: Array) -> Gates:
-        """Return the gates of `run` and `live` where the exposures are apart."""
-        if not self.apart:
-            return Gates()
-        rig, moved_s = replace(self.stereo_rig, cov=cov, sigma_px=LOOSE_PX), (self.timing["skew"], self.timing["start"])
-        moved_m = self.speeds[0] / math.sqrt(3) * math.hypot(*moved_s)
-        return gates(rig, self.layout, self.views[len(self.views) // 2], noise_px, moved_m)
 
     def _cov_calibration(self) -> Array:
         """Return the covariance (P, P) of the rig's parameters."""

@@ -17,22 +17,17 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import gammaincinv
 
-from armsight.data import Array, Correspondences, Discs, Ids, PoseEstimate, Record
+from armsight.data import Array, Detections, Discs, Ids, PoseEstimate, Record
 from armsight.errors import InputError
 from armsight.geometry.pose import pose, transform
 from armsight.geometry.rotation import exp_so3, skew
 from armsight.vision.calibrate.boards import printed_board, rigid_board
 from armsight.vision.discs.bias import expect
-from armsight.vision.discs.hypothesis import hypothesis
-from armsight.vision.discs.pairing import DiscView, pair
 from armsight.vision.markers.targets import Composite
-from armsight.vision.match import gate
 from armsight.vision.pose.bundle import BundleModel, BundleState, Observations, minimise
-from armsight.vision.pose.locate import locate
-from armsight.vision.pose.measure import locate_discs
+from armsight.vision.pose.measure import locate_composite, measure_detections
 from armsight.vision.pose.predict import PoseDerivatives, PredictedView, pose_derivatives, view
 from armsight.vision.rig import StereoRig
-from armsight.vision.triangulate import triangulate
 
 #: Share of errors that a figure "at 95 %" covers.
 LEVEL = 0.95
@@ -225,7 +220,9 @@ def pose_budget(rig: StereoRig, points: Array, normals: Array, views: list[Predi
         d = pose_derivatives(rig, points, seen)
         if d is None:
             continue
-        F = {name: d.by_uv.reshape(6, -1) * sigma for name, sigma in given.noise_px.items()}
+        # As many sources as the pose has parts: what is seen differs from position to position.
+        root = np.linalg.cholesky(d.noise(1.0))
+        F = {name: root * sigma for name, sigma in given.noise_px.items()}
         F |= {name: d.by_rig @ root for name, root in by_rig.items() if root.size}
         each = np.einsum("gm,kmi,mij->kgj", together, d.by_point, spread).reshape(6, -1)
         larger = given.body_scale * np.einsum("kmi,mi->k", d.by_point, points)
@@ -240,14 +237,14 @@ def pose_budget(rig: StereoRig, points: Array, normals: Array, views: list[Predi
         for name, (m, rad) in {"hand-eye": given.handeye, "steps and backlash of the arm": given.arm}.items():
             F[name] = np.diag(np.repeat([m, rad], 3))
         R = np.kron(np.eye(2), seen.T_left_body[:3, :3])
-        found.append({name: R @ each for name, each in F.items() if each.any()})
+        found.append({name: R @ each for name, each in F.items()})
         at.append(seen.T_left_body[:3, 3])
         lost.append(share)
         forward = forward + seen.forward
     if not found:
         raise InputError("both cameras together see three markers of the body nowhere in the volume")
-    # What is not seen at one position has as many sources as at the others.
-    factors = {name: _stacked([one.get(name) for one in found]) for name in CAUSES if any(name in one for one in found)}
+    every = {name: np.array([one[name] for one in found]) for name in CAUSES if name in found[0]}
+    factors = {name: each for name, each in every.items() if each.any()}
     return Budget(np.array(at), forward / np.linalg.norm(forward), factors, np.array(lost))
 
 
@@ -281,32 +278,18 @@ def _between_exposures(rig: StereoRig, p_left: Array) -> Array:
 
 def _found(rig: StereoRig, target: Composite, seen: PredictedView, noise_px: float, moved_m: Array) -> bool:
     """Whether ``measure`` finds a body that moved by (3,), m, left frame, before the right camera saw it."""
-    points, first, T_left_body = target.body.points, len(target.body.points) - target.disc_count, seen.T_left_body
-    cov, uv, discs = noise_px**2 * np.eye(2), np.full((len(points), 2, 2), np.nan), []
-    rows = np.full((target.disc_count, 2), -1)
-    for side, T in enumerate((T_left_body, pose(np.eye(3), moved_m) @ T_left_body)):
-        there = seen.seen[:, side]
-        uv[there, side] = rig.project(transform(T, points[there]))[side]
+    points, first, coded, discs = target.body.points, len(target.body.points) - target.disc_count, [], []
+    for side, T in enumerate((seen.T_left_body, pose(np.eye(3), moved_m) @ seen.T_left_body)):
+        covs, there = np.tile(noise_px**2 * np.eye(2), (len(points), 1, 1)), seen.seen[:, side]
+        ids, uv = np.flatnonzero(there[:first]), rig.project(transform(T, points))[side]
+        coded.append(Detections(ids, uv[ids], covs[ids]))
         if target.discs is not None:
-            at, there = expect(rig, target.discs, T), there[first:]
-            rows[there, side] = np.arange(there.sum())
-            covs = np.tile(cov, (int(there.sum()), 1, 1))
-            discs.append(Discs(at.uv[there, side], covs, at.shape[there, side], target.discs.bright[there]))
-    if first or target.discs is None:  # coded parts name the discs
-        ids = np.flatnonzero(seen.seen[:first].any(axis=1))
-        named = Correspondences(ids, uv[ids], np.where(np.isfinite(uv[ids])[..., None], cov, 0.0))
-        found = locate(rig, target.body, triangulate(rig, target.body, gate(rig, target.body, named)))
-    else:
-        view = DiscView.of(rig, target.discs, *discs)
-        pairs = pair(view)
-        if pairs is None or len(pairs.left) < 3:
-            return False
-        by_body = hypothesis(view, pairs, T_left_body, rows)
-        if isinstance(by_body, str):
-            return False
-        nothing = Correspondences(np.zeros(0, np.int64), np.zeros((0, 2, 2)), np.zeros((0, 2, 2, 2)))
-        found = locate_discs(rig, target.body, target.discs, nothing, by_body.seen, by_body.T_left_body)
-    return isinstance(found, PoseEstimate)
+            at, k = expect(rig, target.discs, T), np.flatnonzero(there[first:])
+            discs.append(Discs(at.uv[k, side], covs[k], at.shape[k, side], target.discs.bright[k]))
+    if target.discs is None:
+        return isinstance(measure_detections(rig, target.body, *coded), PoseEstimate)
+    both = (coded[0], coded[1]), (discs[0], discs[1])
+    return isinstance(locate_composite(rig, target.body, target.discs, *both), PoseEstimate)
 
 
 def _gated(
@@ -359,16 +342,6 @@ def of_three(pairs: Sequence[Budget], rig: StereoRig, board_scale: float = 0.0) 
         own = CAUSES[name].camera
         factors[name] = np.sqrt(2.0) * np.concatenate(parts, axis=2) if own else np.sum(parts, axis=0) + larger
     return replace(first, factors=factors, shared=())
-
-
-def _stacked(factors: list[Array | None]) -> Array:
-    """Return factors (6, K) of different K, or none, as one array (G, 6, K), filled up with zeros."""
-    most = max(F.shape[1] for F in factors if F is not None)
-    out = np.zeros((len(factors), 6, most))
-    for row, F in zip(out, factors, strict=True):
-        if F is not None:
-            row[:, : F.shape[1]] = F
-    return out
 
 
 def covariance_root(cov: Array) -> Array:
