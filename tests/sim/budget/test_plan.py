@@ -29,7 +29,7 @@ def test_a_file_says_the_same_as_options(tmp_path):
 
 
 def test_amounts_in_any_order_and_with_blanks():
-    plan = RigPlan(volume="400 mm x 0.4 x 0.3 m", want="0.2 deg, 600um", speed="20deg/s,0.3m/s")
+    plan = RigPlan(volume="400 mm x 0.4 X 0.3 m", want="0.2 deg, 600um", speed="20deg/s,0.3m/s")
     np.testing.assert_allclose(plan.size_m, (0.4, 0.4, 0.3))
     assert plan.requested == pytest.approx((6e-4, np.radians(0.2)))
     assert plan.speeds == pytest.approx((0.3, np.radians(20.0)))
