@@ -494,7 +494,7 @@ def main():
     for each in cells:
         each.join(10)
     time.sleep(1.0)
-    process.send_signal(signal.SIGINT)
+    process.terminate()  # SIGINT is ignored by what a script starts in the background
     process.wait()
     counted(folder / "hub")
 
