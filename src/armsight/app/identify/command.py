@@ -16,7 +16,11 @@ from armsight.errors import InputError
 from armsight.files import as_input_error, check_folder, check_writable, write_text
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from armsight.loop.identify.measured import Read
     from armsight.loop.identify.plan import Plan
+    from armsight.robot.kinematics.arm import Arm
 
 
 @click.group("identify", invoke_without_command=True)
@@ -37,6 +41,9 @@ def command(
         "which are not used without.",
         metavar="NAME=COLUMN,...",
     ),
+    references: Path | None = option(
+        "One wire's range instead of measured poses; poses of --data are the controller's.", metavar="REFERENCES.toml"
+    ),
     priors: tuple[str, ...] = option(
         "Sigma (m, rad) of a parameter or kind; 0 keeps it.", "--prior", metavar="NAME=SIGMA"
     ),
@@ -55,6 +62,11 @@ def command(
     if arm_name is None or data is None:
         raise InputError("give --arm and --data: armsight identify --arm ur10 --data poses.csv -o corrected/")
 
+    if references is not None and (joints is not None or other is not None):
+        raise InputError(
+            "--references goes without --joints and --validate: parts of its rows are left out to validate"
+        )
+
     from armsight.app.identify.report import identify_report, write_results
     from armsight.app.identify.run import FILES, run_identify
     from armsight.app.show.plotting import require_matplotlib
@@ -65,14 +77,17 @@ def command(
     arm = open_arm(arm_name)
     if output is not None:
         require_matplotlib()
-        given = (data, joints, other, Path(split_arm(arm_name)[0]))
+        given = (data, joints, other, references, Path(split_arm(arm_name)[0]))
         check_folder(output, holding=FILES, apart_from=given, problem="cannot be made")
     started = time.perf_counter()
     with steps() as progress:
         progress("reading")
         said = said_columns(",".join(columns) or None, ("rotation",))
         how = {"rotation": said.rotation, "columns": said.columns}
-        read = read_measured(data, arm, joints, **how)
+        if references is not None:
+            read = _by_wire(arm, data, references, columns, progress)
+        else:
+            read = read_measured(data, arm, joints, **how)
         held = None if other is None else read_measured(other, arm, joints, **how)
         notes = read.notes if held is None else (*read.notes, *(f"{other}: {note}" for note in held.notes))
         run = run_identify(
@@ -94,6 +109,18 @@ def command(
         report.write(output)
     if output is not None and not as_json:
         click.echo(f"\nwritten: {output}/{', '.join(FILES)}")
+
+
+def _by_wire(arm: Arm, data: Path, references: Path, columns: tuple[str, ...], progress: Callable[[str], None]) -> Read:
+    """Return rows with a wire's length, blunders left out and noted."""
+    from armsight.loop.identify.lengths import read_wire, without_blunders
+    from armsight.loop.identify.measured import Read
+
+    wire = read_wire(data, arm, references, ",".join(columns) or None)
+    measured, used, blunders = without_blunders(arm, wire.q, wire.length_m, wire.p_base, progress)
+    notes = [f"lines {wire.lines[rows.min()]:.0f} to {wire.lines[rows.max()]:.0f}: {why}" for rows, why in blunders]
+    said = "errors are of the wire's length; one wire does not show where the base is: it stays the anchor's"
+    return Read(measured.rows(used), wire.lines[used], (said, *wire.notes, *(f"{each}; left out" for each in notes)))
 
 
 @command.command()

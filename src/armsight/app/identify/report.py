@@ -245,6 +245,11 @@ def assess(run: Identification) -> tuple[Grade, str]:
         why = f"the nominal arm of {run.arm.name} predicts as well"
         return "poor", f"Do not use this identification: {why}; take more poses."
     said = f"the corrected {run.arm.name} is off by {after:.2f} mm where the nominal one is by {before:.2f}"
+    if run.measured.length_m is not None:
+        return (
+            "fair",
+            f"Usable for the wire's point near these poses: {said}; one wire shows no attitude: no zeros alone.",
+        )
     if elsewhere := undetermined(*run.found.moved_all_over()):
         return "fair", f"Usable near these poses only: there {said}; {elsewhere}."
     weak = [note for note in run.notes if "times as large as predicted" in note or "another state" in note]

@@ -81,7 +81,7 @@ def _notes(arm: Arm, found: Identified, measured: Measured, lines: Array) -> lis
         shown = ", ".join(f"{lines[k]:.0f}" for k in found.left_out[:8]) + (", .." if len(found.left_out) > 8 else "")
         poses = f"{len(found.left_out)} pose{'s' if len(found.left_out) > 1 else ''}"
         notes.append(f"{poses} taken for mistakes and left out: line {shown}")
-    if (step := find_step(without_tool(arm), measured)) is not None:
+    if measured.length_m is None and (step := find_step(without_tool(arm), measured)) is not None:
         notes.append(
             f"from line {lines[step.row]:.0f} on the poses seem to be of another state: {step.text} (off by "
             f"{1e3 * step.before:.1f} mm together, {1e3 * step.left:.1f} mm so); identify from one of both parts"

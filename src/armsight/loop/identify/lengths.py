@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -30,7 +31,12 @@ from armsight.loop.identify.misread import without_tool
 from armsight.loop.identify.model import Model
 from armsight.loop.identify.observable import observed
 from armsight.loop.identify.placement import with_placement
+from armsight.loop.identify.read import read_poses
+from armsight.loop.references.distance import Distance
+from armsight.loop.references.file import read_lengths, read_references
 from armsight.robot.kinematics.arm import Arm
+from armsight.tables.cells import Renames
+from armsight.tables.poses import read_pose_table
 
 SHARE = 0.75  # of the rows; the least trimmed squares fit these; half: fewer than are needed, double: blunders pull
 #: Blocks of rows, and random halves of them that the search begins at: blunders come in runs; half: some are missed.
@@ -39,6 +45,9 @@ TRIMS = 30  # concentration steps at most; half: nothing
 BEGIN_M = 1e-3  # m; noise of a wire to begin at; half, double: nothing
 CHANCE = 1e-4  # of a good row beyond the limit; half, double: one row in ten thousand
 AGREE = 1e-6  # chance of a joint's sign that is found by mistake; half, double: nothing
+REST_S = 0.25  # s; so long about a row's time the arm rests; half: noise, double: arms that go on early pull
+#: What rounding hides at least, rad and m, as positions are computed in single precision; half, double: nothing.
+LEAST_ROUNDED = np.array([1e-7, 1e-7])
 JOIN = 3  # rows; blunders so near each other are one run; half: more lines for the same slip
 
 
@@ -80,27 +89,65 @@ def unrounded(arm: Arm, q: Array, p_base: Array, sigma_rad: float, sigma_m: floa
     return q + off * agree[:, None], np.asarray(agree)
 
 
-def identify_wire(
-    arm: Arm,
-    q: Array,
-    length_m: Array,
-    p_base: Array | None = None,
-    *,
-    step_rad: float = np.deg2rad(0.1),
-    step_m: float = 1e-4,
-    progress: Callable[[str], None] = lambda line: None,
-) -> WireIdentified:
-    """Identify an arm, the anchor and the tool's point by the lengths of one wire.
+class WireRead(NamedTuple):
+    """Rests of an arm with a wire at its tool."""
 
-    ``q``: (N, n) joints, rad. ``length_m``: (N,) of the wire, m. ``p_base``: (N, 3) the tool's origin as the controller
-    computes it, m; None: not known. ``step_rad``: to what the joints are rounded. ``step_m``: to what the position is.
+    q: Array  #: (N, n) joints, rad
+    length_m: Array  #: (N,) of the wire, m
+    p_base: Array | None  #: (N, 3) the tool's origin as the controller computes it, m; None: not known
+    lines: Array  #: (N,) of the file of joints
+    notes: tuple[str, ...]  #: what was left out
+
+
+def read_wire(data: Path, arm: Arm, references: Path, columns: Renames | None = None) -> WireRead:
+    """Read joints, with the controller's positions where the table has them, and the range that a references.toml names.
+
+    The range at a rest is the median of its recording within ``REST_S`` of the row's time; without times in the recording
+    each row has its own.
 
     Raises:
-        InputError: so many rows contradict the rest that no arm of this kind explains them.
+        InputError: either file, more than one range, or rows that do not fit.
     """
+    ranges = [each for each in read_references(references) if isinstance(each.reference, Distance)]
+    if len(ranges) != 1 or (source := ranges[0].source) is None:
+        raise InputError(f"{references}: {len(ranges)} tables of kind range; expected one, with a source")
+    table = read_pose_table(data, arm=arm, columns=columns, only_joints=True)
+    assert table.q is not None  # only_joints
+    p, rows, notes = None, np.arange(len(table.q)), table.notes
+    if {"x_m", "x_mm"} & set(table.unused):
+        read = read_poses(data, columns=columns, arm=arm)
+        p, rows, notes = read.measured.p_rig[:, 0], np.searchsorted(table.lines, read.lines), read.notes
+    (t_s, z), lines = read_lengths(source), table.lines[rows].astype(float)
+    if t_s is None:
+        if len(z) != len(table.q):
+            raise InputError(
+                f"{source}: {len(z)} ranges for {len(table.q)} rows of {data}; give one a row, or times t_s"
+            )
+        return WireRead(table.q[rows], z[rows], p, lines, notes)
+    if table.t_s is None:
+        raise InputError(f"{data}: line 1: a column t_s is needed, as {source} has times")
+    near = [np.abs(t_s - ranges[0].reference.delay_s - at) <= REST_S for at in table.t_s[rows]]
+    if (alone := next((k for k, each in enumerate(near) if not each.any()), None)) is not None:
+        where = f"{data}: line {lines[alone]:.0f}: at {table.t_s[rows][alone]:.3f} s"
+        raise InputError(f"{where} {source} has no range within {REST_S:g} s; do both have one clock?")
+    length_m = np.array([np.median(z[each]) for each in near])
+    return WireRead(table.q[rows], length_m, p, lines, notes)
+
+
+def _step(values: Array) -> float:
+    """Return the largest of 1, 0.1, 0.01 .. 1e-6 that all values are multiples of; 0: none."""
+    steps = 10.0 ** -np.arange(7)
+    return float(next((s for s in steps if np.abs(values / s - np.round(values / s)).max() < 1e-3), 0.0))
+
+
+def without_blunders(
+    arm: Arm, q: Array, length_m: Array, p_base: Array | None, progress: Callable[[str], None] = lambda line: None
+) -> tuple[Measured, Mask, tuple[Blunder, ...]]:
+    """Return rows as measured, which (N,) of them are good, and the others; arguments as for :func:`identify_wire`."""
     good, blunders = np.ones(len(q), np.bool_), []
     if p_base is not None:
-        q, good = unrounded(arm, q, p_base, step_rad / np.sqrt(12), step_m / np.sqrt(12))
+        steps = np.deg2rad(_step(np.rad2deg(q))), 1e-3 * _step(1e3 * p_base)
+        q, good = unrounded(arm, q, p_base, *np.maximum(np.array(steps) / np.sqrt(12), LEAST_ROUNDED))
         if good.sum() < SHARE * len(q):
             raise InputError(
                 f"{arm.name}: positions contradict the joints in {(~good).sum()} of {len(q)} rows: other arm?"
@@ -121,10 +168,29 @@ def identify_wire(
         mm = -1e3 * off[rows]
         side = "long" if mm.mean() > 0 else "short"
         blunders.append(Blunder(rows, f"the wire reads {np.abs(mm).min():.1f} to {np.abs(mm).max():.1f} mm too {side}"))
-    used = good & ~far
+    return measured, good & ~far, tuple(blunders)
+
+
+def identify_wire(
+    arm: Arm,
+    q: Array,
+    length_m: Array,
+    p_base: Array | None = None,
+    *,
+    progress: Callable[[str], None] = lambda line: None,
+) -> WireIdentified:
+    """Identify an arm, the anchor and the tool's point by the lengths of one wire.
+
+    ``q``: (N, n) joints, rad. ``length_m``: (N,) of the wire, m. ``p_base``: (N, 3) the tool's origin as the controller
+    computes it, m; None: not known. What joints and positions are rounded to is found from them.
+
+    Raises:
+        InputError: so many rows contradict the rest that no arm of this kind explains them.
+    """
+    measured, used, blunders = without_blunders(arm, q, length_m, p_base, progress)
     found = identify(arm, measured.rows(used), progress=progress)
     kept = np.flatnonzero(used)[found.solution.used]
-    return WireIdentified(found, measured, np.isin(np.arange(len(q)), kept), tuple(blunders))
+    return WireIdentified(found, measured, np.isin(np.arange(len(q)), kept), blunders)
 
 
 def _trimmed(arm: Arm, measured: Measured) -> tuple[Model, Array, float]:

@@ -38,6 +38,8 @@ FAR_M = 0.1
 def errors(model: Model, x: Array, measured: Measured) -> Errors:
     """Return the errors of a parameter vector on poses."""
     e = model.residuals(x, measured, model.feature_values(measured.q, measured.approach))
+    if measured.length_m is not None:
+        return Errors(np.abs(e), np.zeros(0))
     if measured.R_rig_body is None:
         return Errors(np.linalg.norm(e.reshape(len(e), -1, 3), axis=2), np.zeros(0))
     return Errors(np.linalg.norm(e[:, None, :3], axis=2), np.linalg.norm(e[:, 3:], axis=1))

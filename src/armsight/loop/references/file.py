@@ -192,6 +192,17 @@ def read_recording(path: Path, kind: type[Sensor] = Inertial) -> tuple[Array, Ar
     return rows[:, 0], rows[:, 1:]
 
 
+def read_lengths(path: Path) -> tuple[Array | None, Array]:
+    """Return times (N,), s, None where the table has none, and ranges (N,), m, of a recording of one range."""
+    if not path.is_dir() and path.suffix.lower() == ".csv":
+        columns = Columns.of_csv(path)
+        if not any(_plain(each).startswith(("t_", "time")) for each in columns.head):
+            name, factor = _column(columns.head, COLUMNS[Distance][0], str(path))
+            return None, factor * columns.numbers([name])[:, 0]
+    t_s, z = read_recording(path, Distance)
+    return t_s, z[:, 0]
+
+
 def _kept(path: str | Path, rows: Array, what: str, number: Callable[[int], int]) -> Array:
     """Return the rows (N, k) that are finite; ``number``: of a row, as the file counts its lines or messages."""
     bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))

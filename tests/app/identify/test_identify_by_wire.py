@@ -1,0 +1,57 @@
+"""``armsight identify --references``: an arm by the range to one anchor."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+from arms import FOUR
+from identify_files import arm_toml
+
+from cli_runs import assert_rejected, said_of
+
+ROWS = 80
+HOOKED = np.arange(30, 36)
+
+
+def files(folder, *, timed):
+    """Write a nominal arm, the joints at rests of one with a longer link, and a wire's recording; return arguments."""
+    rng, nominal = np.random.default_rng(5), replace(FOUR, name="four")
+    true = replace(nominal, a=nominal.a + 4e-3 * np.eye(nominal.joints)[1])
+    q, t_s = rng.uniform(-1.0, 1.0, (ROWS, nominal.joints)), 2.0 * np.arange(ROWS)
+    T = true.forward(q)
+    length = np.linalg.norm(T[:, :3, 3] + T[:, :3, :3] @ [0.01, 0.02, 0.05] - [0.4, -0.6, -0.1], axis=1)
+    length[HOOKED] += 0.02
+    names = ["t_s"] * timed + [f"q{k + 1}_rad" for k in range(nominal.joints)]
+    table = np.column_stack([t_s, q] if timed else [q])
+    np.savetxt(folder / "joints.csv", table, "%.7f", ",", header=",".join(names), comments="")
+    late, wire = 0.04, np.column_stack([length + rng.normal(0.0, 1e-4, ROWS)])
+    if timed:
+        at = (t_s[:, None] + np.arange(-0.1, 0.11, 0.05)).ravel()
+        wire = np.column_stack([at + late, np.repeat(length, 5) + rng.normal(0.0, 1e-4, len(at))])
+    wire[:, -1] *= 1e3
+    np.savetxt(folder / "wire.csv", wire, "%.6f", ",", header="t_s,range_mm" if timed else "range_mm", comments="")
+    text = f'[wire]\nkind = "range"\nsource = "wire.csv"\ndelay_s = {late}\n'
+    (folder / "references.toml").write_text(text)
+    arm = arm_toml(folder / "four.toml", nominal)
+    return "--arm", str(arm), "--data", str(folder / "joints.csv"), "--references", str(folder / "references.toml")
+
+
+def test_one_wire_finds_a_longer_link_and_its_hooks(tmp_path, capsys):
+    for timed in (False, True):
+        found = said_of(capsys, "identify", *files(tmp_path, timed=timed), "--json").one
+        before, after = (found[key]["mean_m"] for key in ("nominal", "identified"))
+        assert after < 0.5 * before, timed
+        a2 = next(each for each in found["parameters"] if each["name"] == "a2")
+        assert abs(a2["value"] - FOUR.a[1] - 4e-3) < 4 * a2["sigma"], timed
+        assert found["poses"] == ROWS - len(HOOKED), timed
+        assert "lines 32 to 37: the wire reads" in json.dumps(found), timed  # line 1 has the names
+
+
+def test_what_does_not_fit_is_one_line(tmp_path, capsys):
+    given = files(tmp_path, timed=False)
+    (tmp_path / "wire.csv").write_text("range_mm\n400\n401\n")
+    assert_rejected(said_of(capsys, "identify", *given), f"wire.csv: 2 ranges for {ROWS} rows of")
+    (tmp_path / "wire.csv").write_text("t_s,range_mm\n" + "".join(f"{k / 10},400\n" for k in range(30)))
+    assert_rejected(said_of(capsys, "identify", *given), "joints.csv: line 1: a column t_s is needed")
+    (tmp_path / "references.toml").write_text('[imu]\nkind = "inertial"\n')
+    assert_rejected(said_of(capsys, "identify", *given), "0 tables of kind range; expected one, with a source")
