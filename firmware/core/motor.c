@@ -88,18 +88,15 @@
 void motor_start(motor_state *motor, float angle_rad, float speed_limit_rad_s, uint32_t phase)
 {
     const float duty = motor->duty;
-    const bool new = motor->variance_rr == 0.0f; /* else it may still be as warm as it was */
-    const float resistance = new ? 1.0f : motor->resistance_scale;
+    const float before = motor->variance_rr; /* not 0: it may still be as warm as it was */
+    const float resistance = before > 0.0f ? motor->resistance_scale : 1.0f;
     *motor = (motor_state){0};
     motor->duty = duty;
     motor->fastest_rad_s = speed_limit_rad_s > SEEN_RAD_S ? speed_limit_rad_s : SEEN_RAD_S;
-    motor->last_rad = angle_rad;
-    motor->part_rad = angle_rad;
-    motor->window_rad = angle_rad;
-    motor->window_side = SIDE_UNKNOWN;
+    motor->last_rad = motor->part_rad = motor->window_rad = angle_rad;
     motor->resistance_scale = resistance;
     motor->constant_scale = 1.0f;
-    motor->variance_rr = PRIOR_VARIANCE;
+    motor->variance_rr = before > PRIOR_VARIANCE ? before : PRIOR_VARIANCE;
     motor->variance_kk = PRIOR_VARIANCE;
     motor->unsure_rad_s = UNKNOWN_RAD_S;
     motor->step_rad_s = UNKNOWN_RAD_S;
@@ -155,7 +152,7 @@ static float window_noise(motor_state *motor, const motor_config *config, float 
     return WINDOW_NOISE_RAD + crossed * config->backlash_rad + twist_rad + motor->uneven * number_size(way_rad);
 }
 
-static inline void warms(motor_state *motor, const motor_config *config, uint32_t ticks)
+void motor_warms(motor_state *motor, const motor_config *config, uint32_t ticks)
 {
     if (motor->variance_rr < WARM_VARIANCE) {
         const float sigma = number_root(motor->variance_rr) + WARMS * (float)ticks;
@@ -168,7 +165,7 @@ static inline void warms(motor_state *motor, const motor_config *config, uint32_
 static void learn(motor_state *motor, const motor_config *config)
 {
     const bool moved = motor->window_side != SIDE_UNKNOWN;
-    warms(motor, config, motor->mean_ticks); /* also where nothing is learnt */
+    motor_warms(motor, config, motor->mean_ticks); /* also where nothing is learnt */
     const float wander = WANDER_VARIANCE * (float)motor->mean_ticks;
     const float ir_v = motor->mean_ir_v;
     const float kw_v = motor->mean_kw_v;
@@ -290,9 +287,7 @@ static void take(motor_state *motor, const motor_config *config)
 {
     if (motor->window_ticks > SAMPLE_TICKS) {
         lately(motor);
-        return;
-    }
-    if (motor->mean_teaches != 0u) {
+    } else if (motor->mean_teaches != 0u) {
         learn(motor, config);
     }
 }
@@ -517,8 +512,6 @@ void motor_doubt(motor_state *motor, const motor_config *config)
     }
 }
 
-void motor_warms(motor_state *motor, const motor_config *config, uint32_t ticks) { warms(motor, config, ticks); }
-
 float motor_way(const motor_state *motor, bool yielding)
 {
     return TICK_S * (motor->speed_rad_s + (yielding ? motor->unsure_per_a * motor->last_a : 0.0f));
@@ -605,7 +598,6 @@ float motor_sure(const motor_state *motor)
     return by_current_rad_s < motor->sure_rad_s ? by_current_rad_s : motor->sure_rad_s;
 }
 
-/* Return whether a current is seen, without which its sensor may be broken. */
 void motor_damp(motor_state *motor, float reading_rad_s)
 {
     const bool known = motor_is_known(motor) && motor->unsure_rad_s < UNKNOWN_RAD_S;
@@ -974,16 +966,23 @@ bool motor_disobeys(const motor_state *motor, const motor_config *config, float 
 #define SWING_RAD_S 0.4f /* rad/s from the reference's speed at least; half: noise swings, double: slow joints swing
                             unseen */
 
-bool motor_swings_far(motor_state *motor, float off_rad_s)
+bool motor_swings_far(motor_state *motor, float off_rad_s, bool known)
 {
     const int32_t side = off_rad_s > 0.0f ? 1 : -1;
-    if (number_size(off_rad_s) <= SWING_RAD_S) {
+    const float size_rad_s = number_size(off_rad_s);
+    if (size_rad_s <= SWING_RAD_S) {
         return false;
     }
-    if (side != motor->swing_side) {
+    if (side != motor->swing_side) { /* what is shown by noise, of a current beside an uncertain resistance or of a reading, */
+        const float noise_rad_s = known ? motor->unsure_per_a * number_size(motor->last_a) : SWING_RAD_S;
+        const bool stays = motor->driven_ticks - motor->swing_other <= WATCH_TICKS; /* is gone when it is looked at next */
+        motor->swing_other = motor->driven_ticks;
+        if (!stays && size_rad_s <= SWING_RAD_S + noise_rad_s) {
+            return false;
+        }
         motor->swings = motor->driven_ticks - motor->swing_since <= SWING_TICKS ? motor->swings + 1u : 0u;
-        const float stays = motor->swings > SWINGS / 2u ? motor->swing_rad_s : -SWING_STAYS * motor->swing_rad_s;
-        motor->swing_stays_rad_s = motor->swings != 0u ? motor->swing_stays_rad_s + stays : 0.0f;
+        const float goes = motor->swings > SWINGS / 2u ? motor->swing_rad_s : -SWING_STAYS * motor->swing_rad_s;
+        motor->swing_stays_rad_s = motor->swings != 0u ? motor->swing_stays_rad_s + goes : 0.0f;
         if (motor->swings >= SWINGS && motor->swing_stays_rad_s < 0.0f) {
             motor->swings = 0u; /* it decays by itself */
             motor->swing_stays_rad_s = 0.0f;
@@ -992,7 +991,6 @@ bool motor_swings_far(motor_state *motor, float off_rad_s)
         motor->swing_side = side;
         motor->swing_since = motor->driven_ticks;
     }
-    const float size_rad_s = number_size(off_rad_s);
     motor->swing_rad_s = size_rad_s > motor->swing_rad_s ? size_rad_s : motor->swing_rad_s;
     return motor->swings >= SWINGS;
 }

@@ -137,8 +137,8 @@ bool motor_disobeys(const motor_state *motor, const motor_config *config, float 
 #define MOTOR_SWING 0.2f /* of the speed limit: so far from the reference's speed a swing goes at least; half: elastic joints
                             alarm, double: slow swings are not seen */
 
-/* Return whether the motor swings about its reference, from whose speed it is far off by off_rad_s. */
-bool motor_swings_far(motor_state *motor, float off_rad_s);
+/* Return whether the motor swings about its reference, from whose speed it is far off by off_rad_s, by its own speed if known. */
+bool motor_swings_far(motor_state *motor, float off_rad_s, bool known);
 
 #define UNKNOWN_RAD_S 1000.0f /* as uncertain as a motor's speed is whose voltage is not known */
 
@@ -149,8 +149,9 @@ static inline bool motor_is_known(const motor_state *motor) { return motor->sure
  * reference_rad_s. To be asked each WATCH_TICKS. */
 static inline bool motor_swings(motor_state *motor, float reading_rad_s, float reference_rad_s, float speed_limit_rad_s)
 {
-    const float off_rad_s = (motor_is_known(motor) ? motor->speed_rad_s : reading_rad_s) - reference_rad_s;
-    return number_size(off_rad_s) > MOTOR_SWING * speed_limit_rad_s && motor_swings_far(motor, off_rad_s);
+    const bool known = motor_is_known(motor);
+    const float off_rad_s = (known ? motor->speed_rad_s : reading_rad_s) - reference_rad_s;
+    return number_size(off_rad_s) > MOTOR_SWING * speed_limit_rad_s && motor_swings_far(motor, off_rad_s, known);
 }
 
 /* Return whether a joint whose reading is faster than its limit has been so long enough to be sure. */

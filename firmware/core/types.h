@@ -454,7 +454,8 @@ typedef struct motor_state {
     float way_mark_rad;      /* the reading's when it last got on */
     uint32_t way_ticks;      /* since then */
     int32_t swing_side;      /* which side of the reference's speed the motor's was on last */
-    uint32_t swing_since;    /* driven_ticks when it changed */
+    uint32_t swing_since;    /* driven_ticks when it changed, */
+    uint32_t swing_other;    /* and when it was last seen on the other side */
     uint32_t swings;         /* changes in quick succession */
     float swing_rad_s;       /* how far from it it went since the last, */
     float swing_stays_rad_s; /* sum of that over the second half of the changes that count, less a share of the first half's */

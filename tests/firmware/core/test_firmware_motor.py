@@ -225,8 +225,10 @@ def test_elastic_joints_are_held_and_not_taken_for_broken_ones(arms, library):
     for seed in range(81, 87):
         arms.elastic(library, seed, table)
         arms.eccentric(library, seed, table)
-    assert not sum(table.false.values())
     assert table.fast["elastic 8 to 40 Hz"] < 1.4
+    for seed in (99500300763, 99500317835, 99500316962):  # light ones with backlash, and one that its load takes far
+        arms.elastic(library, seed, table)
+    assert not sum(table.false.values())
 
 
 def test_an_elastic_joint_swings_where_it_is_damped_by_the_reading(arms, library):
@@ -278,14 +280,34 @@ def test_a_jump_too_small_for_the_reading_alone_is_named_by_its_step(arms, libra
     assert arm.first == (Fault.POT_JUMP, 4)
 
 
-def test_gains_that_make_a_joint_swing_are_noticed(arms, library):
-    arm = arms.Arm(library, 930)
+@pytest.mark.parametrize("seed", [931, 932, 933])
+def test_gains_that_make_a_joint_swing_are_noticed(arms, library, seed):
+    arm = arms.Arm(library, seed)
     for joint in arm.core.config.joint:
         joint.gains.kp_per_rad, joint.gains.kd_s_per_rad = 60.0, 6.0
     arm.core.crc, arm.core.crc_at, arm.core.crc_known = 0xFFFFFFFF, 0, 0
     arm.enable()
     arm.swing(3000)
     assert arm.first[0] is Fault.OSCILLATION
+
+
+@pytest.mark.parametrize("name", ["a reading", "a current beside an uncertain resistance"])
+def test_noise_is_no_swing_and_a_swing_is_one(library, name):
+    """Noise of a speed beyond the threshold is on either side by chance; a swing of 20 Hz stays there for some looks."""
+    noise = np.random.default_rng(8).normal(0, 0.3, 1000)
+    found = []
+    for speeds in (noise, noise + 0.7 * np.sin(2 * np.pi * 20 * 3e-3 * np.arange(1000))):
+        motor = c.motor_state()
+        library.motor_start(ctypes.byref(motor), ctypes.c_float(0.0), ctypes.c_float(2.0), 0)
+        motor.last_a, motor.unsure_per_a = 0.5, 0.8
+        for speed in speeds:
+            motor.driven_ticks += 3
+            if library.motor_swings_far(ctypes.byref(motor), ctypes.c_float(speed), name != "a reading"):
+                found.append(True)
+                break
+        else:
+            found.append(False)
+    assert found == [False, True]
 
 
 def test_backlash_teaches_no_resistance(arms, library):

@@ -80,6 +80,16 @@ def test_elastic_gains_are_slower_for_softer_joints_and_none_for_the_softest():
     assert ki(2.0) is None
 
 
+def test_elastic_gains_leave_room_for_backlash_that_opens():
+    """A gap in a spring is a softer spring: unloaded, its poles decay at a fifth of the stiffness too."""
+    motor = MotorFigures(6.0, 2.4, 0.06, 0.02, 0.2)
+    stiffness = 0.03 * (2 * np.pi * 20.0) ** 2
+    loaded, light = (
+        elastic_gains(motor, 12.0, Elasticity(stiffness, 1e-3 * stiffness, 0.5, opens), 4e-4) for opens in (False, True)
+    )
+    assert 0.4 * loaded[1] < light[1] < 0.9 * loaded[1]
+
+
 @pytest.mark.parametrize("count", [0, 1, 2, 50, 3000])
 def test_readings_that_show_nothing_show_no_spring_and_no_drum(count):
     t_s, nothing = 0.002 * np.arange(count), np.zeros(count)

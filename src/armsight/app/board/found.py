@@ -41,9 +41,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _MARGIN_RAD = 0.05
-#: Of an elastic joint: factor of its stiffness, share of stall torque and acceleration that twist it, rad.
-#: Half: slower, double: it rings.
-_SOFTER, _SUDDEN, _ACCELERATION_TWIST_RAD = 1.5, 0.2, 0.0025
+#: Of an elastic joint: share of stall torque, and acceleration that twist it, rad. Half: slower, double: it rings.
+_SUDDEN, _ACCELERATION_TWIST_RAD = 0.2, 0.0025
 _MOST_INVERTED_RAD = 1.0
 _MOST_UNEVEN = 0.5  # share of a ratio, as config.c holds it
 
@@ -118,7 +117,10 @@ class JointFound:
     def elastic(self) -> Elasticity | None:
         """Its spring, where it has one."""
         values = (self.stiffness_n_m, self.spring_damping_n_m_s, self.link_share)
-        return None if None in values else Elasticity(*values)  # type: ignore[arg-type]
+        if None in values:
+            return None
+        opens = (self.gravity_n_m or 0.0) < 0.5 * (self.backlash_rad or 0.0) * (self.stiffness_n_m or 0.0)
+        return Elasticity(*values, opens)  # type: ignore[arg-type]
 
     @property
     def friction_twist_rad(self) -> float:
@@ -309,6 +311,9 @@ def _put_motor(
     if elastic is not None:
         soft = elastic_gains(motor, supply_v, elastic, found.noise_rad)
         gains = np.zeros(len(GAIN_RANGES)) if soft is None else soft
+    if gains[0] > 0:  # until ki answers a load takes it so far that kp asks for the whole duty
+        joint["pot"]["inverted_rad"] = min(joint["pot"]["inverted_rad"] + 1 / gains[0], _MOST_INVERTED_RAD)
+        joint["following_rad"] += 1 / gains[0]
     backlash_rad = 1.5 * (LAB_BACKLASH_RAD if found.backlash_rad is None else found.backlash_rad)
     apart_rad = max(0.03, 10 * found.noise_rad + backlash_rad)
     joint["motor"] = (motor.resistance_ohm, motor.constant_v_s, apart_rad, backlash_rad)
@@ -336,8 +341,6 @@ def _put_spring(joint: Configuration, motor: MotorFigures, elastic: Elasticity, 
     stalled_rad = supply_v / motor.resistance_ohm * twist_rad_per_a
     _put(joint["transmission"], damping_share=1.0, twist_rad_per_a=min(twist_rad_per_a, 1.0))
     joint["motor"]["apart_rad"] = min(joint["motor"]["apart_rad"] + _SUDDEN * stalled_rad, 1.0)
-    joint["pot"]["inverted_rad"] = min(joint["pot"]["inverted_rad"] + _SOFTER * stalled_rad, _MOST_INVERTED_RAD)
-    joint["following_rad"] += _SOFTER * stalled_rad
 
 
 def _put_free(joint: Configuration, found: JointFound) -> None:

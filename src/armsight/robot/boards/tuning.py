@@ -66,6 +66,7 @@ class Elasticity:
     stiffness_n_m: float  #: of the spring, N m/rad
     damping_n_m_s: float  #: of the spring, N m s/rad
     link_share: float  #: share of the joint's inertia behind the spring
+    opens: bool = False  #: whether its load is too small to keep the teeth of its backlash together
 
     def held_hz(self, inertia_kg_m2: float) -> float:
         """Return the resonance of the joint while its motor is held, Hz, of an inertia of motor and joint together."""
@@ -112,6 +113,9 @@ def tuned_gains(
 #: gain may come, and damping and ratio of the third pole to the others' frequency. The motor's speed is smoothed for so
 #: long (motor.c), and a duty comes so late: a tick is half held, one is computed in.
 _STIFFNESSES, _LEAST_MARGIN, _ELASTIC_DAMPING = (0.5, 1.0, 1.7), 0.5, 0.7
+#: Share of spring and damping that swings of 0.7 of the backlash find (the describing function of a gap in a spring); half:
+#: soft joints are slow, double: light ones swing between the teeth.
+_OPEN_SHARE = 0.2
 _THIRD_POLES, _MOTOR_SMOOTH_S, _LATE_S = (1.0, 0.6), 0.002, 0.0015
 _ELASTIC_FILTER_S = 0.005  # of the reading's speed, which is damped only while the motor's is not known
 _MARGIN_HZ = np.geomspace(0.3, 400.0, 200)
@@ -123,7 +127,8 @@ def elastic_gains(motor: MotorFigures, supply_v: float, elastic: Elasticity, noi
     Without the spring there would be three poles, ``(s^2 + 2 z w s + w^2) (s + r w)``; w is the greatest with which the
     loop gain, at the motor's duty and with the spring, stays away from -1 and every pole decays. Damping by its speed
     takes energy from the resonance at any frequency; by the speed read behind the spring it feeds it from there on (Spong,
-    Hutchinson and Vidyasagar, "Robot Modeling and Control", 2006, section 6.5).
+    Hutchinson and Vidyasagar, "Robot Modeling and Control", 2006, section 6.5). Backlash that opens is a softer spring, the
+    softer the smaller the swing (Gelb and Vander Velde, "Multiple-Input Describing Functions", 1968, chapter 2).
 
     Args:
         motor: its motor; the inertia is that of motor and joint together.
@@ -135,13 +140,16 @@ def elastic_gains(motor: MotorFigures, supply_v: float, elastic: Elasticity, noi
         (8,) as those of :func:`tuned_gains`; None where the joint is too soft: no bandwidth from 5 rad/s on is stable.
     """
     best: Array | None = None
+    springs = [(share, elastic.damping_n_m_s, _LEAST_MARGIN) for share in _STIFFNESSES]
+    if elastic.opens:
+        springs.append((_OPEN_SHARE, _OPEN_SHARE * elastic.damping_n_m_s, 0.0))
     for third in _THIRD_POLES:
         for bandwidth in _bandwidths(motor, _QUIET_STEP_RAD_S):
             gains = _three_pole_gains(motor, supply_v, bandwidth, third)
             too_many = any(gain > most for gain, (_, most) in zip(gains, GAIN_RANGES.values(), strict=True))
             if too_many or gains[0] * noise_rad > _QUIET[0][1]:
                 continue
-            if all(_holds(motor, supply_v, elastic, gains, share) for share in _STIFFNESSES):
+            if all(_holds(motor, supply_v, elastic, gains, *spring) for spring in springs):
                 best = gains if best is None or gains[1] > best[1] else best
                 break
     return best
@@ -158,17 +166,19 @@ def _three_pole_gains(motor: MotorFigures, supply_v: float, bandwidth: float, th
     return np.array([kp, ki, kd, own / stall + kd, ka, kf, _ELASTIC_FILTER_S, windup])
 
 
-def _holds(motor: MotorFigures, supply_v: float, elastic: Elasticity, gains: Array, share: float) -> bool:
-    """Return whether the loop with share of the spring's stiffness is stable, with margin."""
+def _holds(
+    motor: MotorFigures, supply_v: float, elastic: Elasticity, gains: Array, share: float, c: float, margin: float
+) -> bool:
+    """Return whether the loop with share of the spring's stiffness and damping c, N m s/rad, is stable, with margin."""
     stall, own = motor.stall_n_m(supply_v), motor.own_damping_n_m_s
     link = elastic.link_share * motor.inertia_kg_m2
-    rotor, k, c = motor.inertia_kg_m2 - link, share * elastic.stiffness_n_m, elastic.damping_n_m_s
+    rotor, k = motor.inertia_kg_m2 - link, share * elastic.stiffness_n_m
     kp, ki, kd = gains[:3]
     s = 2j * np.pi * _MARGIN_HZ
     spring = k + c * s
     per = stall * np.exp(-_LATE_S * s) / ((rotor * s**2 + own * s + spring) * (link * s**2 + spring) - spring**2)
     loop = per * (spring * (kp + ki / s) + (link * s**2 + spring) * kd * s / (1 + _MOTOR_SMOOTH_S * s))
-    if np.abs(1 + loop).min() < _LEAST_MARGIN:
+    if np.abs(1 + loop).min() < margin:
         return False
     # States: motor's angle and speed, joint's angle and speed, smoothed speed, integral, lateness (Pade's first order).
     a, asked = np.zeros((7, 7)), np.array([0, 0, -kp, 0, -kd, 1, 0])
