@@ -542,9 +542,9 @@ def rotated_camera(rotation_deg: float) -> None:
 
 def rendered(case: str) -> None:
     """Run the quick demo with a fault and print what it says."""
-    run, carry = demo.run_experiment, Mounting.pose_measurement
+    run, carry = demo.run_in, Mounting.pose_measurement
 
-    def faulty(setup, rig, plan, targets, **options):
+    def faulty(folder, setup, rig, plan, targets, files, **options):
         if case == "rig":
             rotated = exp_se3(np.array([0.0, 0.0, 0.0, 0.0, 0.05 * DEG, 0.0]))
             rig = replace(rig, T_left_right=rig.T_left_right @ rotated)
@@ -554,7 +554,7 @@ def rendered(case: str) -> None:
             setup = replace(setup, target=type(target)(target.name, (), replace(discs, body=body)))
         if case == "fixed":
             setup = replace(setup, fixed=with_plates(case))
-        return run(setup, rig, plan, targets, **options)
+        return run(folder, setup, rig, plan, targets, files, **options)
 
     def moved(mounting, measured, t_s):
         if case in ("knock", "bump", "fixed") and t_s >= KNOCK_S:
@@ -564,13 +564,13 @@ def rendered(case: str) -> None:
 
     if case == "rotation":
         rotated_camera(0.02)
-    demo.run_experiment, Mounting.pose_measurement = faulty, moved
+    demo.run_in, Mounting.pose_measurement = faulty, moved
     try:
         with tempfile.TemporaryDirectory() as folder:
             began = time.perf_counter()
             report = demo.run_demo(demo.Demo(Path(folder), quick=True))
     finally:
-        demo.run_experiment, Mounting.pose_measurement = run, carry
+        demo.run_in, Mounting.pose_measurement = run, carry
     for name, track in ((name, report.json().get(name)) for name in ("vision", "fused")):
         if track is not None:
             rms, claimed = (1e3 * track.get(key, np.nan) for key in ("position_rms_m", "position_sigma_rms_m"))

@@ -340,7 +340,7 @@ def cost() -> None:
     session.start()
     server = LiveServer(session, port=0)
     server.start()
-    until(lambda: session.newest is not None)
+    until(lambda: session.capture.newest is not None)
 
     def share(seconds: float) -> float:
         before, began = time.process_time(), time.monotonic()
@@ -361,10 +361,10 @@ def cost() -> None:
     session.capture.close()
     session.shared.capture = CameraCapture(lambda: Pictures(150.0))
     session.capture.start()
-    until(lambda: session.newest is not None and session.newest.number > 500)
-    first, begun = session.newest.number, resident_mb()
-    until(lambda: session.newest.number - first >= 10_000, 600.0)
-    print(f"{session.newest.number - first} frames: memory {begun:.0f} -> {resident_mb():.0f} MB")
+    until(lambda: session.capture.newest is not None and session.capture.newest.number > 500)
+    first, begun = session.capture.newest.number, resident_mb()
+    until(lambda: session.capture.newest.number - first >= 10_000, 600.0)
+    print(f"{session.capture.newest.number - first} frames: memory {begun:.0f} -> {resident_mb():.0f} MB")
     driver.quit()
     server.close()
     session.close()

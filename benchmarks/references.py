@@ -24,7 +24,7 @@ import numpy as np
 from armsight.app.demo import demo
 from armsight.app.demo.demo import true_track
 from armsight.app.replay.open import Request, replay
-from armsight.app.run.experiment import run_experiment
+from armsight.app.run.folder import run_in
 from armsight.app.run.metrics import track_metrics
 from armsight.app.run.tracks import Tracks
 from armsight.data import Array
@@ -97,7 +97,7 @@ def hidden_run(seed: int, folder: Path) -> tuple[dict[str, tuple[float, float]],
     demo._MOTIONS = {**demo._MOTIONS, True: circles(folder / "circles.toml")}
     Workcell.cover = cover  # type: ignore[method-assign]
     demo.finish = finish
-    demo.run_experiment = lambda *given, **named: run_experiment(*given, **named, close_loop=False)
+    demo.run_in = lambda *given, **named: run_in(*given, **named, close_loop=False)
     demo.run_demo(demo.Demo(folder / "run", seed=seed, quick=True))
     return found, spans
 

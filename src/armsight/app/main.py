@@ -20,7 +20,7 @@ import click
 
 from armsight.app.interrupts import terminate_as_interrupt
 from armsight.app.retired import in_todays_options
-from armsight.app.show.messages import UNANSWERED, colour, print_error, print_notes, silence_stdout
+from armsight.app.show.messages import UNANSWERED, colour, note, print_error, print_notes, silence_stdout
 from armsight.errors import ArmsightError
 
 #: What a person is about -> the commands with the first sentence of their help; each has a folder of its name.
@@ -137,8 +137,7 @@ class _Sections(click.Group):
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Read the command line, with today's options for those that are retired."""
         args, notes = in_todays_options(args)
-        for note in notes:
-            click.echo(f"note: {note}", err=True)
+        note(*notes)
         return super().parse_args(ctx, args)
 
     def invoke(self, ctx: click.Context) -> object:

@@ -25,6 +25,7 @@ from typing import Any, get_args, get_type_hints
 
 import click
 
+from armsight.app.show.messages import note
 from armsight.errors import InputError
 
 #: What is in a rig's file, for :func:`out`.
@@ -169,7 +170,7 @@ def _say_replaced(before: Mapping[str, tuple[int, int]]) -> None:
     there = ((file, os.stat(file)) for file in sorted(before) if os.path.exists(file))
     if changed := [file for file, now in there if (now.st_ino, now.st_mtime_ns) != before[file]]:
         more = f" and {len(changed) - _LISTED} more" if len(changed) > _LISTED else ""
-        click.echo(f"note: replaced: {', '.join(changed[:_LISTED])}{more}", err=True)
+        note(f"replaced: {', '.join(changed[:_LISTED])}{more}")
 
 
 def _parameters(of: Any) -> Iterator[click.Parameter]:  # noqa: ANN401 - a function or a class

@@ -35,8 +35,10 @@ class FakeSession:
 
     def __init__(self):
         self.executed, self.held, self.said = [], [], []
-        self.arm = SimpleNamespace(busy=False)
+        self.arm = SimpleNamespace(busy=False, hold_for=self.held.append, between_shots=lambda: None)
         self.step, self.number = "cameras", 1
+
+    capture = property(lambda self: self)
 
     @property
     def newest(self):
@@ -45,9 +47,6 @@ class FakeSession:
 
     def sections(self):
         return {"overview": SimpleNamespace, "cameras": {"step": self.step}} | {"overview": {"step": self.step}}
-
-    def between_shots(self):
-        pass
 
     def events(self, after=0):
         return (Event(1, "12:00:00", "good", "begun"),) if after < 1 else ()
@@ -59,9 +58,6 @@ class FakeSession:
 
     def stop(self):
         return StopAnswer(True, "emergency stop", 1.0)
-
-    def hold(self, why):
-        self.held.append(why)
 
     def say(self, level, text):
         self.said.append(text)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from armsight.app.options import JSON, SEED, argument, declared, option, out
+from armsight.app.show.messages import note, print_answer
 from armsight.errors import InputError
 from armsight.files import as_input_error, check_folder, check_suffix, check_writable, read_text, read_toml, write_text
 
@@ -29,17 +29,13 @@ _ANGLES = argument("Q1 Q2 ...")
 
 
 def _print(shown: Shown, as_json: bool) -> None:
-    click.echo(json.dumps(shown[0]) if as_json else "\n".join(shown[1]))
+    print_answer(as_json, shown[0], *shown[1])
 
 
 def _open(name: str) -> Arm:
     from armsight.robot.arm_file import open_arm
 
     return open_arm(name)
-
-
-def _note(text: str) -> None:
-    click.echo(f"note: {text}", err=True)
 
 
 def _check_written(output: Path, arm: str, *also: str | Path, suffix: str = "", what: str = "") -> None:
@@ -106,8 +102,7 @@ def fk(arm_name: str = _ARM, angles: tuple[str, ...] = _ANGLES, as_json: bool = 
         corrected = open_corrected(arm_name)
         T = corrected.forward(q[None])[0]
         sides = "with the sensors' curves and compliance; from which sides the joints came is not known"
-        for note in (*corrected.notes, sides):
-            _note(note)
+        note(*corrected.notes, sides)
     _print(description.forward(arm, q, T), as_json)
 
 
@@ -203,7 +198,7 @@ def calibrated(
         off_m, off_rad = write_calibration(arm, nominal, output)
         if max(off_m, off_rad) > 1e-9:
             off = f"{1e3 * off_m:.3f} mm and {math.degrees(off_rad):.3f} deg off the last joint's axis"
-            _note(f"{output} cannot hold the flange's {off}: give them to the tool")
+            note(f"{output} cannot hold the flange's {off}: give them to the tool")
     elif output is not None:
         write_urdf(arm, output)
     _print(description.difference(nominal, arm, difference(nominal, arm), sigma_m), as_json)
@@ -237,7 +232,7 @@ def plan(
     write_text(output, text)
     size = " x ".join(f"{100 * each:.0f}" for each in extent) + " cm"
     if extent.min() < _NARROW_M:
-        _note(
+        note(
             f"the poses are between those at which {around} saw the body, and cover only {size}: zeros, base "
             "and tool, and lengths will hardly be distinguished; first record a run whose hand-eye poses cover more"
         )
@@ -319,6 +314,5 @@ def _joints(arm: Arm, texts: tuple[str, ...]) -> Array:
     most = np.floor(np.degrees(MOST_RADIANS))
     for i in np.flatnonzero(np.abs(degrees) > most)[:1]:
         raise InputError(f"q{i + 1} is {texts[i]} degrees; no joint rotates further than {most:.0f}")
-    for note in description.beyond(arm, np.radians(degrees)):
-        _note(note)
+    note(*description.beyond(arm, np.radians(degrees)))
     return np.asarray(np.radians(degrees))

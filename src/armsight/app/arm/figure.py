@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from armsight.app.show.plotting import BLUE, INK, MUTED, ORANGE, RED, drawing, new_figure, png
+from armsight.app.show.plotting import BLUE, INK, MUTED, ORANGE, RED, Figure, drawing, new_figure, png
 from armsight.data import Array
 from armsight.files import replacing
 from armsight.robot.kinematics.arm import Arm
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 #: Colours of the x, y and z axes of a frame, and their length as a share of the drawing.
 AXES, SHARE = (RED, "#2f855a", BLUE), 0.11

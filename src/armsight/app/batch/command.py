@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import click
 
 from armsight.app.options import ESTIMATOR, JSON, argument, declared, option, out
+from armsight.app.show.messages import print_answer, say
 from armsight.errors import InputError
 
 OPERATIONS = ("measure", "replay", "identify", "check")
@@ -56,18 +56,14 @@ def command(
         raise InputError("batch identify needs the nominal arm: give --arm, a name, .toml or .urdf")
     options = BatchOptions(operation, _absolute(rig), _absolute(target), _absolute(arm), estimator)
     batch = Batch(recordings, output.expanduser(), options, workers)
-    done = run_batch(batch, lambda line: click.echo(line, err=True))
-    if as_json:
-        click.echo(json.dumps(done.to_json()))
-    else:
-        click.echo(
-            f"{done.recordings} recordings: {done.ok} done, {done.before} of them before, {done.failed} failed; "
-            f"{done.shots} shots; written to {output}"
-        )
-        for reason, count in list(done.reasons.items())[:_REASONS]:
-            click.echo(f"  failed {count} times: {reason}")
-        if done.failed:
-            click.echo(f"  {output}/recordings.parquet has every reason; started again, the batch tries these again")
+    done = run_batch(batch, say)
+    said = [
+        f"{done.recordings} recordings: {done.ok} done, {done.before} of them before, {done.failed} failed; "
+        f"{done.shots} shots; written to {output}"
+    ]
+    said += [f"  failed {count} times: {reason}" for reason, count in list(done.reasons.items())[:_REASONS]]
+    more = f"  {output}/recordings.parquet has every reason; started again, the batch tries these again"
+    print_answer(as_json, done.to_json(), *said, *([more] if done.failed else []))
     if done.failed:
         click.get_current_context().exit(1)
 
@@ -81,7 +77,7 @@ def _report(folders: tuple[str, ...], as_json: bool) -> None:
     if len(folders) != 1:
         raise InputError("batch report reads the results of one batch: give its folder")
     rows = report(Path(folders[0]).expanduser())
-    click.echo(json.dumps(to_json(rows)) if as_json else "\n".join(lines(rows)))
+    print_answer(as_json, to_json(rows), *lines(rows))
 
 
 def _absolute(name: str | None) -> str | None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import re
 import threading
 import time
@@ -17,7 +16,7 @@ from click.core import ParameterSource
 from armsight.app.board.flash import FLASHED, PROGRAMMERS, build_firmware, flash, package_build
 from armsight.app.options import JSON, SECONDS, argument, declared, option, out
 from armsight.app.progress import steps
-from armsight.app.show.messages import UNTRUSTED
+from armsight.app.show.messages import UNTRUSTED, note, print_answer
 from armsight.errors import DeviceError, InputError
 from armsight.files import check_folder, unused, write_text
 
@@ -56,10 +55,6 @@ _BOARD = option(
 _COMPILER = option("zig or gcc; by default the first one that is installed.", metavar="NAME")
 _FOLDER = out("DIR", "Where the image is written.", default="firmware-build")
 _YES = option("Do not ask.")
-
-
-def _show(as_json: bool, value: object, text: str) -> None:
-    click.echo(json.dumps(value) if as_json else text)
 
 
 def _open(name: str) -> Board:
@@ -115,7 +110,7 @@ def build_(
         if name is None:
             build.build_package(firmware.BUILT, build.open_compiler(compiler))
         built = package_build() if name is None else build_firmware(name, output, compiler)
-    _show(as_json, text.built_json(built), text.built_text(built))
+    print_answer(as_json, text.built_json(built), text.built_text(built))
 
 
 @command.command("flash")
@@ -136,7 +131,7 @@ def flash_(
         progress("writing")
         used = flash(built, programmer)
     answer = {**text.built_json(built), "programmer": used}
-    _show(as_json, answer, f"{built.image} is on the board, written by {used}")
+    print_answer(as_json, answer, f"{built.image} is on the board, written by {used}")
 
 
 @command.command()
@@ -155,7 +150,7 @@ def monitor(
     from armsight.robot.board_registry import is_real
 
     if click.get_current_context().get_parameter_source("name") is ParameterSource.DEFAULT:
-        click.echo(f"note: no --board: this one is {name}, a program; --board serial:PORT is a board", err=True)
+        note(f"no --board: this one is {name}, a program; --board serial:PORT is a board")
     with open_any(name) as board:
         click.echo(text.welcome_text(board), err=True)
         passed, said = 0.0, ""
@@ -163,11 +158,11 @@ def monitor(
             states = board.receive(every)
             passed += every
             if (now := not_homed(board)) != said:
-                click.echo(f"note: {now or 'all joints are homed'}", err=True)
+                note(f"{now or 'all joints are homed'}")
                 said = now
             if not is_real(name):
                 time.sleep(every)  # its time passes at once
-            _show(as_json, text.status_json(board, states), text.status_text(board, states))
+            print_answer(as_json, text.status_json(board, states), text.status_text(board, states))
 
 
 @command.command()
@@ -196,7 +191,7 @@ def gains(
             board.confirm(board.set_gains(values))
         if store:
             board.store(text.with_gains(config, values))
-    _show(as_json, text.gains_json(values), text.gains_text(values))
+    print_answer(as_json, text.gains_json(values), text.gains_text(values))
     if store:
         click.echo("stored: in use after the board's next start, too", err=True)
         if board.welcome.config_source == ConfigSource.FACTORY:
@@ -225,7 +220,7 @@ def selftest_(
         click.echo(f"{name}: {keep_clear if drives else 'drives stay off; --drives moves the arm'}", err=True)
     with steps() as progress:
         result = selftest(name, drives=drives, progress=progress)
-    _show(as_json, result.record(), text.selftest_text(result))
+    print_answer(as_json, result.record(), text.selftest_text(result))
     for scenario, found in result.scenarios.items():
         for problem in found.problems:
             click.echo(f"{scenario}: {problem}", err=True)
@@ -287,8 +282,7 @@ def bringup(
         chosen = [joint - 1 for joint in sorted(set(joints))] or range(6)
         session = Bringup(board, person, folder, chosen, encoders=kinds, again=again, most_current_a=most_current_a)
         session.run(steps or tuple(STEPS))
-    if as_json:
-        click.echo(json.dumps(session.found.json()))
+    print_answer(as_json, session.found.json())
     if session.refuted:
         click.get_current_context().exit(UNTRUSTED)
 
@@ -352,7 +346,7 @@ def home(
         if not len(q := board.receive(0.05).q):
             raise DeviceError(f"{name} reports no angles after it was homed")
     degrees = [round(float(each), 3) for each in np.degrees(q[-1])]
-    _show(as_json, {"q_rad": [round(float(each), 6) for each in q[-1]]}, f"homed, at {degrees} deg")
+    print_answer(as_json, {"q_rad": [round(float(each), 6) for each in q[-1]]}, f"homed, at {degrees} deg")
 
 
 @command.command()
@@ -368,7 +362,7 @@ def clear(name: str = _BOARD, as_json: bool = JSON) -> None:
         board.receive(0.05)
         state, faults = board.status.state.name, board.status.faults
     said = "; ".join(map(str, faults)) or "no fault"
-    _show(as_json, {"state": state, "faults": [each.fault.name for each in faults]}, f"{state}: {said}")
+    print_answer(as_json, {"state": state, "faults": [each.fault.name for each in faults]}, f"{state}: {said}")
 
 
 @command.command()
@@ -381,7 +375,7 @@ def release(name: str = _BOARD, as_json: bool = JSON) -> None:
         board.confirm(board.command(Command.DISABLE))
         board.receive(0.05)
         state = board.status.state.name
-    _show(as_json, {"state": state}, state)
+    print_answer(as_json, {"state": state}, state)
 
 
 @command.command()
@@ -434,7 +428,7 @@ def offsets(
             click.confirm(zeros.question, abort=True, err=True)
         if given:
             zeros.write(keep)
-        _show(as_json, {"written": bool(given), "joints": zeros.json}, zeros.text)
+        print_answer(as_json, {"written": bool(given), "joints": zeros.json}, zeros.text)
         if given:
             click.echo(f"written; the old offsets are in {keep}", err=True)
 
@@ -464,7 +458,7 @@ def emulate(
     so101 is a servo bus with backlash and droop, for feetech:PORT; ar4 a Teensy with backlash and a homing that is off.
     """
     with emulated_arm(arm) as board:
-        _show(as_json, {"board": board}, board)
+        print_answer(as_json, {"board": board}, board)
         threading.Event().wait(seconds)
 
 
@@ -500,10 +494,7 @@ def get(
         text = configuration_text(used, board.welcome.board)
     if output is not None:
         write_text(output, text)
-    if as_json:
-        click.echo(json.dumps(dict(entries(used))))
-    elif output is None:
-        click.echo(text, nl=False)
+    print_answer(as_json, dict(entries(used)), *([text.rstrip("\n")] if output is None else []))
 
 
 @config.command()
@@ -517,10 +508,8 @@ def diff(file: Path = _FILE, name: str = _BOARD, as_json: bool = JSON) -> int:
         _same_board(file, board_name, board)
         theirs = dict(entries(board.configuration()))
     found = {path: [theirs.get(path), value] for path, value in entries(ours) if theirs.get(path) != value}
-    if as_json:
-        click.echo(json.dumps(found))
-    for path, (on_board, in_file) in ({} if as_json else found).items():
-        click.echo(f"{path}: {on_board} on the board, {in_file} in {file}")
+    lines = (f"{path}: {on_board} on the board, {in_file} in {file}" for path, (on_board, in_file) in found.items())
+    print_answer(as_json, found, *lines)
     return 1 if found else 0
 
 
@@ -573,6 +562,5 @@ def _same_board(file: Path, name: str, board: Board) -> None:
 
 
 def _stored(as_json: bool) -> None:
-    if as_json:
-        click.echo(json.dumps({"stored": True}))
+    print_answer(as_json, {"stored": True})
     click.echo("stored: in use after the board's next start", err=True)

@@ -6,12 +6,12 @@ import json
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from armsight.app.board.command import STEPS
-from armsight.app.show.plotting import BLUE, MUTED, ORANGE, new_figure
+from armsight.app.show.plotting import BLUE, MUTED, ORANGE, Figure, new_figure
 from armsight.app.show.report import Block, Lines, Plot, Report, Section
 from armsight.app.show.table import TextTable
 from armsight.data import Array
@@ -36,9 +36,6 @@ from armsight.robot.boards.tuning import (
     motion_limits,
     quiet_gains,
 )
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 _MARGIN_RAD = 0.05
 #: Of an elastic joint: share of stall torque, and acceleration that twist it, rad. Half: slower, double: it rings.

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
-
 import click
 
 from armsight.app.body import PAPERS
 from armsight.app.options import JSON, argument, declared, option, out
+from armsight.app.show.messages import note, print_answer
 from armsight.errors import InputError
 from armsight.files import check_writable
 
@@ -73,17 +72,12 @@ def draw(
     from armsight.app.body.draw import draw_body
 
     drawing = draw_body(paths, output, paper=paper.lower(), dpi=dpi, split=split)
-    for note in drawing.notes:
-        click.echo(f"note: {note}", err=True)
-    if as_json:
-        pages = [
-            {"normal": page.normal.tolist(), "markers": [name or path for name in page.names]}
-            for page, path in zip(drawing.pages, drawing.of, strict=True)
-        ]
-        click.echo(
-            json.dumps({"body": " ".join(paths), "files": drawing.files, "paper": paper.lower(), "pages": pages})
-        )
-        return
-    for number, (page, path) in enumerate(zip(drawing.pages, drawing.of, strict=True), start=1):
-        click.echo(f"page {number}: {', '.join(name or path for name in page.names)}")
-    click.echo(f"written to {', '.join(drawing.files)}; print at 100%, not fitted to the page, and measure the bar")
+    note(*drawing.notes)
+    pages = [
+        {"normal": page.normal.tolist(), "markers": [name or path for name in page.names]}
+        for page, path in zip(drawing.pages, drawing.of, strict=True)
+    ]
+    lines = [f"page {number}: {', '.join(page['markers'])}" for number, page in enumerate(pages, start=1)]
+    written = f"written to {', '.join(drawing.files)}; print at 100%, not fitted to the page, and measure the bar"
+    answer = {"body": " ".join(paths), "files": drawing.files, "paper": paper.lower(), "pages": pages}
+    print_answer(as_json, answer, *lines, written)

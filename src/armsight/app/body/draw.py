@@ -13,13 +13,13 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, Any
 
 import numpy as np
 
 from armsight.app.body import PAPERS
 from armsight.app.show.messages import require
-from armsight.app.show.plotting import drawing, plain
+from armsight.app.show.plotting import Axes, Figure, drawing, plain
 from armsight.data import Array, Record
 from armsight.errors import InputError
 from armsight.files import read_bytes, replacing
@@ -34,10 +34,6 @@ from armsight.vision.markers.chessboard import Chessboard
 from armsight.vision.markers.circles import CircleGrid
 from armsight.vision.markers.targets import Composite, read_layout
 from armsight.vision.pose.predict import face_axes, look_direction
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 #: A bright disc's dark surround reaches to so many radii; where another marker is in the way, to fewer.
 RING, RING_MIN = 2.0, 1.5

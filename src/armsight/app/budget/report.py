@@ -7,22 +7,19 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from armsight.app.show.messages import Note
 from armsight.app.show.page import PAGE
-from armsight.app.show.plotting import subplots
+from armsight.app.show.plotting import Figure, subplots
 from armsight.app.show.report import Fact, Grade, Plot, Report, Section, figure_files
 from armsight.app.show.table import TextTable
 from armsight.sim.budget.plan import PRICES, RigPlan
 from armsight.sim.budget.result import NOT_MODELLED, Alternative, RigBudget
 from armsight.sim.workcell.body import body_text
 from armsight.vision.calibrate.budget import Budget
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 _SHOWN = 0.01  # share of lost shots that is shown; half: one in 200 is, double: one in 50 is not
 #: Why three cameras come out worse than two.

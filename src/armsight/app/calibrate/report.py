@@ -7,7 +7,7 @@ import json
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -33,6 +33,7 @@ from armsight.app.calibrate.figures import (
 )
 from armsight.app.show.messages import weak
 from armsight.app.show.page import PAGE, bullets, table, text
+from armsight.app.show.plotting import Figure
 from armsight.app.show.report import Block, Html, Plot, Report, Section, Text, figure_files
 from armsight.app.show.table import TextTable, plain_text
 from armsight.geometry.pose import left_jacobian
@@ -41,9 +42,6 @@ from armsight.vision.calibrate.result import Calibration, corner_variance_px2
 from armsight.vision.calibrate.screen import merged_notes
 from armsight.vision.calibrate.weak import COVERAGE_GRID, contradicted
 from armsight.vision.rig import StereoRig
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 _ROUNDING = 1e-12
 #: Why the reprojection RMS may be far below the epipolar RMS of the same fit.

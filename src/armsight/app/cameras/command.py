@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import click
 
 from armsight.app.options import JSON, declared
+from armsight.app.show.messages import print_answer
 
 if TYPE_CHECKING:
     from armsight.vision.sources.v4l2 import VideoDevice
@@ -25,19 +25,16 @@ def command(as_json: bool = JSON) -> None:
     from armsight.vision.sources.v4l2 import find_cameras
 
     cameras = find_cameras()
-    if as_json:
-        click.echo(json.dumps({"cameras": [dataclasses.asdict(camera) for camera in cameras]}))
-        return
-    for camera in cameras:
-        click.echo("\n".join(_lines(camera)))
+    lines = [line for camera in cameras for line in _lines(camera)]
     if not cameras:
-        click.echo(
+        lines.append(
             "no camera is attached\n"
             "  check the cable and the port: lsusb lists what the computer sees\n"
             "  check the driver: sudo dmesg | tail, right after plugging in, should name a /dev/video...\n"
             "  in a container or a VM: /dev/video* must be passed to it\n"
             "  your user must be in the group video: sudo usermod -aG video $USER, then log in again"
         )
+    print_answer(as_json, {"cameras": [dataclasses.asdict(camera) for camera in cameras]}, *lines)
 
 
 def _lines(camera: VideoDevice) -> Iterator[str]:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import click
 
 from armsight.app.check import CYCLES
 from armsight.app.options import JSON, argument, declared, option, out
+from armsight.app.show.messages import note, print_answer
 from armsight.errors import InputError
 from armsight.files import check_folder, check_writable, write_text
 
@@ -135,13 +135,10 @@ def plan(
     test = plan_test(open_arm(arm_name), name, cycles, middle, speed / 1e3, visible_in)
     if output is not None:
         write_text(output, test.motions if output.suffix == ".toml" else plan_csv(test.plan))
-    for note in test.notes:
-        click.echo(f"note: {note}", err=True)
-    if as_json:
-        click.echo(json.dumps(plan_json(test)))
-        return
+    note(*test.notes)
     at = " ".join(f"{1e3 * v:.0f}" for v in test.plan.centre)
     what = {"line": "a line", "circle": "a circle"}.get(name, f"{len(test.plan.names)} poses")
-    click.echo(f"{what} in a cube of {1e3 * test.plan.side_m:.0f} mm about {at} mm, cycles: {test.cycles}")
+    lines = [f"{what} in a cube of {1e3 * test.plan.side_m:.0f} mm about {at} mm, cycles: {test.cycles}"]
     if output is not None and output.suffix == ".toml":
-        click.echo(f"written: {output}; run it: armsight run --motion {output} ... -o RUN; then: armsight check RUN")
+        lines.append(f"written: {output}; run it: armsight run --motion {output} ... -o RUN; then: armsight check RUN")
+    print_answer(as_json, plan_json(test), *lines)

@@ -21,7 +21,7 @@ from armsight.app.check.result import (
 from armsight.app.check.rows import Row
 from armsight.app.show.messages import Note
 from armsight.app.show.page import PAGE, bullets
-from armsight.app.show.plotting import BLUE, INK, MUTED, ORANGE, RED, new_figure, nice, subplots
+from armsight.app.show.plotting import BLUE, INK, MUTED, ORANGE, RED, Figure, new_figure, nice, subplots
 from armsight.app.show.report import Block, Grade, Html, Report, Text, figure_files, figures
 from armsight.app.show.table import TextTable, html_table
 from armsight.data import Array
@@ -29,7 +29,6 @@ from armsight.loop.iso9283.paths import square_to
 from armsight.loop.iso9283.statistic import Metric
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
     from matplotlib.projections.polar import PolarAxes
 
 

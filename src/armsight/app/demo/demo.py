@@ -22,14 +22,13 @@ import numpy as np
 from scipy.special import chdtri
 
 from armsight.app.run.devices import setup_of, simulated_unit
-from armsight.app.run.experiment import RunResult, closed_on, drive, prior_of, run_experiment, timing
-from armsight.app.run.folder import finish, make_room, open_folder
+from armsight.app.run.experiment import RunResult, closed_on, drive, prior_of, timing
+from armsight.app.run.folder import finish, make_room, open_folder, run_in
 from armsight.app.run.metrics import Study, track_metrics
 from armsight.app.run.motion_file import DEFAULT_MOTION, QUICK, read_motions
 from armsight.app.run.tracks import Tracks
 from armsight.app.show.report import Report
-from armsight.app.stream.datum import Published
-from armsight.app.stream.mcap_file import REFERENCES, LazyMcap, properties
+from armsight.app.stream.mcap_file import REFERENCES
 from armsight.data import Array, PoseEstimate, Record, Shot
 from armsight.errors import ArmsightError
 from armsight.files import read_text, write_text
@@ -334,26 +333,13 @@ def run_demo(demo: Demo, *, progress: Progress = lambda line: None) -> Report:
         first = next(shots)  # begun before, the second process would take a core from those that render it
         with contextlib.closing(Process(caller, "armsight.vision.calibrate.boards")) as second:
             rig = _calibrated(CHESSBOARD, chain([first], shots), progress, second).rig
-        rig.save(folder / "rig.json")
-        write_text(folder / "body.toml", workcell.body_text)
         targets = handeye_poses(workcell.model, np.vstack([workcell.model.home, workcell.poses]), handeyes, demo.seed)
-        setup, more = setup_of(workcell), dict[str, str]()
+        setup, files = setup_of(workcell), {"motion.toml": motion, "body.toml": workcell.body_text}
         if demo.references is not None and unit is not None:
             setup = replace(setup, beside=simulated_unit(workcell, unit, demo.seed))
-            more[REFERENCES] = read_text(demo.references)
-            write_text(folder / REFERENCES, more[REFERENCES])
-        texts = properties(rig, workcell.body_text, setup.arm, command="demo", **more)
-        published = Published(rig, setup.target.body, setup.arm, texts)
-        with contextlib.closing(LazyMcap(folder, published, progress, process=True)) as file:
-            result = run_experiment(
-                setup,
-                rig,
-                plan,
-                targets,
-                progress=progress,
-                cover=workcell.cover,
-                publisher=file,
-            )
+            files[REFERENCES] = read_text(demo.references)
+        how: dict[str, Any] = {"process": True, "progress": progress, "cover": workcell.cover}
+        result = run_in(folder, setup, rig, plan, targets, files, command="demo", say=progress, **how)
         workcell.source.close()  # its processes hold 300 MB
         studies: list[Study] = []
         try:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,6 +10,7 @@ import click
 
 from armsight.app.options import JSON, argument, declared, option, out
 from armsight.app.progress import bar
+from armsight.app.show.messages import note, print_answer
 from armsight.errors import ArmsightError, InputError
 from armsight.files import check_folder
 from armsight.vision.dense import METHODS, open_method
@@ -76,8 +76,8 @@ def match(
 
     def run(shot: Shot, where: Path) -> PairResult:
         search = search_of(form, max_disparity, near, shot)
-        result = run_shot(shot, where, form, method, search, lambda line: click.echo(f"note: {line}", err=True))
-        click.echo(json.dumps(result.to_json()) if as_json else result_line(result))
+        result = run_shot(shot, where, form, method, search, note)
+        print_answer(as_json, result.to_json(), result_line(result))
         return result
 
     if pair is not None:
@@ -89,14 +89,14 @@ def match(
                 total += 1
                 if shot.problem is not None:
                     problem = {"shot": shot.name, "problem": shot.problem}
-                    click.echo(json.dumps(problem) if as_json else problem_line(shot.name, shot.problem))
+                    print_answer(as_json, problem, problem_line(shot.name, shot.problem))
                 else:
                     done += run(shot, output / shot.name).summary.problem is None
                 advance()
         if not done:
             raise ArmsightError(f"{source}: none of {total} shots could be matched; their lines say why")
     if form is None:
-        click.echo("note: no RIG.json: the images were taken as rectified", err=True)
+        note("no RIG.json: the images were taken as rectified")
 
 
 def _arguments(
@@ -123,7 +123,7 @@ def _arguments(
         raise InputError(f"--near {near:g}: expected metres, between 0.01 and 1000")
     rig = None if rectified else StereoRig.load_trusted(paths[0])
     if rig is not None and not rig.cov.any():
-        click.echo(f"note: {paths[0]} does not say how well it is known: sigma is the matching's share alone", err=True)
+        note(f"{paths[0]} does not say how well it is known: sigma is the matching's share alone")
     pair = None if source is not None else (paths[-2], paths[-1])
     return None if rig is None else rig.rectify(), pair
 
@@ -159,4 +159,4 @@ def evaluate(
                 advance()
     if output is not None:
         write_evaluation(output, lines)
-    click.echo(json.dumps(evaluation_json(lines)) if as_json else table_text(lines))
+    print_answer(as_json, evaluation_json(lines), table_text(lines))

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import click
 
 from armsight.app.options import JSON, argument, declared, option, out
+from armsight.app.show.messages import note, print_answer
 
 FORMS = ("csv", "parquet", "mcap", "tum", "ros2")
 
@@ -48,8 +48,7 @@ def command(
         recorded = read_run(file)
         if recorded is None:
             raise InputError(f"{file}: not written by armsight; its poses come from armsight replay")
-        for note in recorded.notes:
-            click.echo(f"note: {note}", err=True)
+        note(*recorded.notes)
         files = {"csv": write_csv, "parquet": write_parquet, "tum": write_tum}[form](recorded, output)
     answer = {"run": run, "to": form, "files": [str(path) for path in files]}
-    click.echo(json.dumps(answer) if as_json else "\n".join(map(str, files)))
+    print_answer(as_json, answer, *map(str, files))

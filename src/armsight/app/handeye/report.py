@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from armsight.app.show.messages import Note
-from armsight.app.show.plotting import BLUE, INK, MUTED, ORANGE, RED, subplots
+from armsight.app.show.plotting import BLUE, INK, MUTED, ORANGE, RED, Figure, subplots
 from armsight.app.show.report import Block, Fact, Grade, Lines, Report, Section, figures
 from armsight.app.show.table import TextTable
 from armsight.data import Array, Record
@@ -21,9 +20,6 @@ from armsight.loop.handeye.handeye import TRUSTED_M, TRUSTED_RAD, HandEye, known
 from armsight.loop.handeye.recording import PairedPoses
 from armsight.loop.handeye.sources import OF_THE_ARM
 from armsight.loop.identify.plan import MountingPlan, worst_sigmas
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 _MANY = 0.25  # as many blunders as this share of the poses are no calibration to trust
 #: Sources whose mean log density of a pose left out is within this of the best are not distinguished from them.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import threading
 from dataclasses import asdict
 from pathlib import Path
@@ -12,7 +11,7 @@ import click
 from armsight.app.options import JSON, argument, declared, option, out
 from armsight.app.progress import steps
 from armsight.app.show.http import host_and_port
-from armsight.app.show.messages import require
+from armsight.app.show.messages import note, print_answer, require
 from armsight.app.stream.cell_file import endpoint, read_cell
 from armsight.errors import ArmsightError
 from armsight.files import check_folder
@@ -55,11 +54,11 @@ def command(
     check_folder(output, problem="no hub can be kept here")
     host_and_port(http, "--http")
     at = endpoint(listen, "--listen")
-    hub = Hub(output, at, http, keys, lambda line: click.echo(f"note: {line}", err=True), mqtt)
+    hub = Hub(output, at, http, keys, note, mqtt)
     try:
-        answer = json.dumps({"address": hub.pages.address, "listen": listen, "directory": str(output)})
+        answer = {"address": hub.pages.address, "listen": listen, "directory": str(output)}
         line = f"open {hub.pages.address} in a browser; cells connect to {listen}; Ctrl-C ends the hub"
-        click.echo(answer if as_json else line)
+        print_answer(as_json, answer, line)
         with rejected(hub.rejected):
             threading.Event().wait()
     finally:
@@ -88,8 +87,7 @@ def keys_command(
     there = "copy this folder to the cell's computer; there: --stream cell:"
     lines = [f"{each.parent}: {there}{each.parent.name}/cell.toml" for each in made]
     lines.append(f"{output}: start the hub with armsight hub --listen tls/0.0.0.0:{port} --keys {output}")
-    answer = {"directory": str(output), "cells": list(map(str, made))}
-    click.echo(json.dumps(answer) if as_json else "\n".join(lines))
+    print_answer(as_json, {"directory": str(output), "cells": list(map(str, made))}, *lines)
 
 
 @command.command("hold")
@@ -110,8 +108,7 @@ def hold_command(
     from armsight.app.hub.router import hold
 
     answer = hold(keys, cell, reason, address)
-    if as_json:
-        click.echo(json.dumps({"cell": cell, "answer": answer}))
+    print_answer(as_json, {"cell": cell, "answer": answer})
     if answer != "held":
         raise ArmsightError(f"{cell} does not hold: {answer or 'it does not answer; stop it there'}")
     if not as_json:
@@ -130,8 +127,8 @@ def clocks_command(first: Path = argument("POSES"), second: Path = argument("OTH
 
     found = time_between(*(read_pose_table(each, side="seen") for each in (first, second)))
     off, sigma = 1e3 * found.delay_s, 1e3 * found.sigma_s
-    said = json.dumps({"delay_s": found.delay_s, "sigma_s": found.sigma_s})
-    click.echo(said if as_json else f"times of {second} less those of {first}: {off:+.3f} ± {sigma:.3f} ms")
+    said = f"times of {second} less those of {first}: {off:+.3f} ± {sigma:.3f} ms"
+    print_answer(as_json, {"delay_s": found.delay_s, "sigma_s": found.sigma_s}, said)
 
 
 @command.command("push")
@@ -156,4 +153,4 @@ def push_command(
         done = push(cell, runs, store, rate, lambda sent: say(f"pushing: {sent / 1e6:.1f} MB"))
     sent = f"{done.files} files, {done.sent_bytes / 1e6:.1f} MB"
     said = f"{done.runs} runs are in {store} now ({sent}); {done.complete_before} were before"
-    click.echo(json.dumps(asdict(done)) if as_json else said)
+    print_answer(as_json, asdict(done), said)

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import time
 from math import degrees
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from armsight.app.options import JSON, SEED, declared, option, out
 from armsight.app.progress import steps
+from armsight.app.show.messages import print_answer
 from armsight.errors import InputError
 from armsight.files import as_input_error, check_folder, check_writable, write_text
 
@@ -90,16 +90,9 @@ def command(
             read = read_measured(data, arm, joints, **how)
         held = None if other is None else read_measured(other, arm, joints, **how)
         notes = read.notes if held is None else (*read.notes, *(f"{other}: {note}" for note in held.notes))
-        run = run_identify(
-            arm,
-            read.measured,
-            read.lines,
-            None if held is None else held.measured,
-            other_name=str(other),
-            priors=_priors(priors),
-            notes=notes,
-            progress=progress,
-        )
+        validated = None if held is None else held.measured
+        more: dict[str, Any] = {"priors": _priors(priors), "notes": notes, "progress": progress}
+        run = run_identify(arm, read.measured, read.lines, validated, other_name=str(other), **more)
         report = identify_report(run, everything=verbose)
         if output is not None:
             progress("writing")
@@ -157,13 +150,9 @@ def plan(
         chosen = plan_joints(open_arm(arm_name), done, None if rig is None else StereoRig.load(rig), count, seed)
     if output is not None:
         write_text(output, _plan_csv(chosen))
-    if as_json:
-        keys = {"q_rad": chosen.q, "approach": chosen.approach, "sigma_m": chosen.sigma_m}
-        click.echo(json.dumps({k: v.tolist() for k, v in (keys | {"random_sigma_m": chosen.random_sigma_m}).items()}))
-    else:
-        click.echo("\n".join(_plan_lines(chosen)))
-        if output is not None:
-            click.echo(f"\nwritten: {output}")
+    keys = {"q_rad": chosen.q, "approach": chosen.approach, "sigma_m": chosen.sigma_m}
+    found = {key: each.tolist() for key, each in (keys | {"random_sigma_m": chosen.random_sigma_m}).items()}
+    print_answer(as_json, found, *_plan_lines(chosen), *([] if output is None else [f"\nwritten: {output}"]))
 
 
 def _plan_lines(plan: Plan) -> list[str]:

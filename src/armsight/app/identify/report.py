@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from armsight.app.identify.run import Identification
 from armsight.app.show.messages import Note
 from armsight.app.show.page import bullets, folded, table
 from armsight.app.show.page import text as escaped
-from armsight.app.show.plotting import BLUE, INK, MUTED, ORANGE, new_figure, panels, subplots
+from armsight.app.show.plotting import BLUE, INK, MUTED, ORANGE, Figure, new_figure, panels, subplots
 from armsight.app.show.report import Block, Fact, Grade, Html, Lines, Report, Text, figures
 from armsight.app.show.table import TextTable, plain_text
 from armsight.data import Array
@@ -23,9 +23,6 @@ from armsight.loop.identify.corrected import Corrected, zeros_text
 from armsight.loop.identify.identify import contributions, value_text
 from armsight.loop.identify.selection import PLACEMENT
 from armsight.robot.arm_file import MOVED, undetermined
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 #: Points plotted at most; names of full size beside a matrix; steps of removal in a row of a figure; letters of names.
 MOST_POINTS, MOST_NAMES, MOST_REMOVED, _MOST_LETTERS = 4000, 60, 8, 45

@@ -15,6 +15,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -445,21 +446,10 @@ class ArmStep(PageStep[ArmState]):
             if follow:
                 require_followed(rig, Path(self._measuring.rig_path or "rig.json"))
             texts = (read_text(self.shared.motion), read_text(str(self._measuring.target_spec)))
-            return run_in(
-                folder,
-                setup,
-                rig,
-                plan,
-                targets,
-                dict(zip(("motion.toml", "body.toml"), texts, strict=True)),
-                command="live",
-                say=self.warn,
-                progress=self._progress,
-                close_loop=closed,
-                begun=self._begun,
-                handeye=handeye,
-                follow_rig=follow,
-            )
+            files = dict(zip(("motion.toml", "body.toml"), texts, strict=True))
+            how: dict[str, Any] = {"progress": self._progress, "begun": self._begun, "close_loop": closed}
+            how |= {"handeye": handeye, "follow_rig": follow}
+            return run_in(folder, setup, rig, plan, targets, files, command="live", say=self.warn, **how)
 
         outcome = self._moving("the run has ended early: {}; what was measured is being written", work)
         if outcome is not None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import secrets
 import time
 from dataclasses import dataclass, replace
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING
 import click
 
 from armsight.app.options import ARM, CELL, FOLLOW_RIG, JSON, SEED, SIM, STREAM, declared, option, out
-from armsight.app.show.messages import require
+from armsight.app.show.messages import print_answer, require, say
 from armsight.errors import InputError
 
 if TYPE_CHECKING:
@@ -85,19 +84,18 @@ def command(
     if source.startswith("usb:") and not is_one(source.removeprefix("usb:")):
         parsed_usb(source.removeprefix("usb:"))  # cameras may come later, their names may not; one alone the page says
     tried = [each for each in options.streams if not each.startswith(CELL)]  # a mistake is said now; a cell's was
-    open_streams(tried, Published(), lambda line: click.echo(line, err=True)).close()
+    open_streams(tried, Published(), say).close()
     session = LiveSession(options)
     with alone_in(session.folder, "live"):
         server = LiveServer(session, host, port, None if host in HERE else secrets.token_urlsafe(18))
         try:
             server.start()
             session.start()
-            if as_json:
-                click.echo(json.dumps({"address": server.address, "directory": str(session.folder)}))
-            else:
-                click.echo(
-                    f"open {server.address} in a browser; everything is stored in {session.folder}; Ctrl-C ends the session"
-                )
+            answer = {"address": server.address, "directory": str(session.folder)}
+            line = (
+                f"open {server.address} in a browser; everything is stored in {session.folder}; Ctrl-C ends the session"
+            )
+            print_answer(as_json, answer, line)
             shown = 0
             while True:
                 for event in session.events(shown):

@@ -36,7 +36,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from http import HTTPStatus
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qs, urlsplit
 
 from armsight.app.live.capture import LiveShot
@@ -145,20 +145,16 @@ class LiveServer:
         self._encoding = [asyncio.Lock(), asyncio.Lock()]
         silent = logging.getLogger("armsight.live")  # what fails is handled here, and not logged
         silent.setLevel(logging.CRITICAL)
+        how: dict[str, Any] = {"process_request": self._request, "compression": None, "logger": silent}
+        how |= {
+            "max_size": 2 * LONGEST,
+            "max_queue": 16,
+            "write_limit": 1 << 16,
+            "ping_interval": 5,
+            "ping_timeout": 10,
+        }
         try:
-            server = await serve(
-                self._connected,
-                self.host,
-                self.port,
-                process_request=self._request,
-                max_size=2 * LONGEST,
-                max_queue=16,
-                compression=None,
-                ping_interval=5,
-                ping_timeout=10,
-                write_limit=1 << 16,
-                logger=silent,
-            )
+            server = await serve(self._connected, self.host, self.port, **how)
         except OSError as error:
             self._failed = _bind_error(error, self.host, self.port)
             return
@@ -250,7 +246,7 @@ class LiveServer:
                 self._introduce()
 
     def _hold(self, why: str) -> None:
-        self._stops.submit(self.session.hold, why)
+        self._stops.submit(self.session.arm.hold_for, why)
 
     def _introduce(self) -> None:
         for number, client in self._clients.items():
@@ -308,7 +304,7 @@ class LiveServer:
             while True:
                 if client.visible and self._due(client):
                     if self.session.arm.busy:
-                        await asyncio.get_running_loop().run_in_executor(self._work, self.session.between_shots)
+                        await asyncio.get_running_loop().run_in_executor(self._work, self.session.arm.between_shots)
                     for side in self._due(client):
                         if (encoded := await self._encoded(side)) is not None:
                             number, data = encoded
@@ -322,7 +318,7 @@ class LiveServer:
 
     def _due(self, client: _Client) -> list[int]:
         """Return the sides of which a page has shown the last image, and there is a newer one."""
-        newest = self.session.newest
+        newest = self.session.capture.newest
         if newest is None:
             return []
         return [side for side, (number, shown) in enumerate(client.images) if shown and newest.number != number]
@@ -330,7 +326,7 @@ class LiveServer:
     async def _encoded(self, side: int) -> tuple[int, bytes] | None:
         """Return the number of the newest shot and its view as JPEG, encoded once for all pages; None without a shot."""
         async with self._encoding[side]:
-            live = self.session.newest
+            live = self.session.capture.newest
             if live is None:  # other cameras are being opened
                 return None
             if self._jpeg[side][0] != live.number:
@@ -361,7 +357,7 @@ class LiveServer:
                 self._hold("the page that commands does not answer")
 
     def _texts(self) -> dict[str, str]:
-        self.session.between_shots()
+        self.session.arm.between_shots()
         return {name: json_text({"section": name, "state": state}) for name, state in self.session.sections().items()}
 
     def _update(self, client: _Client, texts: dict[str, str]) -> None:

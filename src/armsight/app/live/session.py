@@ -21,7 +21,7 @@ from armsight.app.live.arm import ArmStep, StopAnswer
 from armsight.app.live.body import BoardStep, BodyStep
 from armsight.app.live.calibration import CalibrationStep
 from armsight.app.live.cameras import CamerasStep
-from armsight.app.live.capture import CameraCapture, LiveShot
+from armsight.app.live.capture import CameraCapture
 from armsight.app.live.measuring import MeasureState, MeasureStep
 from armsight.app.live.recorded import RecordedStep
 from armsight.app.live.records import STEPS, Event, PageCommand, asked
@@ -83,7 +83,7 @@ class LiveSession:
         self.folder = check_folder(options.folder, problem="the session cannot be written here").absolute()
         self._settings = self._kept()
         self._number, self._events, self._lock = 0, deque[Event](maxlen=_EVENTS), threading.Lock()
-        self.shared = shared = Shared(options, self.folder, self.say, hold=self.hold)
+        self.shared = shared = Shared(options, self.folder, self.say, hold=lambda why: self.arm.hold_for(why))
         self.cameras = CamerasStep(shared)
         model, simulated = open_arm(options.arm), shared.source.startswith(SIM)
         ArmStep.check_board(options.board, shared.source, model)
@@ -246,10 +246,6 @@ class LiveSession:
         """Stop the arm in an emergency; the answer is the board's own. Any thread may call it."""
         return self.arm.stop()
 
-    def hold(self, why: str) -> None:
-        """Bring the arm to rest and hold it, if it moves."""
-        self.arm.hold_for(why)
-
     def say(self, level: Level, text: str) -> None:
         """Add an event."""
         with self._lock:
@@ -305,7 +301,7 @@ class LiveSession:
             number = live.number
             try:
                 if self.cameras.look(live, chosen=self._step == "cameras"):
-                    self.between_shots()
+                    self.arm.between_shots()
                     self.cameras.look_well(live)
                 if self._step == "board":
                     self.board.look(live)
@@ -316,15 +312,6 @@ class LiveSession:
             except Exception as error:  # noqa: BLE001 - nobody else watches this thread
                 self.say("error", f"looking at an image failed: {why(error)}")
                 time.sleep(1.0)
-
-    @property
-    def newest(self) -> LiveShot | None:
-        """The newest shot, to be shown."""
-        return self.capture.newest
-
-    def between_shots(self) -> None:
-        """Wait, while a loop moves the arm, until no image waits for its command (:meth:`ArmStep.between_shots`)."""
-        self.arm.between_shots()
 
     def sections(self) -> dict[str, object]:
         """Return the state, section by section: records of this package."""

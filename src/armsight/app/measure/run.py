@@ -20,7 +20,7 @@ from armsight.app.measure.shots import DetectedShots, ImageShots, NamedShots, Re
 from armsight.app.measure.view import CHART, PictureFolder, view_folder
 from armsight.app.options import DETECTIONS
 from armsight.app.progress import bar
-from armsight.app.show.messages import colour, silence_stdout, weak
+from armsight.app.show.messages import note, say, silence_stdout, warn
 from armsight.app.stream.datum import Published
 from armsight.data import Body, Dropped, Missed, PoseEstimate, Shot
 from armsight.errors import ArmsightError, InputError
@@ -66,7 +66,7 @@ def measure_shots(options: MeasureOptions) -> tuple[HealthFinding, ...]:
     rig = open_rig(options.rig)
     folder = _checked_outputs(options)
     if not rig.cov.any():
-        click.echo(f"note: {options.rig} has no covariance: every ± is the share of the pixel noise alone", err=True)
+        note(f"{options.rig} has no covariance: every ± is the share of the pixel noise alone")
     started = time.perf_counter()
     with contextlib.ExitStack() as stack:
         shots = stack.enter_context(contextlib.closing(open_shots(options, rig, requested, folder is not None)))
@@ -81,7 +81,7 @@ def measure_shots(options: MeasureOptions) -> tuple[HealthFinding, ...]:
             from armsight.app.board.readings import BoardReadings  # not above: a pair of images needs no board
 
             board = stack.enter_context(contextlib.closing(BoardReadings(options.board)))
-            board.start(publisher.put, lambda line: click.echo(line, err=True))
+            board.start(publisher.put, say)
         missed = _Contradicting(rig, shots.body, shots.again)
         try:
             run.measure(_watched(rig, fixed, missed.keeping(shots.results), run.monitor), publisher)
@@ -172,12 +172,9 @@ class MeasureRun:
                 publisher.put(ShotDatum(shot, result, arrival_s))
                 if arrival_s is not None and arrival_s - looked_s > _HEALTH_S:
                     looked_s = arrival_s
-                    for note in notes.of(arrival_s, self.monitor.findings(ends=False)):
-                        if note.level == "warning":
-                            _warn(note.text)
-                        else:
-                            click.echo(f"note: {note.text}", err=True)
-                        publisher.put(note)
+                    for each in notes.of(arrival_s, self.monitor.findings(ends=False)):
+                        (warn if each.level == "warning" else note)(each.text)
+                        publisher.put(each)
                 if self.options.as_json:
                     self._print(json.dumps(record.to_json()))
                 else:
@@ -224,7 +221,7 @@ class MeasureRun:
             self.file.add(row_of(record, columns))
         except InputError as error:
             if not self.unwritten:
-                _warn(f"{error}; measuring goes on")
+                warn(f"{error}; measuring goes on")
             self.unwritten += 1
 
     def close(self) -> None:
@@ -295,14 +292,11 @@ class MeasureRun:
             kept = (
                 "" if save_rig is not None or rig.disc_noise is not None else "; --save-rig keeps it for single shots"
             )
-            click.echo(
-                f"note: discs' centres vary {left} (left) and {right} (right) times as much as single images say{kept}",
-                err=True,
-            )
+            note(f"discs' centres vary {left} (left) and {right} (right) times as much as single images say{kept}")
         if save_rig is not None and found is None and self.shutters is None:
             few = "too few shots, or the body moved too little, to know the discs' noise"
             why = "the shots show a skew, which hides the discs' noise: give --skew find" if shots.skewed else few
-            _warn(f"{save_rig} was not written: {why}")
+            warn(f"{save_rig} was not written: {why}")
             return False
         if save_rig is not None:
             replace(rig, shutters=self.shutters or rig.shutters, disc_noise=found or rig.disc_noise).save(save_rig)
@@ -315,23 +309,16 @@ class MeasureRun:
             replace(each, advice=_RECORDED) if each.cause == "host" and shots.recorded else each
             for each in self.monitor.findings()
         )
-        for line in unseen_lines(self.monitor.fixed_never_seen):
-            click.echo(f"note: {line}", err=True)
+        note(*unseen_lines(self.monitor.fixed_never_seen))
         if contradicted is not None:
             health = (contradicted, *(each for each in health if each.cause not in ("rig", "body", "lens")))
         if shots.skewed and any(each.cause in ("rig", "time") for each in health):
             # Of a moving body a skew looks like cameras that moved against each other; all shots together size it best.
             health = (*shots.skewed, *(each for each in health if each.cause not in ("rig", "time")))
         else:  # a skew that changes no pose by more than its sigma
-            for late in shots.skewed:
-                click.echo(f"note: {late.what}; {late.advice}", err=True)
-        for line in health_lines(health):
-            _warn(line)
+            note(*(f"{late.what}; {late.advice}" for late in shots.skewed))
+        warn(*health_lines(health))
         return health
-
-
-def _warn(line: str) -> None:
-    click.echo(weak(line), err=True, color=colour())
 
 
 def _contradicts(dropped: Sequence[Dropped], used: int) -> bool:
@@ -399,7 +386,7 @@ def _streams(specs: Sequence[str], rig: StereoRig, body: Body) -> Publisher:
     from armsight.app.stream.streams import open_streams
 
     published = Published(rig, body, properties={"command": "measure"})
-    return open_streams(specs, published, lambda line: click.echo(line, err=True))
+    return open_streams(specs, published, say)
 
 
 def _line(record: ShotPose, width: int) -> str:

@@ -14,6 +14,7 @@ import numpy as np
 
 from armsight.app.measure.command import MeasureOptions
 from armsight.app.measure.moving import NOTED_SHOTS, Requested, moved_results, skew_finding
+from armsight.app.show.messages import note
 from armsight.data import SIDES, Body, Image, Missed, PoseEstimate, Shot
 from armsight.errors import InputError
 from armsight.files import check_writable
@@ -114,7 +115,7 @@ class ImageShots:
             if requested is not None and not self._timed:
                 raise InputError("--skew and --readout need a recording with times: they show the motion of the body")
             if requested is None and rig.shutters is not None and not self._timed:
-                click.echo(f"note: {options.rig} has {rig.shutters}, not used: no recording with times", err=True)
+                note(f"{options.rig} has {rig.shutters}, not used: no recording with times")
             self._requested = rig.shutters if requested is None and self._timed else requested
             self.moves = self._requested is not None
             self._again = open_source(options.source) if self.moves and draws else None
@@ -153,7 +154,7 @@ class ImageShots:
         first = [(replace(shot, left=None, right=None), found, followed) for shot, found, followed, _ in wide]
         timed = [(shot.t_s, found) for shot, found, _ in first]
         moved, shutters = moved_results(self._rig, self.body, timed, requested)
-        click.echo(f"note: {shutters}", err=True)
+        note(shutters)
         for (shot, _, followed), (found, is_moved) in zip(first, moved, strict=True):
             drawn = self._again.read() if self._again is not None else None
             yield drawn or shot, found, followed, shutters if is_moved else None
@@ -249,8 +250,7 @@ def _detected(detections: str, target: str) -> tuple[Body, list[SeenShot], bool]
 
 def say(notes: Iterable[str]) -> None:
     """Print notes on stderr."""
-    for note in notes:
-        click.echo(f"note: {note}", err=True)
+    note(*notes)
 
 
 @dataclass

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from armsight.app.options import JSON, SECONDS, STREAM, argument, declared, option, out
+from armsight.app.show.messages import note, print_answer
 from armsight.errors import ArmsightError
 
 if TYPE_CHECKING:
@@ -55,8 +55,7 @@ def command(
     with contextlib.ExitStack() as stack:
         opened = stack.enter_context(contextlib.closing(open_source(source)))
         said = notes_of(opened)
-        for note in said:
-            click.echo(f"note: {note}", err=True)
+        note(*said)
         published = Published(properties=properties(None, None, command="record", source=source))
         say = partial(click.echo, err=True)
         file = stack.enter_context(contextlib.closing(LazyMcap(output.expanduser(), published, say)))
@@ -69,11 +68,9 @@ def command(
             advance()
 
         result = record(opened, output, shots=shots, seconds=seconds, on_shot=stored_one)
-        for note in notes_of(opened)[len(said) :]:
-            click.echo(f"note: {note}", err=True)
-    if as_json:
-        keys = {"directory": str(result.directory), "shots": result.shots, "problems": result.problems}
-        click.echo(json.dumps({**keys, "stopped": result.stopped}))
+        note(*notes_of(opened)[len(said) :])
+    keys = {"directory": str(result.directory), "shots": result.shots, "problems": result.problems}
+    print_answer(as_json, {**keys, "stopped": result.stopped})
     stored = f"{result.shots} shots are stored in {result.directory}"
     if result.problems:
         stored += f", {result.problems} of them without images: shots.csv has the reasons"

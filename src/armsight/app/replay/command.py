@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import tempfile
 from collections import Counter
 from dataclasses import asdict
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING
 import click
 
 from armsight.app.options import ESTIMATOR, JSON, REFERENCES, STREAM, argument, declared, option, out
+from armsight.app.show.messages import print_answer, say
 
 if TYPE_CHECKING:
     from armsight.app.replay.run import Replayed
@@ -50,7 +50,7 @@ def command(
             output, holding=(POSES, LIVE), signs=(LIVE,), apart_from=[other and other / name for name in (POSES, LIVE)]
         )
     request = Request(recording, rig, target, arm, estimator, rate, references, stream)
-    replayed = replay(request, lambda line: click.echo(line, err=True))
+    replayed = replay(request, say)
     answer, lines = described(recording, replayed)
     if output is not None:
         write_tables(output.expanduser(), replayed)
@@ -61,7 +61,7 @@ def command(
             found = compare(other, Path(temporary))
         answer["compared"] = [each.to_json() for each in found]
         lines += [line for each in found for line in each.lines()]
-    click.echo(json.dumps(answer) if as_json else "\n".join(lines))
+    print_answer(as_json, answer, *lines)
 
 
 def described(recording: str, replayed: Replayed) -> tuple[dict[str, object], list[str]]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from functools import partial
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from armsight.app.options import IS_RIG, JSON, argument, declared, kept, option, out
+from armsight.app.show.messages import note, print_answer
 from armsight.errors import InputError
 from armsight.files import check_outputs, check_writable
 from armsight.vision.rigfiles import ASSUMED_SIGMA_PX, EXPORTED, FORMATS, export_rig, import_rig, open_format
@@ -41,7 +41,7 @@ def show(path: str = argument("RIG.json"), as_json: bool = JSON) -> None:
     from armsight.vision.rig import StereoRig
 
     rig = StereoRig.load(path)
-    click.echo(json.dumps(_json(path, rig)) if as_json else "\n".join(_lines(rig)))
+    print_answer(as_json, _json(path, rig), *_lines(rig))
 
 
 @command.command("import")
@@ -67,11 +67,9 @@ def import_(
     chosen = None if names is None else (names[0], names[1])
     rig = import_rig(name, files, unit_m=unit_m, image_size_px=size, sigma_px=sigma_px, pair=chosen)
     rig.save(output)
-    for key in ("uncertainty", "sigma_px"):
-        click.echo(f"note: {key}: {rig.provenance[key]}", err=True)
-    for note in rig.provenance["notes"]:
-        click.echo(f"note: {note}", err=True)
-    click.echo(json.dumps(_json(output, rig)) if as_json else f"{output}: baseline {rig.baseline_m * 1e3:.3f} mm")
+    note(*(f"{key}: {rig.provenance[key]}" for key in ("uncertainty", "sigma_px")))
+    note(*rig.provenance["notes"])
+    print_answer(as_json, _json(output, rig), f"{output}: baseline {rig.baseline_m * 1e3:.3f} mm")
 
 
 @command.command()
@@ -97,13 +95,10 @@ def export(
     lost = export_rig(StereoRig.load(path), name, paths)
     alpha = ALPHA if open_format(name).rectifies else None
     if alpha is not None:
-        click.echo(
-            f"note: the rectification in it has alpha {alpha:g}: all pixels of the rectified images are valid", err=True
-        )
-    for what in lost:
-        click.echo(f"note: not in the {name} format: {what}", err=True)
+        note(f"the rectification in it has alpha {alpha:g}: all pixels of the rectified images are valid")
+    note(*(f"not in the {name} format: {what}" for what in lost))
     answer = {"rig": path, "format": name, "files": paths, "lost": lost, "rectification_alpha": alpha}
-    click.echo(json.dumps(answer) if as_json else " ".join(paths))
+    print_answer(as_json, answer, " ".join(paths))
 
 
 @command.command("update")
@@ -127,7 +122,7 @@ def update_(
 
     check_writable(output, apart_from=(run / "rig.json", run / "body.toml", run / "detections.csv"))
     answer, lines = update(run, Path(output), since, report)
-    click.echo(json.dumps(answer) if as_json else "\n".join(lines))
+    print_answer(as_json, answer, *lines)
 
 
 def _image_size(text: str) -> tuple[int, int]:

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import tempfile
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from armsight.app.options import ARM, FIXED, FOLLOW_RIG, JSON, LOGGED, REFERENCES, SIM, STREAM, declared, option, out
 from armsight.app.progress import steps
-from armsight.app.show.messages import UNTRUSTED, colour, require, weak
+from armsight.app.show.messages import UNTRUSTED, note, print_answer, require, say, warn
 from armsight.errors import InputError
 from armsight.files import read_text, write_text
 
@@ -121,20 +120,9 @@ def command(
                 setup = replace(setup, fixed=fixed_targets)
                 require_start(setup, motions, targets)
                 begun = True
-                result = run_in(
-                    output,
-                    setup,
-                    rig,
-                    motions,
-                    targets,
-                    files,
-                    command="run",
-                    say=lambda line: click.echo(line, err=True),
-                    streams=stream,
-                    progress=progress,
-                    close_loop=not open_loop,
-                    follow_rig=follow_rig,
-                )
+                how: dict[str, Any] = {"streams": stream, "progress": progress}
+                how |= {"close_loop": not open_loop, "follow_rig": follow_rig}
+                result = run_in(output, setup, rig, motions, targets, files, command="run", say=say, **how)
                 progress("writing and plotting")
                 report = finish(result, output)
     except KeyboardInterrupt:
@@ -162,15 +150,13 @@ def _run_logged(
     require_matplotlib()
     arm, rig, target = open_arm(arm_spec), StereoRig.load_trusted(rig_path), open_target(target_spec)
     angles = read_angles(path, arm)
-    for note in angles.notes:
-        click.echo(f"note: {note}", err=True)
+    note(*angles.notes)
     with open_folder(output), contextlib.closing(open_source(source_spec)) as source, steps() as progress:
         result = run_logged(source, rig, target, arm, angles, progress)
         progress("writing and plotting")
         summary = write_logged(output, result, {"arm": arm_spec, "board": f"{LOGGED}{path}"})
-    click.echo(json.dumps(summary) if as_json else "\n".join(summary_lines(summary, output)))
-    for line in result.weak:
-        click.echo(weak(line), err=True, color=colour())
+    print_answer(as_json, summary, *summary_lines(summary, output))
+    warn(*result.weak)
     if result.weak:
         click.get_current_context().exit(UNTRUSTED)
 

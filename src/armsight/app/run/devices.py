@@ -14,10 +14,10 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-import click
 import numpy as np
 
 from armsight.app.options import SIM
+from armsight.app.show.messages import note
 from armsight.data import Array
 from armsight.errors import DeviceError, InputError
 from armsight.loop.references.distance import Distance
@@ -287,7 +287,7 @@ def open_devices(devices: Devices) -> Iterator[Setup]:
         rate_hz, stamped = shots.rate_hz()  # before the board is opened: what it says meanwhile would pile up
         if not stamped:
             taken = f"{_RATE_HZ:g} Hz is taken" if rate_hz is None else f"they come at {rate_hz:.1f} Hz, which is taken"
-            click.echo(f"note: the times of the shots show no rate of the cameras: {taken}", err=True)
+            note(f"the times of the shots show no rate of the cameras: {taken}")
         controller = stack.enter_context(open_motion_board(board))
         require_joints(controller, board, devices.arm)
         bit_s = sync_led_bit_s(controller, f"--board {board}") if devices.sync_led else None

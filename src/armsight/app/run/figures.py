@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy.special import ndtri
 
 from armsight.app.run.metrics import PassErrors, Study
 from armsight.app.run.tracks import Part, ToolTrack, errors
-from armsight.app.show.plotting import BLUE, INK, MUTED, ORANGE, RED, new_figure, plain_log, subplots
+from armsight.app.show.plotting import BLUE, INK, MUTED, ORANGE, RED, Axes, Figure, new_figure, plain_log, subplots
 from armsight.data import Array, Image
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 GREEN, SOFT_GREEN = "#2f7d4f", "#cfe8d8"
 _MM, _DEG = 1e3, float(np.degrees(1.0))

@@ -70,9 +70,10 @@ def run_in(
     command: str,
     say: Callable[[str], None],
     streams: Sequence[str] = (),
+    process: bool = False,
     **how: Any,  # noqa: ANN401 - options of run_experiment
 ) -> RunResult:
-    """Run the experiment on real devices, with run.mcap in its folder and streams beside.
+    """Run the experiment, with run.mcap in its folder, written by another process where asked for, and streams beside.
 
     ``files`` are the texts of motion.toml and body.toml, perhaps of references.toml, which are written first; run.mcap says
     which ``command`` made it; ``say`` is given what could not be recorded or published.
@@ -95,7 +96,7 @@ def run_in(
     may_hold = hold if command == "run" else None
     here = replace(published, hold=may_hold, temperatures_c=lambda: setup.board.joints.temperature_c)
     with contextlib.ExitStack() as stack:
-        file = stack.enter_context(contextlib.closing(LazyMcap(folder, published, say)))
+        file = stack.enter_context(contextlib.closing(LazyMcap(folder, published, say, process=process)))
         beside = stack.enter_context(contextlib.closing(open_streams(streams, here, say)))
         try:
             result = run_experiment(setup, rig, plan, targets, publisher=Fanout((file, beside)), **how)

@@ -6,14 +6,14 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from armsight.app.run.angles import LoggedAngles
 from armsight.app.run.folder import write_handeye
 from armsight.app.show.page import PAGE
-from armsight.app.show.plotting import BLUE, subplots
+from armsight.app.show.plotting import BLUE, Figure, subplots
 from armsight.app.show.report import Lines, Report, figures
 from armsight.data import Array, Missed, PoseEstimate, Record
 from armsight.errors import CalibrationError, InputError
@@ -28,9 +28,6 @@ from armsight.vision.markers.marker import Target
 from armsight.vision.pose.measure import measure
 from armsight.vision.rig import StereoRig
 from armsight.vision.sources import Source
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 MIN_POSES = 12
 #: Rows that belong to the neighbouring shots fit so many times better: then they are shifted.

@@ -25,7 +25,7 @@ from armsight.app.run.metrics import (
     track_metrics,
 )
 from armsight.app.run.tracks import Part, Tracks
-from armsight.app.show.messages import UNTRUSTED, Level, Note, colour, weak
+from armsight.app.show.messages import UNTRUSTED, Level, Note, note, warn
 from armsight.app.show.page import PAGE
 from armsight.app.show.report import Block, Fact, Grade, Lines, Plot, Report, Section, Text
 from armsight.app.show.table import TextTable
@@ -228,8 +228,8 @@ def show(report: Report, folder: Path, *, as_json: bool) -> None:
     """Print a run's report, mm and degrees or JSON; end with UNTRUSTED where it must not be trusted."""
     report.echo(as_json=as_json)
     if not as_json:
-        for note in report.notes:
-            click.echo(f"note: {note.text}" if note.level == "hint" else weak(note.text), err=True, color=colour())
+        for each in report.notes:
+            (note if each.level == "hint" else warn)(each.text)
         click.echo(f"{folder / PAGE} shows the run; {report.values['wall_s']:.0f} s")
     if report.noted("error"):
         click.get_current_context().exit(UNTRUSTED)

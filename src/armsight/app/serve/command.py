@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import click
 
 from armsight.app.options import argument, declared, option
+from armsight.app.show.messages import print_answer
 
 
 @click.command("serve")
@@ -24,8 +24,4 @@ def command(
     from armsight.app.serve.config import read_config
     from armsight.app.serve.service import Service
 
-    def report(event: dict[str, Any]) -> None:
-        if as_json:
-            click.echo(json.dumps(event))
-
-    click.get_current_context().exit(Service(read_config(config), report).run())
+    click.get_current_context().exit(Service(read_config(config), partial(print_answer, as_json)).run())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import sys
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ from typing import Any
 import click
 
 from armsight.app.options import JSON, SIM, argument, declared, option
-from armsight.app.show.messages import UNANSWERED
+from armsight.app.show.messages import UNANSWERED, print_answer, say
 from armsight.errors import InputError
 
 
@@ -56,11 +55,10 @@ def command(
     stdout = contextlib.redirect_stdout(sys.stderr) if as_json else contextlib.nullcontext()  # what commands print
     with stdout, simulated(walk, source or "") if simulate else contextlib.nullcontext():
         try:
-            code = walk.go(lambda line: click.echo(line, err=True), result)
+            code = walk.go(say, result)
         except (KeyboardInterrupt, click.Abort) as error:
             if isinstance(error.__context__, EOFError):
                 raise InputError(UNANSWERED) from None
             click.echo(f"\nwhat is done is kept: armsight setup {arm} goes on there", err=True)
-    if as_json:
-        click.echo(json.dumps(result))
+    print_answer(as_json, result)
     click.get_current_context().exit(code)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import json
 import logging
 import os
 import sys
@@ -17,8 +18,6 @@ from armsight.errors import InputError
 Level = Literal["note", "weak", "untrusted", "good", "hint", "warn", "error"]
 #: Exit code of a command that is done, but whose result must not be trusted (docs/concepts/health.md).
 UNTRUSTED = 3
-
-
 #: What is wrong where a question is asked and the standard input is closed.
 UNANSWERED = "nobody answers, as the standard input is closed: run it at a terminal"
 
@@ -41,6 +40,29 @@ def print_error(text: str) -> None:
     click.echo(click.style(f"armsight: error: {text}", fg="red"), err=True, color=colour())
 
 
+def print_answer(as_json: bool, value: object, *lines: str) -> None:
+    """Print what a command found: as JSON, or as lines for people."""
+    if as_json or lines:
+        click.echo(json.dumps(value) if as_json else "\n".join(lines))
+
+
+def say(line: str) -> None:
+    """Print a line on stderr."""
+    click.echo(line, err=True)
+
+
+def note(*lines: object) -> None:
+    """Print what is worth knowing on stderr, a line each."""
+    for line in lines:
+        say(f"note: {line}")
+
+
+def warn(*lines: str) -> None:
+    """Print what is weak about a result on stderr, a line each."""
+    for line in lines:
+        click.echo(weak(line), err=True, color=colour())
+
+
 class _Notes(logging.Handler):
     """Prints what the library logs as notes on stderr, each once."""
 
@@ -51,7 +73,7 @@ class _Notes(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         if (line := record.getMessage()) not in self._said:
             self._said.add(line)
-            click.echo(f"note: {line}", err=True)
+            note(line)
 
 
 def print_notes() -> None:

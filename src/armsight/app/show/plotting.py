@@ -17,9 +17,12 @@ from armsight.errors import InputError
 from armsight.files import table_text
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+    from matplotlib.axes import Axes as Axes
     from matplotlib.axis import Axis
-    from matplotlib.figure import Figure, FigureBase
+    from matplotlib.figure import Figure as Figure
+    from matplotlib.figure import FigureBase as FigureBase
+else:  # types of whoever plots: the library is imported where something is drawn
+    Axes = Figure = FigureBase = Any
 
 DPI = 150
 WIDTH_IN = 10.0

@@ -9,20 +9,17 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import click
 import numpy as np
 
 from armsight.app.show import page
 from armsight.app.show.encode import json_of
-from armsight.app.show.messages import UNTRUSTED, Level, Note, weak
-from armsight.app.show.plotting import data_csv, drawing, png, require_matplotlib, svg
+from armsight.app.show.messages import UNTRUSTED, Level, Note, note, weak
+from armsight.app.show.plotting import Figure, data_csv, drawing, png, require_matplotlib, svg
 from armsight.app.show.table import TextTable, html_table, plain_text
 from armsight.data import Image
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True)
@@ -187,8 +184,7 @@ class Report:
 
     def echo(self, *, as_json: bool, written: str | None = None, **more: object) -> int:
         """Print the result, notes on stderr, and return the exit code."""
-        for note in self.noted("note"):
-            click.echo(f"note: {note}", err=True)
+        note(*self.noted("note"))
         click.echo(json.dumps({**self.json(), **json_of(more)}) if as_json else self.text(styled=True))
         if written is not None and not as_json:
             click.echo(f"\nwritten: {written}")

@@ -25,6 +25,7 @@ import click
 import numpy as np
 
 from armsight.app.show.encode import jpeg
+from armsight.app.show.messages import say
 from armsight.app.stream.cell_file import (
     ANSWER_S,
     LONGEST,
@@ -269,9 +270,7 @@ class CellSink(Sink):
         def note(text: str) -> None:
             if text not in notes:
                 notes.add(text)
-                click.echo(
-                    f"note: --stream cell:{self._cell.name}: {text}; its events are kept and sent later", err=True
-                )
+                say(f"note: --stream cell:{self._cell.name}: {text}; its events are kept and sent later")
 
         while True:
             ending = self._ending.wait(_POST_S)

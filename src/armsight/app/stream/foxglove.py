@@ -6,6 +6,8 @@ left camera's frame is the rig's. Covariances are along the axes of the frame th
 
 from __future__ import annotations
 
+import functools
+import importlib
 from collections.abc import Iterator
 from typing import Any, TypeAlias
 
@@ -44,6 +46,19 @@ def require_foxglove(what: str, extra: str) -> None:
         ) from None
 
 
+@functools.cache
+def _type(name: str) -> Message:
+    return getattr(importlib.import_module(f"foxglove_schemas_protobuf.{name}_pb2"), name)
+
+
+def _made(kind: str, /, **fields: object) -> Message:
+    return _type(kind)(**fields)
+
+
+def _log(stamp: Message, level: str, text: str) -> Message:
+    return _made("Log", timestamp=stamp, level=_LEVELS[level], message=text, name="armsight")
+
+
 class LookedAt:
     """Chooses of shots that are pixels those whose images are sent, to be looked at: one pair a second."""
 
@@ -62,33 +77,8 @@ class Messages:
     """Makes messages; it remembers what is sent once."""
 
     def __init__(self, published: Published) -> None:
-        from foxglove_schemas_protobuf import (
-            CameraCalibration_pb2,
-            CompressedImage_pb2,
-            FrameTransforms_pb2,
-            ImageAnnotations_pb2,
-            JointStates_pb2,
-            Log_pb2,
-            Odometry_pb2,
-            PoseInFrame_pb2,
-            SceneUpdate_pb2,
-        )
-        from google.protobuf.timestamp_pb2 import Timestamp
-
-        self._published = published
-        self._Calibration: Message = CameraCalibration_pb2.CameraCalibration
-        self._Compressed: Message = CompressedImage_pb2.CompressedImage
-        self._Transforms: Message = FrameTransforms_pb2.FrameTransforms
-        self._Annotations: Message = ImageAnnotations_pb2.ImageAnnotations
-        self._Joints: Message = JointStates_pb2.JointStates
-        self._Log: Message = Log_pb2.Log
-        self._Odometry: Message = Odometry_pb2.Odometry
-        self._Pose: Message = PoseInFrame_pb2.PoseInFrame
-        self._Scene: Message = SceneUpdate_pb2.SceneUpdate
-        self._Timestamp: Message = Timestamp
-        self._calibrated = False
-        self._looked_at = LookedAt()
-        self._joints_s = -np.inf
+        self._published, self._looked_at = published, LookedAt()
+        self._calibrated, self._joints_s = False, -np.inf
         self._T_base_rig: Array | None = None
 
     def of(self, datum: ShotDatum | JointsDatum | NoteDatum | EventDatum) -> Iterator[tuple[str, Message]]:
@@ -99,14 +89,13 @@ class Messages:
         elif isinstance(datum, JointsDatum):
             yield from self._of_joints(datum, stamp)
         elif isinstance(datum, NoteDatum):
-            yield "/log", self._log(stamp, datum.level, datum.text)
+            yield "/log", _log(stamp, datum.level, datum.text)
 
     def _stamp(self, t_s: float) -> Message:
-        seconds, nanos = divmod(nanoseconds(t_s), _NS)
-        return self._Timestamp(seconds=seconds, nanos=nanos)
+        from google.protobuf.timestamp_pb2 import Timestamp
 
-    def _log(self, stamp: Message, level: str, text: str) -> Message:
-        return self._Log(timestamp=stamp, level=_LEVELS[level], message=text, name="armsight")
+        seconds, nanos = divmod(nanoseconds(t_s), _NS)
+        return Timestamp(seconds=seconds, nanos=nanos)
 
     def _of_shot(self, datum: ShotDatum, stamp: Message) -> Iterator[tuple[str, Message]]:
         if not self._calibrated:
@@ -123,11 +112,11 @@ class Messages:
                 yield f"/{side}/annotations", annotations
             if result.dropped:
                 said = "; ".join(f"{each.point}: {each.reason}" for each in result.dropped)
-                yield "/log", self._log(stamp, "info", f"{datum.shot.name}: left out {said}")
+                yield "/log", _log(stamp, "info", f"{datum.shot.name}: left out {said}")
         elif isinstance(result, Missed):
-            yield "/log", self._log(stamp, "warning", f"{datum.shot.name}: missed: {result.reason}")
+            yield "/log", _log(stamp, "warning", f"{datum.shot.name}: missed: {result.reason}")
         if datum.outcome is not None and not datum.outcome.startswith("used"):
-            yield "/log", self._log(stamp, "warning", f"{datum.shot.name}: {datum.outcome}")
+            yield "/log", _log(stamp, "warning", f"{datum.shot.name}: {datum.outcome}")
 
     def _images(self, shot: Shot, stamp: Message) -> Iterator[tuple[str, Message]]:
         """Yield both images as the cameras delivered them; of pixels one pair a second, to look at, as JPEG."""
@@ -138,7 +127,7 @@ class Messages:
             return
         for side, data in zip(SIDES, encoded, strict=True):
             kind = "png" if data.startswith(b"\x89PNG") else "jpeg"
-            yield f"/{side}/image", self._Compressed(timestamp=stamp, frame_id=side, data=data, format=kind)
+            yield f"/{side}/image", _made("CompressedImage", timestamp=stamp, frame_id=side, data=data, format=kind)
 
     def _calibrations(self, stamp: Message) -> Iterator[tuple[str, Message]]:
         rig = self._published.rig
@@ -151,7 +140,8 @@ class Messages:
                 d += [0.0] * (5 - len(d))
             yield (
                 f"/{side}/calibration",
-                self._Calibration(
+                _made(
+                    "CameraCalibration",
                     timestamp=stamp,
                     frame_id=side,
                     width=camera.image_size_px[0],
@@ -165,7 +155,7 @@ class Messages:
             )
 
     def _transforms(self, stamp: Message, result: PoseEstimate | Missed | None) -> Message:
-        found = self._Transforms()
+        found = _made("FrameTransforms")
         frames: list[tuple[str, str, Array]] = [("rig", "left", np.eye(4))]
         if self._published.rig is not None:
             frames.append(("rig", "right", self._published.rig.T_left_right))
@@ -184,9 +174,11 @@ class Messages:
     def _of_pose(self, result: PoseEstimate, stamp: Message) -> Iterator[tuple[str, Message]]:
         T = result.T_left_body
         cov = left_axes(T, result.cov)
-        yield "/pose", self._in_frame(stamp, "left", T)
+        pose = _made("PoseInFrame", timestamp=stamp, frame_id="left")
+        _set_pose(pose.pose.position, pose.pose.orientation, T)
+        yield "/pose", pose
         yield "/odometry", self._odometry(stamp, "left", "body", T, cov)
-        scene = self._Scene()
+        scene = _made("SceneUpdate")
         entity = scene.entities.add(timestamp=stamp, frame_id="left", id="ellipsoid", frame_locked=True)
         values, axes = np.linalg.eigh(cov[:3, :3])
         axes = axes * np.sign(np.linalg.det(axes))
@@ -199,13 +191,8 @@ class Messages:
         _colour(sphere.color, _YELLOW)
         yield "/scene", scene
 
-    def _in_frame(self, stamp: Message, frame: str, T: Array) -> Message:
-        found = self._Pose(timestamp=stamp, frame_id=frame)
-        _set_pose(found.pose.position, found.pose.orientation, T)
-        return found
-
     def _odometry(self, stamp: Message, frame: str, body: str, T: Array, cov: Array) -> Message:
-        found = self._Odometry(timestamp=stamp, frame_id=frame, body_frame_id=body)
+        found = _made("Odometry", timestamp=stamp, frame_id=frame, body_frame_id=body)
         _set_pose(found.pose.position, found.pose.orientation, T)
         found.pose_covariance.extend(cov.ravel().tolist())
         return found
@@ -215,7 +202,7 @@ class Messages:
         seen, names = result.points.seen, self._published.body.point_names
         reasons = {each.point: each.reason for each in result.dropped}
         for camera in range(2):
-            found = self._Annotations(timestamp=stamp)
+            found = _made("ImageAnnotations", timestamp=stamp)
             used = found.points.add(timestamp=stamp, type=1, thickness=6.0)
             _colour(used.outline_color, _GREEN)
             for row, (u, v) in zip(seen.ids.tolist(), seen.uv[:, camera].tolist(), strict=True):
@@ -232,7 +219,7 @@ class Messages:
             return
         self._joints_s = datum.time_s
         q = datum.states.q[-1]
-        joints = self._Joints(timestamp=stamp)
+        joints = _made("JointStates", timestamp=stamp)
         for k, angle in enumerate(q.tolist(), start=1):
             joints.joints.add(name=f"joint{k}", position=angle)
         yield "/joints", joints
@@ -240,7 +227,7 @@ class Messages:
             return
         T = datum.T_base_tool
         yield "/tool/odometry", self._odometry(stamp, "base", "tool", T, left_axes(T, datum.cov))
-        found = self._Transforms()
+        found = _made("FrameTransforms")
         self._add_transform(found, stamp, "base", "tool", T)
         yield "/tf", found
         if self._published.arm is not None:
@@ -250,7 +237,7 @@ class Messages:
         """Return the arm as a line through the origins of its links."""
         arm = self._published.arm
         assert arm is not None
-        scene = self._Scene()
+        scene = _made("SceneUpdate")
         entity = scene.entities.add(timestamp=stamp, frame_id="base", id="arm", frame_locked=True)
         line = entity.lines.add(type=0, thickness=0.01)
         for p in arm.links(q)[:, :3, 3].tolist():
