@@ -420,11 +420,7 @@ def test_readings_of_rotations_axes_and_units(armsight, tmp_path, seen):
     )
     other = A.copy()
     other[5, :3, 3] *= 1e3
-    rejected(
-        matrices(path, other),
-        "are some rows in millimetres?",
-        more=("--columns", "units=detect"),
-    )
+    rejected(matrices(path, other), "are some rows in millimetres?", more=("--columns", "units=detect"))
     head, arm = ",".join(f"q{i}_deg" for i in range(1, 7)), ("--model", "six_r")
     rejected(named(path, head, np.degrees(q + np.pi / 2 * np.eye(6)[2])), "another zero", "add -90 deg to q3", more=arm)
     ur = open_arm("ur3").home + q

@@ -25,9 +25,8 @@ _MANY = 0.25  # as many blunders as this share of the poses are no calibration t
 #: Sources whose mean log density of a pose left out is within this of the best are not distinguished from them.
 DISTINGUISHED = 0.2
 ADVISED, MORE = 15, 6  # fewer poses than these are few, and so many more are advised then
-GOOD_M = (
-    2e-3  # m; error of poses left out of a good calibration at most; half: worn arms have none, double: 4 mm is good
-)
+#: m; error of poses left out of a good calibration at most; half: worn arms have none, double: 4 mm is good.
+GOOD_M = 2e-3
 _POSE = ("x, mm", "y, mm", "z, mm", "rx, deg", "ry, deg", "rz, deg")
 
 

@@ -146,13 +146,8 @@ class LiveServer:
         silent = logging.getLogger("armsight.live")  # what fails is handled here, and not logged
         silent.setLevel(logging.CRITICAL)
         how: dict[str, Any] = {"process_request": self._request, "compression": None, "logger": silent}
-        how |= {
-            "max_size": 2 * LONGEST,
-            "max_queue": 16,
-            "write_limit": 1 << 16,
-            "ping_interval": 5,
-            "ping_timeout": 10,
-        }
+        how |= {"max_size": 2 * LONGEST, "max_queue": 16, "write_limit": 1 << 16}
+        how |= {"ping_interval": 5, "ping_timeout": 10}
         try:
             server = await serve(self._connected, self.host, self.port, **how)
         except OSError as error:

@@ -147,9 +147,8 @@ class RunResult:
     #: begin and end of the time the body was hidden on purpose; None where it was not.
     covered_s: tuple[float, float] | None = None
     kept: list[Shot] = field(default_factory=list)  #: the first shots of the motions
-    picture: tuple[Shot, PoseEstimate] | None = (
-        None  #: the first shot in motion in which the body was found, and its pose
-    )
+    #: the first shot in motion in which the body was found, and its pose.
+    picture: tuple[Shot, PoseEstimate] | None = None
     health: tuple[HealthFinding, ...] = ()  #: why the result must not be trusted; empty where nothing says so
     changes: tuple[Change, ...] = ()  #: what explains a motion of the rig or the body; empty where none was found
     fixed_unseen: tuple[str, ...] = ()  #: names of the fixed bodies that were seen too rarely to be watched

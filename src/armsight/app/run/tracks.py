@@ -36,9 +36,8 @@ from armsight.tables.columns import Columns
 NAMES = ("truth", "potentiometers", "vision", "fused", "live", "reference")
 _COLUMNS = ("t_s", "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
 _DIGITS = 9  # decimals of m, s and rad in files
-_PART_S = (
-    60.0  # s; of what is in memory at once where a whole run is gone through; half: slower, double: twice the memory
-)
+#: s; of what is in memory at once where a whole run is gone through; half: slower, double: twice the memory.
+_PART_S = 60.0
 
 
 @dataclass(frozen=True, eq=False)

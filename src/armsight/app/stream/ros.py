@@ -154,9 +154,8 @@ def reading_messages(name: str, samples: Samples) -> Iterator[tuple[int, bytes]]
     """Yield the time, ns, and the bytes of the message of each sample; ``name`` is its frame."""
     frame = name.encode() + b"\0"
     frame = struct.pack("<I", len(frame)) + frame
-    infrared = (
-        frame + b"\1" + b"\0" * (-(9 + len(frame)) % 4)
-    )  # numbers stand at multiples of their size from the stamp on
+    # Numbers stand at multiples of their size from the stamp on.
+    infrared = frame + b"\1" + b"\0" * (-(9 + len(frame)) % 4)
     frame += b"\0" * (-(8 + len(frame)) % 8)
     for t_ns, z in zip(np.round(1e9 * samples.t_s).astype(np.int64).tolist(), samples.z.tolist(), strict=True):
         stamp = struct.pack("<4siI", b"\0\1\0\0", *divmod(t_ns, 1_000_000_000))
