@@ -134,7 +134,7 @@ def broken(tmp_path, monkeypatch, mend):
 
     monkeypatch.setattr(demo, "Workcell", Mended)
     monkeypatch.setattr(demo, "Process", Here)
-    monkeypatch.setattr(demo, "LazyMcap", lambda *given, process: LazyMcap(*given))
+    monkeypatch.setattr("armsight.app.run.folder.LazyMcap", lambda *given, process: LazyMcap(*given))
     monkeypatch.setattr(demo, "_AMOUNTS", {True: (6, 12, 0)})
     with pytest.raises(ArmsightError) as caught:
         run_demo(Demo(tmp_path, emulator="host", cameras="640x360@30", quick=True, seed=1))

@@ -112,7 +112,7 @@ def test_ctrl_c_before_and_in_motion(armsight, files, tmp_path, monkeypatch, sta
         def __exit__(self, *ended):
             return self.shown.__exit__(*ended)
 
-    monkeypatch.setattr("armsight.app.progress.steps", Interrupting)
+    monkeypatch.setattr("armsight.app.run.command.steps", Interrupting)
     said = armsight(*arguments(files, tmp_path / "run"))
     assert said.code == 130
     assert said.err.splitlines()[-1] == "armsight: interrupted"
