@@ -7,6 +7,7 @@ program that started it: so a script needs no guard of its main module, as :mod:
 
 from __future__ import annotations
 
+import ctypes
 import importlib
 import os
 import pickle
@@ -27,6 +28,12 @@ _SMALL_BYTES = 1 << 14
 #: A child gives way to who started it: with few cores, measuring does not wait for rendering.
 _NICE = 5
 _LENGTH = struct.Struct("<q")
+
+
+def return_freed() -> None:
+    """Return memory that was freed to the system; glibc keeps blocks as large as the largest that was freed before."""
+    with suppress(OSError, AttributeError, TypeError):
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 class Process:

@@ -14,7 +14,6 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
-from scipy.signal import correlate, find_peaks
 
 from armsight.data import Array, JointStates
 from armsight.errors import CalibrationError, InputError
@@ -198,6 +197,8 @@ def _positions(table: PoseTable) -> tuple[Array, Array]:
 
 def _likely_lags(t_a: Array, p_a: Array, t_b: Array, p_b: Array) -> list[float]:
     """Return the lags, s, at which the speeds of two paths are most alike, the best first."""
+    from scipy.signal import correlate, find_peaks  # takes 25 MB, which who only runs or shows an arm does not need
+
     step = float(min(np.median(np.diff(t_a)), np.median(np.diff(t_b))))
     speeds = []
     for t, p in ((t_a, p_a), (t_b, p_b)):

@@ -1,5 +1,7 @@
 """The capture: the newest shot alone, a camera that is pulled out and put back, left and right exchanged."""
 
+import subprocess
+import sys
 import threading
 import time
 
@@ -139,3 +141,11 @@ def test_one_camera_alone_is_one_line_and_the_session_stays(tmp_path):
         assert errors[0].startswith("usb:7 names one camera, two are needed")
     finally:
         session.close()
+
+
+def test_the_page_does_not_import_what_takes_much_memory():
+    code = (
+        "import armsight.app.live.session, sys; print([m for m in ('scipy.signal', 'scipy.stats') if m in sys.modules])"
+    )
+    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert answer.stdout == "[]\n"

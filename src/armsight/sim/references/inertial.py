@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy import signal
 
 from armsight.data import Array, Record
 from armsight.geometry.pose import exp_se3, inverse, log_se3
@@ -115,6 +114,8 @@ class InertialUnit:
 
     def _filtered(self, t_s: Array, z: Array) -> Array:
         """Return times and values (N, 7) behind the analogue part, the last one of before among them."""
+        from scipy import signal  # takes 25 MB, which a workcell without a unit does not need
+
         e = self._errors
         z = z + e.hum * np.sin(2 * np.pi * e.hum_hz * t_s[:, None] + np.arange(6))
         rates, forces = z[:, :3], z[:, 3:]
@@ -149,6 +150,8 @@ def record(t_s: Array, Ts_base_sensor: Array, errors: InertialErrors, rng: np.ra
     Arguments are as for :meth:`InertialUnit.read` and :class:`InertialUnit`.
     """
     if errors.mount_hz:
+        from scipy import signal  # as above
+
         dt, w = float(t_s[1] - t_s[0]), 2 * np.pi * errors.mount_hz
         drive = np.zeros(len(t_s))
         drive[1:-1] = np.gradient(_felt(Ts_base_sensor, dt)[:, 0], dt)

@@ -15,6 +15,7 @@ import numpy as np
 from armsight.data import Array, Shot
 from armsight.errors import DeviceError, InputError
 from armsight.geometry.pose import exp_se3, inverse, log_se3, transform
+from armsight.processes import return_freed
 from armsight.robot.kinematics.arm import Arm
 from armsight.sim.example_rig import board_poses
 from armsight.sim.render.scene import chessboard
@@ -131,7 +132,7 @@ class SimulatedCameras(Source):
         self.workcell = Workcell.open(arm=arm, cameras=cameras, seed=seed, emulator=emulator, model=model)
         self.person = Person(self.workcell, seed)
         self.outline: Callable[[], tuple[Array, Array] | None] = lambda: None
-        self._number, self._due_s = 0, 0.0
+        self._number, self._due_s, self._shown = 0, 0.0, False
 
     def read(self) -> Shot | None:
         """Return the next shot, at the cameras' pace at most."""
@@ -177,6 +178,9 @@ class SimulatedCameras(Source):
 
     def seen(self, shot: Shot) -> Shot:
         """Return a shot as it is with the lenses that are covered."""
+        if not self._shown:  # the first images take 90 MB for a moment
+            self._shown = True
+            return_freed()
         dark = {
             side: np.full_like(image, 3) for side in self.person.covered if (image := getattr(shot, side)) is not None
         }
