@@ -48,7 +48,7 @@ def draw_wire(folder: Path) -> None:
             found, part = identify(arm, wire.measured.rows(train)), wire.measured.rows(test)
             x, free = found.solution.x, found.solution.free
             weighted = with_joint_noise(found.model, x, part, found.joint_sigma_rad)
-            linear = linear_of(found.model, x, weighted, found.model.feature_values(part.q, None), free, found.prior)
+            linear = linear_of(found.model, x, weighted, free, found.prior)
             cov = covariances(linear, variances_of(linear, found.solution.noise))
             cov = cov + linear.J @ found.solution.cov[np.ix_(free, free)] @ linear.J.swapaxes(1, 2)
             e[test], squares[test] = linear.e[:, 0], linear.e[:, 0] ** 2 / cov[:, 0, 0]

@@ -90,12 +90,11 @@ def identify(seed, displaced=STILL, blunder=0.0):
     B = body @ X @ exp_se3(rng.normal(size=(N, 6)) * noise)
     B[BLUNDER, :3, 3] += blunder
     measured = Measured(empty.q, B[:, None, :3, 3], B[:, :3, :3], cov)
-    phi = model.feature_values(q, None)
 
     def linear(x):
         at = truth.copy()
         at[free] += x
-        return linear_of(model, at, measured, phi, free, prior)
+        return linear_of(model, at, measured, free, prior)
 
     return Drawn(linear, lambda of: restricted(of, np.full(2, 1e-8), MIN_NOISE, MAX_NOISE), int(free.sum()))
 

@@ -145,16 +145,9 @@ def _beyond(
 
 @kernel
 def _step(
-    table: Array,
-    points: Array,
-    beside: Array,
-    motion: Array,
-    dt: float,
-    half: Array,
-    position: Array,
-    speed: Array,
+    table: Array, points: Array, beside: Array, motion: Array, dt: float, half: Array, position: Array, speed: Array,
     lever: Array,
-) -> None:
+) -> None:  # fmt: skip
     """Step links in half their backlash by a time dt: position and speed (n,) off their shafts, rad, rad/s; write levers.
 
     The shafts' motion (3, n) is angles, speeds and accelerations.
@@ -191,34 +184,17 @@ def loose(table: Array, points: Array, beside: Array, q: Array, out: Array) -> N
 
 @kernel
 def float_on(
-    t: Array,
-    q: Array,
-    memory: Array,
-    first: int,
-    begin: int,
-    end: int,
-    table: Array,
-    points: Array,
-    beside: Array,
-    still: float,
-    gap: Array,
-) -> None:
+    t: Array, q: Array, memory: Array, first: int, begin: int, end: int, table: Array, points: Array, beside: Array,
+    still: float, gap: Array,
+) -> None:  # fmt: skip
     """Step links inside their backlash from row to row of readings.
 
-    Args:
-        t: (N,) times of the readings, s.
-        q: (N, n) readings, rad.
-        memory: (N, 4, n) to be written: position and speed in half gaps, how far the links have come in that, and lever
-            of the torque of inertia, m.
-        first: first row there is.
-        begin: first row to be written.
-        end: the row after the last.
-        table: of the arm.
-        points: what stands for its links (K, 5).
-        beside: what each joint has beside them (3, n).
-        still: an arm none of whose joints is faster stands, rad/s: its links stand as well, and what is loose stays where
-            it is while its shaft creeps.
-        gap: (n,) the backlash, rad.
+    ``t``: (N,) times of the readings, s. ``q``: (N, n) readings, rad. ``memory``: (N, 4, n) to be written: position and
+    speed in half gaps, how far the links have come in that, and lever of the torque of inertia, m. ``first``: first row
+    there is. ``begin``: first row to be written. ``end``: the row after the last. ``table``: of the arm. ``points``:
+    what stands for its links (K, 5). ``beside``: what each joint has beside them (3, n). ``still``: an arm none of
+    whose joints is faster stands, rad/s: its links stand as well, and what is loose stays where it is while its shaft
+    creeps. ``gap``: (n,) the backlash, rad.
     """
     joints = gap.shape[0]
     motion, position, speed, half = np.empty((3, joints)), np.empty(joints), np.empty(joints), 0.5 * gap

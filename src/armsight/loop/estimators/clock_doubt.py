@@ -13,14 +13,13 @@ import math
 import numpy as np
 
 from armsight.data import Array
-from armsight.loop.estimators.clock import ClockFollower
+from armsight.loop.estimators.clock import SYSTEMATIC_S, ClockFollower
 from armsight.loop.estimators.errormodel import Predicted, StateStep
 
 #: Sigmas from which on an image begins a hypothesis, and below which one is dropped; half: noise does, double: jumps of
 #: some ms are taken for errors of the arm.
 DOUBTED, REFUTED = 4.5, 2.0
-#: An offset is known no better than this, s; an image that shows none to ``SHOWN_S`` begins none. Half, double: nothing.
-SIGMA_S, SHOWN_S = 3e-4, 0.01
+SHOWN_S = 0.01  # s; an image that shows an offset no better than this begins none; half, double: nothing
 
 
 class JumpingClock(ClockFollower):
@@ -58,11 +57,8 @@ class ClockDoubt:
     def step(self, t_s: float, steps: tuple[StateStep, ...], at: Predicted, arm: int) -> None:
         """Take how the filter came to its newest state since the image before.
 
-        Args:
-            t_s: time of the image, s, which was the last step.
-            steps: of the arm's error and what is beside.
-            at: as the image was predicted.
-            arm: count of the arm's error.
+        ``t_s``: time of the image, s, which was the last step. ``steps``: of the arm's error and what is beside.
+        ``at``: as the image was predicted. ``arm``: count of the arm's error.
         """
         late, by, self.t_s = at.H[:, self._delay], self._by, t_s
         for step in steps:
@@ -88,7 +84,7 @@ class ClockDoubt:
         if math.isfinite(self._variance):
             self._offset_s += float(now @ (z - g * self._offset_s)) / (1.0 / self._variance + float(now @ g))
             self._variance = 1.0 / (1.0 / self._variance + float(now @ g))
-            if abs(self._offset_s) < REFUTED * math.hypot(math.sqrt(self._variance), SIGMA_S):
+            if abs(self._offset_s) < REFUTED * math.hypot(math.sqrt(self._variance), SYSTEMATIC_S):
                 self.drop()
         held = self._offset_s**2 / self._variance
         if information > SHOWN_S**-2 and score**2 / information > max(DOUBTED**2, held):
@@ -100,6 +96,6 @@ class ClockDoubt:
         """One sigma (K,) of what the jump does to the arm's error as the filter has it; None where there is none."""
         if not len(self._by):
             return None
-        out = self._by * math.hypot(self._offset_s, math.sqrt(self._variance), SIGMA_S)
+        out = self._by * math.hypot(self._offset_s, math.sqrt(self._variance), SYSTEMATIC_S)
         out[self._delay] = 0.0
         return out

@@ -46,14 +46,10 @@ def gained(
 ) -> Gained:
     """Return what a reading does.
 
-    Args:
-        P: (K, K) covariance of the state.
-        z: (m,) residual: measured minus predicted.
-        H: (m, K) derivative of the prediction by the state.
-        R: (m, m) covariance of what is the reading's own.
-        shares: the parameters that the reading depends on.
-        before: how the state's error hangs on parameters so far.
-        fixed: rows of the state that a reading does not change.
+    ``P``: (K, K) covariance of the state. ``z``: (m,) residual: measured minus predicted. ``H``: (m, K) derivative of
+    the prediction by the state. ``R``: (m, m) covariance of what is the reading's own. ``shares``: the parameters that
+    the reading depends on. ``before``: how the state's error hangs on parameters so far. ``fixed``: rows of the state
+    that a reading does not change.
     """
     C = {name: before.get(name, np.zeros((len(P), len(one.cov)))) for name, one in shares.items()}
     HP = H @ P + sum(one.by @ C[name].T for name, one in shares.items())

@@ -200,13 +200,9 @@ class ErrorModel:
     ) -> Propagation:
         """Return the same for times (N,), and how far joints (N, n) and sides (N, 2, n) have come.
 
-        Args:
-            time_s: (N,) since a state, s.
-            travel: (N, n) of the joints meanwhile, rad.
-            flips: (N, 2, n) of the sides.
-            was: (N, n) what was left of a reading's variance at the state, or (1, n) at one state for all.
-            joints: at the times.
-            learning: as above.
+        ``time_s``: (N,) since a state, s. ``travel``: (N, n) of the joints meanwhile, rad. ``flips``: (N, 2, n) of the
+        sides. ``was``: (N, n) what was left of a reading's variance at the state, or (1, n) at one state for all.
+        ``joints``: at the times. ``learning``: as above.
         """
         shape = len(time_s), self.layout.size
         kept, added = np.empty(shape), np.empty(shape)
@@ -245,11 +241,8 @@ class ErrorModel:
     ) -> tuple[Array, Array]:
         """Return the innovation (6,) of a measurement, and the model's derivative (6, size) by x.
 
-        Args:
-            x: the state.
-            joints: at the measurement.
-            pose_measurement: the measurement.
-            jitter_s: standard deviation of its time, s.
+        ``x``: the state. ``joints``: at the measurement. ``jitter_s``: standard
+        deviation of its time, s.
         """
         z, H = np.empty(6), np.empty((6, self.layout.size))
         seen = pose_measurement.T_base_tool, pose_measurement.cov_noise, jitter_s
@@ -274,12 +267,9 @@ class ErrorModel:
         Return the gain (size, 6), innovation (6,) and derivative (6, size) of the last linearization; ``at.HP`` is of it,
         too. The iterated update (Bell and Cathey, 1993). Other arguments as for :meth:`innovation`.
 
-        Args:
-            at: the state before.
-            joints: at the measurement.
-            pose_measurement: the measurement.
-            jitter_s: standard deviation of its time, s.
-            learns_delay: whether the delay is corrected; if not, it stays as it is, and so does its variance.
+        ``at``: the state before. ``joints``: at the measurement. ``jitter_s``:
+        standard deviation of its time, s. ``learns_delay``: whether the delay is corrected; if not, it stays as it is,
+        and so does its variance.
         """
         K, z, H = np.empty((self.layout.size, 6)), at.z.copy(), at.H.copy()
         now = joints.q[0], joints.qd[0], joints.unseen[0]
@@ -312,18 +302,9 @@ def _decayed(x: float) -> float:
     "f8[:, ::1]"
 )
 def _forget(
-    time: Array,
-    travel: Array,
-    flips: Array,
-    variance: Array,
-    lasts: Array,
-    was: Array,
-    sigmas: Array,
-    forgets: Array,
-    learning: float,
-    kept: Array,
-    added: Array,
-) -> None:
+    time: Array, travel: Array, flips: Array, variance: Array, lasts: Array, was: Array, sigmas: Array, forgets: Array,
+    learning: float, kept: Array, added: Array,
+) -> None:  # fmt: skip
     """Write into kept and added (N, size) what times (N,), travel (N, n) and flips (N, 2, n) do."""
     rest_travel, pose_travel, creep, flip, flip_float, reading = forgets
     joints, pose_at = travel.shape[1], sigmas.shape[0] - 7
@@ -377,19 +358,9 @@ def _add_times(HP: Array, H: Array, out: Array) -> None:
     fastmath={"contract"},
 )
 def _tracked(
-    table: Array,
-    x: Array,
-    P: Array,
-    kept: Array,
-    added: Array,
-    q: Array,
-    unseen: Array,
-    T_measured: Array,
-    common: Array,
-    Ts: Array,
-    covs: Array,
-    own: Array,
-) -> None:
+    table: Array, x: Array, P: Array, kept: Array, added: Array, q: Array, unseen: Array, T_measured: Array,
+    common: Array, Ts: Array, covs: Array, own: Array,
+) -> None:  # fmt: skip
     """Write poses (N, 4, 4) by a state propagated to readings q (N, n), and H (K P K + A) H' (N, 6, 6), to Ts and own.
 
     K and A stand in kept and added (N, size): A has the rest, the readings' noise and the pose alone (:func:`_forget`).
@@ -461,18 +432,9 @@ def _shared(Ts: Array, T_measured: Array, common: Array, covs: Array) -> None:
     "f8[:, ::1]"
 )
 def _innovation(
-    table: Array,
-    x: Array,
-    q: Array,
-    qd: Array,
-    unseen: Array,
-    T_measured: Array,
-    cov_noise: Array,
-    jitter_s: float,
-    z: Array,
-    H: Array,
-    R: Array,
-) -> None:
+    table: Array, x: Array, q: Array, qd: Array, unseen: Array, T_measured: Array, cov_noise: Array, jitter_s: float,
+    z: Array, H: Array, R: Array,
+) -> None:  # fmt: skip
     """Write the innovation (6,), the derivative (6, size) by x and the noise (6, 6) to z, H, R."""
     T, delay = np.empty((4, 4)), x.shape[0] - 1
     pose_and_derivative(table, x, q, unseen, T, H)
@@ -492,24 +454,9 @@ def _innovation(
     "const f8[:, ::1], f8, f8[::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1]"
 )
 def _predicted(
-    table: Array,
-    kept: Array,
-    added: Array,
-    q: Array,
-    qd: Array,
-    unseen: Array,
-    T_measured: Array,
-    cov_noise: Array,
-    cov_common: Array,
-    jitter_s: float,
-    x: Array,
-    P: Array,
-    z: Array,
-    H: Array,
-    R: Array,
-    HP: Array,
-    S: Array,
-) -> float:
+    table: Array, kept: Array, added: Array, q: Array, qd: Array, unseen: Array, T_measured: Array, cov_noise: Array,
+    cov_common: Array, jitter_s: float, x: Array, P: Array, z: Array, H: Array, R: Array, HP: Array, S: Array,
+) -> float:  # fmt: skip
     """Propagate x and P in place, write the other parts of a :class:`Predicted`, and return the chi-square of z."""
     for k in range(x.shape[0]):
         if kept[k] != 1.0:
@@ -535,22 +482,9 @@ def _predicted(
     fastmath={"contract"},
 )
 def _updated(
-    table: Array,
-    q: Array,
-    qd: Array,
-    unseen: Array,
-    T_measured: Array,
-    cov_noise: Array,
-    jitter_s: float,
-    learns_delay: bool,
-    x: Array,
-    P: Array,
-    z: Array,
-    H: Array,
-    R_at: Array,
-    HP: Array,
-    K: Array,
-) -> None:
+    table: Array, q: Array, qd: Array, unseen: Array, T_measured: Array, cov_noise: Array, jitter_s: float,
+    learns_delay: bool, x: Array, P: Array, z: Array, H: Array, R_at: Array, HP: Array, K: Array,
+) -> None:  # fmt: skip
     """Overwrite x and P by those after a measurement, write the gain to K (size, 6); z, H and HP become the last ones."""
     size = x.shape[0]
     delay = size - 1

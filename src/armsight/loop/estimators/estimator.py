@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -149,15 +149,8 @@ class Track(Record):
 
     def __getitem__(self, row: int) -> ArmEstimate:
         """Return one of them."""
-        return ArmEstimate(
-            float(self.t_s[row]),
-            self.Ts_base_tool[row],
-            self.covs[row],
-            self.covs_own[row],
-            self.q[row],
-            self.qd[row],
-            float(self.vision_age_s[row]),
-        )
+        parts: list[Any] = [float(each[row]) if each.ndim == 1 else each[row] for each in vars(self).values()]
+        return ArmEstimate(*parts)
 
 
 @dataclass(frozen=True, eq=False)

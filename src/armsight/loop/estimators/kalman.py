@@ -12,7 +12,7 @@ docs/concepts/loop.md.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from copy import copy
 from dataclasses import replace
 from functools import partial
@@ -314,31 +314,24 @@ class KalmanEstimator:
             return Outcome.WAITING
         if seen_s < oldest or (row == 1 and before.measurement is not None and self._after(before, measurement)):
             return Outcome.TOO_LATE
-        later = [
-            state for state in self._states[row:] if not isinstance(state.measurement, Until)
-        ]  # one window follows
-        newest_heard = not later
+        # Of windows one follows.
+        later = [state for state in self._states[row:] if not isinstance(state.measurement, Until)]
         self._window = Outcome.WAITING
-        after, outcome = self._used(before, measurement, report=newest_heard)
+        after, outcome = self._used(before, measurement, report=not later)
         contradicted = self._contradicted(Until, self._window)
         if isinstance(measurement, PoseMeasurement):
             contradicted = self._contradicted(PoseMeasurement, outcome) or contradicted
         if after is None or contradicted:
             return outcome
         self._states[row:] = [after]
-        self._use_again(later)
+        for state in later:
+            again, _ = (None, None) if state.measurement is None else self._used(self._states[-1], state.measurement)
+            if again is not None:
+                self._states.append(again)
         self._backlash_set = False
         while len(self._states) > 2 and self._states[1].t_s < self._states[-1].t_s - HISTORY_S:
             del self._states[0]
         return outcome
-
-    def _use_again(self, later: Sequence[ErrorState]) -> None:
-        """Use the measurements of states that followed one that came late."""
-        for state in later:
-            if state.measurement is not None:
-                again, _ = self._used(self._states[-1], state.measurement)
-                if again is not None:
-                    self._states.append(again)
 
     def _contradicted(self, kind: type, outcome: Outcome) -> bool:
         """Count outcomes of a kind, images or windows; return whether so many are against the unit that it was dropped."""
@@ -590,9 +583,8 @@ class KalmanEstimator:
         share = float(np.exp(-window[0] / LOOSE_S))
         kept[loose] *= share
         added[loose] += self._apart(before, joints, share)
-        q, unseen = (
-            np.concatenate([getattr(end, part) for end in (before.joints, joints)]) for part in ("q", "unseen")
-        )
+        ends = before.joints, joints
+        q, unseen = (np.concatenate([getattr(end, part) for end in ends]) for part in ("q", "unseen"))
         got, Ts, outcome = self._advanced(self._unit, window, before, step, q, unseen)
         if report:
             self._window = outcome
@@ -604,9 +596,8 @@ class KalmanEstimator:
             got, _, again = self._advanced(self._unit, window, before, step, q, unseen)
             if again is Outcome.OUTLIER:
                 return self._alone(before, t_s, (joints, step))
-        considered = {
-            name: C * kept[:, None] - got.gain[: len(C)] @ (got.by @ C) for name, C in before.considered.items()
-        }
+        apart = before.considered.items()
+        considered = {name: C * kept[:, None] - got.gain[: len(C)] @ (got.by @ C) for name, C in apart}
         by, velocity = np.hstack([got.by, got.by_y]), got.velocity
         if before.beside is None or before.beside.t_s != before.t_s:  # it began with another velocity
             by[:, len(kept) : len(kept) + 3] = velocity[:, len(kept) : len(kept) + 3] = 0.0
@@ -687,16 +678,11 @@ class KalmanEstimator:
         """Return how the tool moves by a state, and what the readings' noise makes of its twist and acceleration (6, 6)."""
         by_speed = by_state[:, self._at.zeros] * self._arm.direction
         # The variance that a parabola leaves of its slope at its end is 192/(9 SPAN^2) of that of its value.
-        moves = (
-            np.where(joints.qd[0] == 0.0, 0.0, joints.variance[0] * 192 / 9) * (self._prior.reading_rad / SPAN_S) ** 2
-        )
+        slope = (self._prior.reading_rad / SPAN_S) ** 2
+        moves = np.where(joints.qd[0] == 0.0, 0.0, joints.variance[0] * 192 / 9) * slope
         cov_twist = by_speed * moves @ by_speed.T
-        motion = ToolMotion(T, by_speed @ joints.qd[0])
-        if not inertial:
-            return motion, cov_twist, np.zeros((6, 6))
-        oldest, newest = self.span_s
-        ends = np.clip([t_s - APART_S, t_s + APART_S], oldest, newest)
-        if ends[1] <= ends[0]:
+        motion, ends = ToolMotion(T, by_speed @ joints.qd[0]), np.clip([t_s - APART_S, t_s + APART_S], *self.span_s)
+        if not inertial or ends[1] <= ends[0]:
             return motion, cov_twist, np.zeros((6, 6))
         near = self._readings.at(ends)
         _, Hs = self._model.poses(x, near.q, near.unseen)
@@ -750,10 +736,8 @@ class KalmanEstimator:
         if chi < _GATE:
             self._outliers = []
             return Outcome.USED
-        if self._outliers:
-            apart = z - self._outliers[-1]
-            if chi_square(S, apart) > _GATE:
-                self._outliers = []
+        if self._outliers and chi_square(S, z - self._outliers[-1]) > _GATE:
+            self._outliers = []
         self._outliers.append(z)
         if len(self._outliers) < STUBBORN:
             return Outcome.OUTLIER

@@ -52,9 +52,7 @@ class Mounting(Record):
         T_base_tool = T_base_rig T_rig_body T_tool_body^-1; with right tangents z of the first, b of the second and x of
         T_tool_body its own is Ad(T_tool_body) (Ad(T_rig_body^-1) z + b - x).
 
-        Args:
-            pose: where the body is in the rig.
-            t_s: the middle of the exposure as the camera stamps it, s.
+        ``pose``: where the body is in the rig. ``t_s``: the middle of the exposure as the camera stamps it, s.
 
         Raises:
             InputError: ``t_s`` is no number.
@@ -91,17 +89,9 @@ def _is_positive(C: Array) -> bool:
     "const f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1]"
 )
 def _carry(
-    T_rig_body: Array,
-    cov_noise: Array,
-    common: Array,
-    T_base_rig: Array,
-    T_body_tool: Array,
-    to_tool: Array,
-    cov: Array,
-    T: Array,
-    noise: Array,
-    shared: Array,
-) -> None:
+    T_rig_body: Array, cov_noise: Array, common: Array, T_base_rig: Array, T_body_tool: Array, to_tool: Array,
+    cov: Array, T: Array, noise: Array, shared: Array,
+) -> None:  # fmt: skip
     """Write what :meth:`Mounting.pose_measurement` computes to T, noise and shared; the covariance common is used up."""
     by_mounting = np.zeros((6, 12))  # [Ad(T_rig_body^-1), -I]
     for i in range(3):

@@ -97,17 +97,9 @@ def _take(t: Array, q: Array, memory: Array, first: int, begin: int, end: int, d
 
 @kernel
 def _rest(
-    t: Array,
-    q: Array,
-    low: int,
-    high: int,
-    at: float,
-    sigma: float,
-    angles: Array,
-    speeds: Array,
-    variance: Array,
+    t: Array, q: Array, low: int, high: int, at: float, sigma: float, angles: Array, speeds: Array, variance: Array,
     noise: Array,
-) -> None:
+) -> None:  # fmt: skip
     """Replace fitted angles (n,) by the means of rows low to high for joints that stand still meanwhile.
 
     Also for joints that drift a little, as far as the rows lie around the time: there drift does not move the mean.
@@ -152,17 +144,9 @@ def _misfit(
 
 @kernel
 def _shortened(
-    t: Array,
-    q: Array,
-    first: int,
-    count: int,
-    at: float,
-    length: float,
-    sigma: float,
-    motion: Array,
-    variance: Array,
+    t: Array, q: Array, first: int, count: int, at: float, length: float, sigma: float, motion: Array, variance: Array,
     noise: Array,
-) -> None:
+) -> None:  # fmt: skip
     """Replace angles ``motion[0]`` and ``variance`` (n,) of joints whose motion no parabola follows over a span of time, s.
 
     Those of parabolas over half of the span, a quarter of it and so on, and at last of a line between the two readings
@@ -221,22 +205,9 @@ def _round(variance: Array, lasts: Array, speeds: Array, step: float, sigma: flo
     "f8[:, :, ::1], f8[:, ::1], f8[:, :, ::1]"
 )
 def _smooth(
-    t: Array,
-    q: Array,
-    memory: Array,
-    first: int,
-    count: int,
-    at: Array,
-    sigma: float,
-    step: float,
-    qs: Array,
-    qds: Array,
-    variance: Array,
-    lasts: Array,
-    unseen: Array,
-    travel: Array,
-    flips: Array,
-) -> bool:
+    t: Array, q: Array, memory: Array, first: int, count: int, at: Array, sigma: float, step: float, qs: Array,
+    qds: Array, variance: Array, lasts: Array, unseen: Array, travel: Array, flips: Array,
+) -> bool:  # fmt: skip
     """Write the joints at times (N,) into the parts of a :class:`Smoothed`; return whether all are within those kept."""
     motion, noise, newest = np.empty((3, q.shape[1])), np.empty(q.shape[1]), t[first + count - 1]
     for n in range(len(at)):
@@ -264,20 +235,9 @@ def _smooth(
 
 @kernel("f8[::1], f8[:, ::1], f8[:, :, ::1], i8, i8, i8, i8, f8, f8[::1], const f8[::1], f8[:, ::1], f8[:, ::1], f8")
 def _take_on(
-    t: Array,
-    q: Array,
-    memory: Array,
-    first: int,
-    settled: int,
-    begin: int,
-    end: int,
-    dead: float,
-    gap: Array,
-    table: Array,
-    points: Array,
-    beside: Array,
-    still: float,
-) -> int:
+    t: Array, q: Array, memory: Array, first: int, settled: int, begin: int, end: int, dead: float, gap: Array,
+    table: Array, points: Array, beside: Array, still: float,
+) -> int:  # fmt: skip
     """Update the memory by new rows begin to end, links from row ``settled`` on; return the first unsettled row."""
     _take(t, q, memory, first, begin, end, dead, gap)
     float_on(t, q, memory[:, 4:], first, settled, end, table, points, beside, still, gap)

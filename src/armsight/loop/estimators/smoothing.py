@@ -42,9 +42,7 @@ class Interval(NamedTuple):
 def intervals(states: list[ErrorState], t_s: Array) -> list[Interval]:
     """Return times (N,), rising, grouped by the measurements around them.
 
-    Args:
-        states: the filter's, oldest first.
-        t_s: the times, s.
+    ``states``: the filter's, oldest first. ``t_s``: the times, s.
     """
     ends = [state for state in states if state.pose_measurement is not None]
     at, found = np.searchsorted([state.t_s for state in ends], t_s), list[Interval]()
@@ -97,7 +95,7 @@ def blended(model: ErrorModel, readings: Readings, parts: list[Interval]) -> Tra
             tracks += [_alone(model, readings, part) for part in some]
     if len(tracks) == 1:
         return tracks[0]
-    return Track(*(np.concatenate(column) for column in zip(*map(_columns, tracks), strict=True)))
+    return Track(*map(np.concatenate, zip(*(vars(track).values() for track in tracks), strict=True)))
 
 
 def _merged(parts: list[Interval]) -> list[Interval]:
@@ -128,12 +126,6 @@ def by_state(model: ErrorModel, state: ErrorState, t_s: Array, joints: Smoothed,
 def _alone(model: ErrorModel, readings: Readings, part: Interval) -> Track:
     joints, (before,) = readings.at(part.t_s), anew(readings, [part.before])
     return by_state(model, before, part.t_s, joints, model.moved(before, joints, part.t_s))
-
-
-def _columns(track: Track) -> tuple[Array, ...]:
-    """Return the fields of a track in their order."""
-    own = track.covs, track.covs_own
-    return (track.t_s, track.Ts_base_tool, *own, track.q, track.qd, track.vision_age_s)
 
 
 def _between(model: ErrorModel, readings: Readings, parts: list[Interval]) -> Track:
@@ -183,12 +175,11 @@ def _ends(states: list[ErrorState]) -> _Ends:
         np.array([state.t_s for state in states]),
         np.array([state.x for state in states]),
         [state.P for state in states],
-        *(np.concatenate(part) for part in zip(*(_far(state.joints) for state in states), strict=True)),
+        *(
+            np.concatenate([getattr(state.joints, part) for state in states])
+            for part in ("travel", "flips", "variance")
+        ),
     )
-
-
-def _far(joints: Smoothed) -> tuple[Array, Array, Array]:
-    return joints.travel, joints.flips, joints.variance
 
 
 def _come(ends: _Ends, joints: Smoothed, rows: Ids) -> tuple[Array, Array]:

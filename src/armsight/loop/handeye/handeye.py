@@ -166,10 +166,8 @@ class HandEye(Record):
     def __repr__(self) -> str:
         """Return the error on poses left out of the fit, and both translations with one sigma, mm."""
         position_m, angle_rad = self.held_out.rms()
-        shown = []
-        for name, T, sigma_mm in zip(
-            ("still", "held"), (self.T_base_still, self.T_flange_held), self.sigma_mm, strict=True
-        ):
+        shown, Ts = [], (self.T_base_still, self.T_flange_held)
+        for name, T, sigma_mm in zip(("still", "held"), Ts, self.sigma_mm, strict=True):
             both = zip(1e3 * T[:3, 3], sigma_mm, strict=True)
             shown.append(f"{name} at {', '.join(f'{x:.2f} +- {sigma:.2f}' for x, sigma in both)} mm")
         return (
@@ -339,11 +337,7 @@ class _Problem(Record):
     def means(self, linear: Linear, guess: _Guess) -> dict[str, float]:
         """Return the mean of each source's sigma before it is looked for: what the residuals are, or what arms do."""
         position, rotation = _middle_sigmas(linear.e)
-        lengths = {
-            "flange_m": position / guess.per_m,
-            "time_drift_m": position / guess.per_m,
-            "time_walk_m": position / guess.per_m,
-        }
+        lengths = dict.fromkeys(("flange_m", "time_drift_m", "time_walk_m"), position / guess.per_m)
         of = {name: position if name.endswith("_m") else rotation for name in linear.sources} | lengths
         of |= {"scale_walk": 1e-2, "image": 1.0, "time_s": 1e-3}
         return of | dict(zip((*LINKS, *DRIFT), (*LINK, *DRIFT_SIZE), strict=True))
@@ -441,18 +435,13 @@ def calibrate_poses(
     if poses.common is not None:
         guess = replace(guess, common=np.zeros(poses.common.shape[2]))
     found, back = _weighed(whole, guess, used, quick, progress), np.argsort(order)
-    return replace(
-        found,
-        used=found.used[back],
-        distance=found.distance[back],
-        leverage=found.leverage[back],
-        held_out=found.held_out.rows(back),
-        held_out_nominal=found.held_out_nominal.rows(back),
-        held_out_geometry=None if found.held_out_geometry is None else found.held_out_geometry.rows(back),
-    )
+    left = {name: getattr(found, name) for name in ("held_out", "held_out_nominal", "held_out_geometry")}
+    as_given: dict[str, Any] = {name: None if each is None else each.rows(back) for name, each in left.items()}
+    as_given |= {name: getattr(found, name)[back] for name in ("used", "distance", "leverage")}
+    return replace(found, **as_given)
 
 
-def _spread(rows: NDArray[np.int64], most: int) -> NDArray[np.int64]:
+def evenly(rows: NDArray[np.int64], most: int) -> NDArray[np.int64]:
     """Return at most this many of the rows, evenly spread."""
     if len(rows) <= most:
         return rows
@@ -460,7 +449,7 @@ def _spread(rows: NDArray[np.int64], most: int) -> NDArray[np.int64]:
 
 
 def _first(poses: Poses) -> list[_Guess]:
-    part = poses.rows(_spread(np.arange(len(poses.A)), 300))
+    part = poses.rows(evenly(np.arange(len(poses.A)), 300))
     return [_Guess(Z, X) for X, Z in starts(part.A, part.right_side)[:3]]
 
 
@@ -475,7 +464,7 @@ def _middle_sigmas(e: Array) -> tuple[float, float]:
 def _robust(problem: _Problem, guesses: list[_Guess]) -> tuple[_Guess, NDArray[np.bool_]]:
     """Refine starts with the weights of Student's t; return the best, and which rows are no blunders."""
     best: tuple[float, _Guess] | None = None
-    rows = _spread(np.arange(len(problem.poses.A)), MAX_FIT)
+    rows = evenly(np.arange(len(problem.poses.A)), MAX_FIT)
     part = problem.rows(rows)
     for start in guesses:
         guess = start
@@ -508,7 +497,7 @@ def _with_scale(problem: _Problem) -> tuple[_Problem, _Guess, NDArray[np.bool_]]
     per_m = 1 / scale_between(problem.poses)
     guesses = [replace(one, per_m=per_m) for one in _first(problem.scaled(_Guess(np.eye(4), np.eye(4), per_m)))]
     found, used = _robust(free, guesses)
-    rows = _spread(np.flatnonzero(used), MAX_VARIANCE)
+    rows = evenly(np.flatnonzero(used), MAX_VARIANCE)
     at, sure = found, False
     for _ in range(ROUNDS):
         linear = free.rows(rows).linear(at)
@@ -535,7 +524,7 @@ def _with_scale(problem: _Problem) -> tuple[_Problem, _Guess, NDArray[np.bool_]]
 
 def scale_between(poses: Poses) -> float:
     """Return true lengths over those of the measured body, by closed forms from small parts of the poses."""
-    p = poses.rows(_spread(np.arange(len(poses.A)), 300))
+    p = poses.rows(evenly(np.arange(len(poses.A)), 300))
     A, B = p.A, p.right_side
     rng = np.random.default_rng(0)
     best = (np.inf, 1.0)
@@ -668,12 +657,12 @@ def _settled(
     whole: _Problem, guess: _Guess, used: NDArray[np.bool_], quick: bool
 ) -> tuple[_Guess, NDArray[np.bool_], dict[str, float], int]:
     """Alternate variances, transforms and blunders until they stay."""
-    few = whole.rows(_spread(np.flatnonzero(used), MAX_VARIANCE if whole.t_s is None else MAX_WALK))
+    few = whole.rows(evenly(np.flatnonzero(used), MAX_VARIANCE if whole.t_s is None else MAX_WALK))
     variances = _taken_up(few, guess, quick)
     most = MAX_WALK if any("walk" in name for name in variances) else MAX_FIT
     for _ in range(ROUNDS):
-        rows = _spread(np.flatnonzero(used), most)
-        few, part = whole.rows(_spread(rows, min(most, MAX_VARIANCE))), whole.rows(rows)
+        rows = evenly(np.flatnonzero(used), most)
+        few, part = whole.rows(evenly(rows, min(most, MAX_VARIANCE))), whole.rows(rows)
         estimated, linear = (p.linear(guess, times=not _TIMED.isdisjoint(variances)).of(variances) for p in (few, part))
         found = most_probable(estimated, few.means(estimated, guess), variances)
         variances = dict(zip(linear.sources, found.tolist(), strict=True))
@@ -698,7 +687,7 @@ def _weighed(
     """Settle, then weigh an arm that is as its model says against one that is not."""
     progress("hand-eye: sources of the error")
     guess, used, variances, most = _settled(whole, guess, used, quick)
-    rows = _spread(np.flatnonzero(used), most)
+    rows = evenly(np.flatnonzero(used), most)
     progress("hand-eye: an arm as its model")
     best = nominal = _Model.of(whole, guess, rows, variances, False, quick)
     arm_off, x, cov, likelihoods = 0.0, nominal.x, nominal.cov, {_said(nominal.linear.sources): nominal.density}
@@ -718,11 +707,10 @@ def _weighed(
     metric, cov = whole.metric(moved, cov)
     rest = np.sqrt(np.diag(cov)[12:]).tolist()
     sigma_scale = rest.pop(0) if whole.free[0] else 0.0
-    sigmas = {name: float(np.sqrt(v)) for name, v in best.variances.items()}
-    sigmas |= {
-        name: sigmas[name] / np.sqrt(len(used) - 1) for name in ("walk_m", "walk_rad") if name in sigmas
-    }  # a frame
+    frames = {name: len(used) - 1 for name in ("walk_m", "walk_rad")}  # those of a walk are a frame's
+    sigmas = {name: float(np.sqrt(v / frames.get(name, 1))) for name, v in best.variances.items()}
     arm_m, camera_m = _displacements(whole, best, guess)
+    off_common = np.subtract(*(transform(p.B, p.centre) for p in (whole.poses.corrected(moved.common), whole.poses)))
     left = [_alone(one.solved, one.linear) for one in (nominal, best)]
     left[0] = left[0] if quick else suits_left
     errors = [_held_out_errors(whole, moved, e, rows) for e in (*left, left_out(best.solved)[0])]
@@ -747,7 +735,7 @@ def _weighed(
         used=used,
         distance=_far(whole, guess, nominal.variances, rows, nominal.linear, nominal.solved) / 6,
         common=moved.common,
-        common_m=_common_m(whole.poses, moved),
+        common_m=float(np.sqrt((off_common**2).sum(axis=-1).mean())) / moved.per_m if moved.common.size else 0.0,
         leverage=np.ones(len(whole.poses.A)),
     )
     require_known(found, whole.poses.B, OPEN_M, OPEN_RAD)
@@ -777,7 +765,7 @@ class _Model(Record):
         whole: _Problem, guess: _Guess, rows: NDArray[np.int64], start: dict[str, float], arm: bool, quick: bool
     ) -> _Model:
         """Weigh the sources of ``start``, and with ``arm`` the arm's own; ``quick``: without integrating."""
-        few, part = whole.rows(_spread(rows, MAX_VARIANCE)), whole.rows(rows)
+        few, part = whole.rows(evenly(rows, MAX_VARIANCE)), whole.rows(rows)
         names = (*start, *((LINKS if whole.links is not None else DRIFT) if arm else ()))
         estimated, linear = (p.linear(guess, arm, not _TIMED.isdisjoint(names)).of(names) for p in (few, part))
         means = few.means(estimated, guess)
@@ -830,12 +818,6 @@ def _said(names: tuple[str, ...]) -> str:
     """Return sources as people read them."""
     found = [SAID.get(name.rpartition("_")[0] if name != "scale_walk" else name) for name in names]
     return ", ".join(dict.fromkeys(name for name in found if name)) or "robot and camera"
-
-
-def _common_m(poses: Poses, guess: _Guess) -> float:
-    """Return the RMS distance by which vision's shared errors move the body's middle, m."""
-    off = transform(poses.corrected(guess.common).B, poses.centre) - transform(poses.B, poses.centre)
-    return float(np.sqrt((off**2).sum(axis=-1).mean())) / guess.per_m if guess.common.size else 0.0
 
 
 def _far(

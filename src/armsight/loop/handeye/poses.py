@@ -64,9 +64,9 @@ def residuals(poses: Poses, Z: Array, X: Array) -> tuple[Array, Array, Array]:
         the square of e, and (N, 6, 6).
     """
     if poses.in_hand:
-        M, last = X @ poses.B, poses.B  # E = Z^-1 A X B
+        M = X @ poses.B  # E = Z^-1 A X B
         E = inverse(Z) @ poses.A @ M
-        by_x = adjoint(inverse(last))
+        by_x = adjoint(inverse(poses.B))
     else:
         M = np.broadcast_to(X, poses.A.shape)  # E = B^-1 Z^-1 A X
         E = inverse(Z @ poses.B) @ poses.A @ M
@@ -91,9 +91,7 @@ LEVER_M = 0.3
 def starts(A: Array, B: Array) -> list[tuple[Array, Array]]:
     """Return candidates for X and Z of ``A_i X = Z B_i``, smallest median residual first.
 
-    Args:
-        A: (N, 4, 4) poses, N >= 3.
-        B: (N, 4, 4) poses.
+    ``A``: (N, 4, 4) poses, N >= 3. ``B``: (N, 4, 4) poses.
     """
     rng = np.random.default_rng(0)
     found = [kronecker(A, B)]

@@ -81,10 +81,8 @@ def recording_of(robot: Path) -> Path | None:
 def robot_in_recording(path: Path, frames: str | None, arm: Arm | None) -> PoseTable:
     """Read the poses of the flange that a recording holds, a row for each of its messages.
 
-    Args:
-        path: a ROS 1 or ROS 2 bag, or MCAP.
-        frames: BASE:FLANGE, of its transforms; None: the poses are those of the joints.
-        arm: the model whose joints are read, by their names.
+    ``path``: a ROS 1 or ROS 2 bag, or MCAP. ``frames``: BASE:FLANGE, of its transforms; None: the poses are those of
+    the joints. ``arm``: the model whose joints are read, by their names.
 
     Raises:
         InputError: no such recording, frames that it does not have, or joints of other names.
@@ -110,8 +108,7 @@ def robot_in_recording(path: Path, frames: str | None, arm: Arm | None) -> PoseT
     there = np.asarray(np.isfinite(np.zeros((len(track.t_s), 0)) if q is None else q).all(axis=1))
     n = int(there.sum())
     if n < len(there):
-        lost = f"{path}: {len(there) - n} of {len(there)} transforms have no joint states around them: left out"
-        notes = (*notes, lost)
+        notes += (f"{path}: {len(there) - n} of {len(there)} transforms have no joint states around them: left out",)
     if n < MIN_POSES:
         raise InputError(
             f"{path}: {frames or 'the joints'}: {n} poses over time, {MIN_POSES} and more are needed: is it a fixed"
@@ -218,10 +215,8 @@ def paired(robot: PoseTable, seen: Seen, in_hand: bool, arm: Arm | None) -> Pair
 def upright(A: Array, B: Array, symmetries: Sequence[Array]) -> tuple[Array, Rows]:
     """Decide which way up a board was that looks the same rotated: angles between poses are the same on both sides.
 
-    Args:
-        A: (N, 4, 4) poses of the flange.
-        B: (N, 4, 4) poses of the body, some of them rotated by a symmetry.
-        symmetries: the motions of the body that change nothing to see.
+    ``A``: (N, 4, 4) poses of the flange. ``B``: (N, 4, 4) poses of the body, some of them rotated by a symmetry.
+    ``symmetries``: the motions of the body that change nothing to see.
 
     Returns:
         B with the rotated ones rotated back to agree with the first, and which symmetry was used, -1 for none.
@@ -275,9 +270,7 @@ def _alike(Ts: Array) -> Rows:
 def matched_rows(robot: PoseTable, seen: Sequence[str]) -> tuple[Rows, Rows]:
     """Return the rows of both sides that belong together: by name where the robot's table has names, else by order.
 
-    Args:
-        robot: the robot's table.
-        seen: names of what was seen, one a row.
+    ``robot``: the robot's table. ``seen``: names of what was seen, one a row.
 
     Raises:
         InputError: no name is among those seen, or other numbers of rows.
@@ -363,10 +356,8 @@ def links_of(robot: PoseTable, arm: Arm | None, at: Array) -> Callable[[Array], 
 
     The joints are taken to give the table's very poses: such as scatter against them would be explained by errors of links.
 
-    Args:
-        robot: the table, N rows.
-        arm: the model.
-        at: (N,) by what the returned function knows each row: its number, or its time.
+    ``robot``: the table, N rows. ``arm``: the model. ``at``: (N,) by what the returned function knows each row: its
+    number, or its time.
     """
     if arm is None or robot.q is None:
         return None

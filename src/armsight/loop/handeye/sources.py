@@ -70,12 +70,9 @@ def error_maps(
 ) -> dict[str, Array]:
     """Return what unit errors of each independent source do to the residuals.
 
-    Args:
-        poses: N poses.
-        e: (N, 6) the residuals.
-        carry: (N, 6, 6) adjoints that map an error of the flange to the residuals.
-        speed: (N, 6) twist of the flange, right tangent, m/s and rad/s; None: no streams.
-        links: (N, L, 4, 4) T_link_flange, m; None: no model.
+    ``poses``: N poses. ``e``: (N, 6) the residuals. ``carry``: (N, 6, 6) adjoints that map an error of the flange to
+    the residuals. ``speed``: (N, 6) twist of the flange, right tangent, m/s and rad/s; None: no streams. ``links``: (N,
+    L, 4, 4) T_link_flange, m; None: no model.
     """
     n = len(poses.A)
     axes = np.zeros((n, 6, 3))

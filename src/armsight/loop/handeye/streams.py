@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.signal import correlate
 
 from armsight.data import Array, Record
 from armsight.errors import CalibrationError, InputError
@@ -113,19 +114,11 @@ def calibrate_streams(
         good &= first & last
         if good.sum() < 20:
             raise CalibrationError(f"the streams overlap in {int(good.sum())} poses only; 20 and more are needed")
-        poses = Poses(
-            A[good], B[good], np.zeros((int(good.sum()), 6, 6)), is_in_hand(eye), np.asarray(centre, dtype=float)
-        )
+        covs, middle = np.zeros((int(good.sum()), 6, 6)), np.asarray(centre, dtype=float)
+        poses = Poses(A[good], B[good], covs, is_in_hand(eye), middle)
         speed = log_se3(inverse(early[good]) @ late[good]) / SPEED_S
-        found = calibrate_poses(
-            poses,
-            t_s=t_eye[good],
-            speed=speed,
-            links=None if links_at is None else links_at(t_eye[good] + offset),
-            scale=scale,
-            quick=quick,
-            progress=progress,
-        )
+        links, t_s = None if links_at is None else links_at(t_eye[good] + offset), t_eye[good]
+        found = calibrate_poses(poses, t_s=t_s, speed=speed, links=links, scale=scale, quick=quick, progress=progress)
         offset += found.step_s
     return HandEyeStreams(found, offset, found.sigma_step_s, t_eye[good], poses.A, poses.B)
 
@@ -161,19 +154,11 @@ def _agreement(hand: PoseStream, eye: PoseStream, step: float, over: int) -> tup
     (t_hand, a, in_a), (t_eye, b, in_b) = (_speeds(stream, step, over) for stream in (hand, eye))
     most = FASTER * min(float(np.quantile(speed, 0.99)) for speed in (a, b))
     a, in_a, b, in_b = np.where(a > most, 0.0, a), in_a * (a <= most), np.where(b > most, 0.0, b), in_b * (b <= most)
-    both = _correlation(in_a, in_b)
+    both = correlate(in_a, in_b, method="fft")  # over all lags from 1 - len(b)
     enough = both > 0.3 * both.max()
     # The mean square difference of the speeds, against what they are themselves where they overlap.
-    size = _correlation(a**2 * in_a, in_b) + _correlation(in_a, b**2 * in_b)
-    squares = size - 2 * _correlation(a, b)
+    size = correlate(a**2 * in_a, in_b, method="fft") + correlate(in_a, b**2 * in_b, method="fft")
+    squares = size - 2 * correlate(a, b, method="fft")
     cost = np.where(enough & (size > 1e-9), squares / np.maximum(size, 1e-12), np.inf)
     lag = int(np.argmin(cost)) - (len(b) - 1)
     return float(cost.min() / np.median(cost[np.isfinite(cost)])), float(t_hand + lag * step - t_eye)
-
-
-def _correlation(a: Array, b: Array) -> Array:
-    """Return sum over k of a[k + lag] b[k] for all lags from 1 - len(b)."""
-    n = len(a) + len(b) - 1
-    size = 1 << (n - 1).bit_length()
-    product = np.fft.irfft(np.fft.rfft(a, size) * np.fft.rfft(b[::-1], size), size)
-    return np.asarray(product[:n])

@@ -94,7 +94,7 @@ def _by_parameters(found: Identified, weighted: Measured) -> Array:
     """Return the variance (N, n), rad^2, of where joints stood by the fitted parameters; their choice is no scatter."""
     assert weighted.cov is not None  # for the type checker: a joint's scatter is known only with it
     model, s = found.model, found.solution
-    J = model.linearised(s.x, weighted, model.feature_values(weighted.q, weighted.approach))[1]
+    J = model.linearised(s.x, weighted)[1]
     B = by_joints(model, J)
     pull = np.linalg.inv(weighted.cov + 1e-18 * np.eye(weighted.size)) @ B
     rows = pull.swapaxes(1, 2) @ J / np.einsum("nmj,nmj->nj", pull, B)[..., None]

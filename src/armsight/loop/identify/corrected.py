@@ -88,10 +88,8 @@ class Corrected(Record):
     def readings(self, T_base_body: Array, near: Array, approach: Array | None = None) -> Array | None:
         """Return the readings (n,), rad, at which the body is at a pose, nearest to ``near``; None out of reach.
 
-        Args:
-            T_base_body: (4, 4) where the body shall be.
-            near: (n,) readings to start from.
-            approach: (n,) from which sides the joints will come.
+        ``T_base_body``: (4, 4) where the body shall be. ``near``: (n,) readings to start from. ``approach``: (n,) from
+        which sides the joints will come.
         """
         q, near_by = np.array(near, float), np.vstack([np.zeros(len(near)), STEP_RAD * np.eye(len(near))])
         sides = None if approach is None else np.tile(approach, (len(near_by), 1))

@@ -99,16 +99,11 @@ class Solution(Record):
         return np.sqrt(np.diag(self.cov))
 
 
-def linear_of(model: Model, x: Array, measured: Measured, phi: Array, free: Mask, prior: Array) -> Linear:
+def linear_of(model: Model, x: Array, measured: Measured, free: Mask, prior: Array, phi: Array | None = None) -> Linear:
     """Return the residuals of poses near a vector by the free parameters, with noise of position and of rotation.
 
-    Args:
-        model: the arm.
-        x: (P,) the vector.
-        measured: the poses.
-        phi: :meth:`Model.feature_values` of them.
-        free: (P,) what may be off.
-        prior: (P,) sigma about the nominal arm's values; infinite where nothing is known.
+    ``x``: (P,) the vector. ``free``: (P,) what may be off. ``prior``: (P,) sigma about the nominal arm's values; infinite
+    where nothing is known. ``phi``: :meth:`Model.feature_values` of the poses, where they are known already.
     """
     e, J = model.linearised(x, measured, phi)
     each = np.broadcast_to(np.eye(measured.size), (len(e), measured.size, measured.size))
@@ -144,8 +139,22 @@ def fit(
     noise = _robust_noise(model.residuals(x, measured, phi)) if noise is None else noise
     keep = _sane(model, x, measured, phi, noise) if used is None else used
     history: list[float] = []
+
+    def newton(x: Array, noise: tuple[float, float]) -> tuple[Array, Linear, Solved]:
+        """Return the best vector, and the residuals and the solution before the last step to it."""
+        part = measured.rows(keep)
+        for _ in range(STEPS):
+            linear = linear_of(model, x, part, free, prior, phi[keep])
+            s = solve(linear, variances_of(linear, noise))
+            x = x.copy()
+            x[free] += s.x
+            history.append(float(np.sqrt(np.einsum("ni,nij,nj->", linear.e, s.W, linear.e) / linear.e.size)))
+            if (np.abs(s.x) < SMALL_STEP * np.linalg.norm(s.root, axis=1)).all():
+                break
+        return x, linear, s
+
     for _ in range(ROUNDS):
-        x, linear, s = _newton(model, x, measured.rows(keep), phi[keep], free, prior, noise, history)
+        x, linear, s = newton(x, noise)
         before = noise
         taken = len(s.x) - float(linear.known @ (s.root**2).sum(axis=1))  # parameters, less what priors determine
         if linear.e.size - taken >= MIN_FREEDOM * linear.e.size:
@@ -156,14 +165,14 @@ def fit(
         kept, keep = keep, (_sane(model, x, measured, phi, noise) if used is None else keep)
         if (kept == keep).all() and np.allclose(before, noise, rtol=1e-2, atol=MIN_NOISE):
             break
-    x, _, s = _newton(model, x, measured.rows(keep), phi[keep], free, prior, noise, history)
+    x, _, s = newton(x, noise)
     return Solution(x, free, _spread(s, free), noise, keep, tuple(history))
 
 
 def covariance(model: Model, s: Solution, measured: Measured, free: Mask, prior: Array) -> Array:
     """Return the covariance (P, P) of the free parameters at a solution, with its noise; zero for the others."""
     part = measured.rows(s.used)
-    linear = linear_of(model, s.x, part, model.feature_values(part.q, part.approach), free, prior)
+    linear = linear_of(model, s.x, part, free, prior)
     return _spread(solve(linear, variances_of(linear, s.noise)), free)
 
 
@@ -172,29 +181,6 @@ def _spread(s: Solved, free: Mask) -> Array:
     cov = np.zeros((len(free), len(free)))
     cov[np.ix_(free, free)] = s.root @ s.root.T
     return cov
-
-
-def _newton(
-    model: Model,
-    x: Array,
-    measured: Measured,
-    phi: Array,
-    free: Mask,
-    prior: Array,
-    noise: tuple[float, float],
-    history: list[float],
-) -> tuple[Array, Linear, Solved]:
-    """Return the best vector, and the residuals and the solution before the last step to it."""
-    for _ in range(STEPS):
-        linear = linear_of(model, x, measured, phi, free, prior)
-        s = solve(linear, variances_of(linear, noise))
-        x = x.copy()
-        x[free] += s.x
-        weighted = np.einsum("ni,nij,nj->", linear.e, s.W, linear.e)
-        history.append(float(np.sqrt(weighted / linear.e.size)))
-        if (np.abs(s.x) < SMALL_STEP * np.linalg.norm(s.root, axis=1)).all():
-            break
-    return x, linear, s
 
 
 def _robust_noise(e: Array) -> tuple[float, float]:
@@ -209,7 +195,7 @@ def _robust_noise(e: Array) -> tuple[float, float]:
 
 def _sane(model: Model, x: Array, measured: Measured, phi: Array, noise: tuple[float, float]) -> Mask:
     """Return which poses (N,) are no outliers: by the scale of the median, or as their own covariance explains them."""
-    linear = linear_of(model, x, measured, phi, np.zeros(len(x), bool), np.full(len(x), np.inf))
+    linear = linear_of(model, x, measured, np.zeros(len(x), bool), np.full(len(x), np.inf), phi)
     variances = variances_of(linear, noise)
     far, given = ((whitened(linear, v)[0] ** 2).sum(axis=1) for v in (variances, 0.0 * variances))
     return np.asarray(by_chance(far, measured.size, CHANCE) | (given <= chdtri(measured.size, CHANCE)))
@@ -233,7 +219,7 @@ def joint_noise(model: Model, solution: Solution, prior: Array, measured: Measur
     """
     phi = model.feature_values(measured.q, measured.approach)
     with_sides = with_joint_noise(model, solution.x, measured, np.zeros(model.arm.joints))
-    linear = linear_of(model, solution.x, with_sides, phi, solution.free, prior)
+    linear = linear_of(model, solution.x, with_sides, solution.free, prior, phi)
     B = by_joints(model, model.linearised(solution.x, measured, phi)[1])
     joints = {f"joint {i + 1}": B[:, :, [i]] for i in range(model.arm.joints)}
     linear = replace(linear, own=joints | linear.own)
@@ -253,22 +239,15 @@ def with_joint_noise(model: Model, x: Array, measured: Measured, sigma_rad: Arra
     if measured.cov is None:
         return measured
     phi = model.feature_values(measured.q, measured.approach)
-    variance = sigma_rad**2 + _of_sides(model, x, phi)
-    if not variance.any():
-        return measured
-    _, J = model.linearised(x, measured, phi)
-    B = by_joints(model, J) * np.sqrt(variance)[:, None]
-    return replace(measured, cov=measured.cov + B @ B.swapaxes(1, 2))
-
-
-def _of_sides(model: Model, x: Array, phi: Array) -> Array:
-    """Return the variance (N, n), rad^2, of joints in their backlash: 1 - mean^2 of a side of +-1, whatever closes it."""
-    out = np.zeros((len(phi), model.arm.joints))
-    for k, f in enumerate(model.features):
+    variance = np.tile(sigma_rad**2, (len(phi), 1))
+    for k, f in enumerate(model.features):  # of a side of +-1 it is 1 - mean^2, whatever closes the backlash
         if f.kind in ("backlash", "gravity_backlash"):
             half = 0.5 * x[model.sources_at + k]
-            out[:, f.joint] += half**2 * (1 - (2 * phi[:, k]) ** 2) * phi[:, k].any()
-    return out
+            variance[:, f.joint] += half**2 * (1 - (2 * phi[:, k]) ** 2) * phi[:, k].any()
+    if not variance.any():
+        return measured
+    B = by_joints(model, model.linearised(x, measured, phi)[1]) * np.sqrt(variance)[:, None]
+    return replace(measured, cov=measured.cov + B @ B.swapaxes(1, 2))
 
 
 def by_joints(model: Model, J: Array) -> Array:

@@ -111,11 +111,9 @@ def gravity_shows(
 ) -> tuple[list[Shown], ReferenceCalibration[Inertial]]:
     """Return the base's tilt about x and y and the zeros, by gravity at rests.
 
-    Args:
-        arm: as its table says it is.
-        sensor: calibrated; its ``cov`` says how far it may be off.
-        q: (N, n) readings of the joints at the rests, rad.
-        readings: N of the accelerometer, the mean of each rest; their times are the rests' rows.
+    ``arm``: as its table says it is. ``sensor``: calibrated; its ``cov`` says how far it may be off. ``q``: (N, n)
+    readings of the joints at the rests, rad. ``readings``: N of the accelerometer, the mean of each rest; their times
+    are the rests' rows.
 
     Raises:
         InputError: too few rests.

@@ -172,7 +172,7 @@ class Identified(Record):
             self.model.T_rig_base(x) @ self.model.tool_in_base(x, q, None) for x in (self.solution.x, self.nominal)
         )
         at = Measured(q, np.repeat(T[:, None, :3, 3], self.model.points, axis=1), T[:, :3, :3] if full else None)
-        J = self.model.linearised(self.solution.x, at, self.model.feature_values(q, None))[1][:, :3]
+        J = self.model.linearised(self.solution.x, at)[1][:, :3]
         square = np.einsum("nki,ij,nkj->", J, self.cov, J) / POSES
         return float(np.sqrt(np.sum((T - T_nominal)[:, :3, 3] ** 2) / POSES)), float(np.sqrt(square))
 
@@ -360,7 +360,7 @@ def contributions(found: Identified, measured: Measured) -> dict[str, float]:
     so that what two could explain is counted once; the squares add up.
     """
     model, s = found.model, found.solution
-    _, J = model.linearised(s.x, measured, model.feature_values(measured.q, measured.approach))
+    _, J = model.linearised(s.x, measured)
     J = J[:, : 3 * measured.points].reshape(-1, len(s.x))
     left = J @ np.where(_of(model, PLACEMENT), 0.0, s.x - found.nominal)
     out: dict[str, float] = {}

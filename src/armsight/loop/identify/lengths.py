@@ -81,7 +81,7 @@ def unrounded(arm: Arm, q: Array, p_base: Array, sigma_rad: float, sigma_m: floa
     """
     model = Model(without_tool(arm), 1, False, ())
     measured = Measured(q, p_base[:, None])
-    e, J = model.linearised(model.nominal(), measured, model.feature_values(q, None))
+    e, J = model.linearised(model.nominal(), measured)
     B = sigma_rad * J[:, :, model.table_at : model.sources_at : 5] * model.arm.direction
     C = np.linalg.inv(B @ B.swapaxes(1, 2) + sigma_m**2 * np.eye(3))
     agree = np.einsum("ni,nij,nj->n", e, C, e) < chi_square_limit(3, CHANCE / len(q))
@@ -163,7 +163,7 @@ def without_blunders(
             blunders.append(Blunder(rows, f"the sign of joint {joint + 1} is lost: negated it fits"))
             good[rows] = False
     far = good & (squares > limit)
-    off = model.residuals(x, measured, model.feature_values(q, None))[:, 0]
+    off = model.residuals(x, measured)[:, 0]
     for rows in _runs(far):
         mm = -1e3 * off[rows]
         side = "long" if mm.mean() > 0 else "short"
@@ -197,12 +197,12 @@ def _trimmed(arm: Arm, measured: Measured) -> tuple[Model, Array, float]:
     model, x = with_placement(Model(arm, 1, False, ()), measured)
     prior = prior_sigma(model, dict.fromkeys(("base_rx", "base_ry", "base_rz"), 0.0))
     noise = (BEGIN_M, 0.0)
-    free, phi = observed(model, x, measured, prior, noise).free, model.feature_values(measured.q, None)
+    free = observed(model, x, measured, prior, noise).free
 
     def concentrated(x: Array, keep: Mask, steps: int) -> tuple[float, Array, Mask]:
         for _ in range(steps):
             x = fit(model, x, measured, free, prior, used=keep, noise=noise).x
-            off = np.abs(model.residuals(x, measured, phi)[:, 0])
+            off = np.abs(model.residuals(x, measured)[:, 0])
             before, keep = keep, off <= np.quantile(off, SHARE)
             if (before == keep).all():
                 break
@@ -214,7 +214,7 @@ def _trimmed(arm: Arm, measured: Measured) -> tuple[Model, Array, float]:
     _, x, keep = min(tried, key=lambda each: each[0])
     _, x, keep = concentrated(x, keep, TRIMS)
     for _ in range(TRIMS):  # reweighted: the good rows that were trimmed come back
-        off = np.abs(model.residuals(x, measured, phi)[:, 0])
+        off = np.abs(model.residuals(x, measured)[:, 0])
         sigma = float(np.median(off)) / np.sqrt(chi_square_limit(1, 0.5))
         before, keep = keep, (off / sigma) ** 2 <= chi_square_limit(1, CHANCE)
         if (before == keep).all():
@@ -224,8 +224,7 @@ def _trimmed(arm: Arm, measured: Measured) -> tuple[Model, Array, float]:
 
 
 def _squares(model: Model, x: Array, measured: Measured, sigma: float) -> Array:
-    off = model.residuals(x, measured, model.feature_values(measured.q, None))[:, 0]
-    return np.asarray((off / sigma) ** 2)
+    return np.asarray((model.residuals(x, measured)[:, 0] / sigma) ** 2)
 
 
 def _signs_lost(

@@ -24,7 +24,7 @@ from armsight.data import Array
 from armsight.errors import CalibrationError, InputError
 from armsight.geometry.pose import inverse, log_se3, mean_pose
 from armsight.geometry.rotation import log_so3, nearest_rotation
-from armsight.loop.handeye.handeye import CONTRADICTS, rotations_of, scale_between
+from armsight.loop.handeye.handeye import CONTRADICTS, evenly, rotations_of, scale_between
 from armsight.loop.handeye.poses import LEVER_M, Poses, kronecker, residuals, starts
 from armsight.loop.handeye.recording import PairedPoses
 from armsight.loop.identify.fit import SIGMA
@@ -69,12 +69,9 @@ def require_plausible(
 ) -> PairedPoses:
     """Reject rows that fit far better read in another way.
 
-    Args:
-        recording: the rows.
-        arm: the model, where the robot's poses come from joints.
-        detect_units: whether lengths in another unit are converted, with a note, in place of an error.
-        scale: whether the target's size is fitted, and may be anything.
-        streams: whether the rows are of streams whose clocks agree roughly only: they are not shifted then.
+    ``arm``: the model, where the robot's poses come from joints. ``detect_units``: convert lengths in another unit, with a
+    note, in place of an error. ``scale``: the target's size is fitted, and may be anything. ``streams``: the clocks of the
+    rows agree roughly only: they are not shifted then.
 
     Raises:
         InputError: what is likely wrong, and what to do.
@@ -139,13 +136,9 @@ def misfit(poses: Poses, *, scale: bool = False) -> Array:
 
 def _evaluated(poses: Poses) -> tuple[Poses, Array]:
     """Return the poses that are looked at, and their residuals (N, 6) of the best closed form, (0, 6) if there is none."""
-    part = poses.rows(_some(len(poses.A), EVALUATED))
+    part = poses.rows(evenly(np.arange(len(poses.A)), EVALUATED))
     found = starts(part.A, part.right_side)
     return part, residuals(part, *found[0][::-1])[0] if found else np.zeros((0, 6))
-
-
-def _some(n: int, most: int) -> Rows:
-    return np.linspace(0, n - 1, min(most, n)).round().astype(np.int64)
 
 
 def _determined(poses: Poses) -> bool:
@@ -242,10 +235,9 @@ def _displaced(p: Poses, given: Array) -> tuple[int, str] | None:
 
     if n < 2 * PART:
         return None
-    tried = {int(k): worse(int(k)).sum() for k in np.linspace(PART, n - PART, min(TRIED, n - 2 * PART + 1)).round()}
-    (X, Z), (X_after, Z_after) = (
-        starts(part.A, part.right_side)[0] for part in parts(min(tried, key=lambda k: tried[k]))
-    )
+    tried = np.linspace(PART, n - PART, min(TRIED, n - 2 * PART + 1)).round().astype(int).tolist()
+    best = min(tried, key=lambda k: float(worse(k).sum()))
+    (X, Z), (X_after, Z_after) = (starts(part.A, part.right_side)[0] for part in parts(best))
     before, after = (_sizes(residuals(p, *both)[0]) for both in ((Z, X), (Z_after, X_after)))
     first = PART + int(np.argmin(np.append(0.0, np.cumsum(before - after))[PART : n - PART + 1]))
     if not _better(worse(first), given):
@@ -346,11 +338,9 @@ def _shifted(p: Poses, shift: int) -> tuple[Rows, Rows, int] | None:
 def _scaled(recording: PairedPoses) -> Iterator[_Reading]:
     """Yield readings of the robot's and of the target's lengths in other units."""
     p, robot, seen = recording.poses, recording.robot, recording.seen.table
-    sides: list[tuple[str, str, float, str, Path | None]] = []
-    sides += [("A", "robot", robot.unit_m, "units", robot.path)] if not robot.of_joints else []
-    sides += [("B", "target", 1.0, "--target's size", None)] if seen is None else []
-    sides += [("B", "target", seen.unit_m, "seen:units", seen.path)] if seen is not None else []
-    for side, whose, unit_m, option, path in sides:
+    target = (1.0, "--target's size", None) if seen is None else (seen.unit_m, "seen:units", seen.path)
+    sides = [("A", "robot", robot.unit_m, "units", robot.path), ("B", "target", *target)]
+    for side, whose, unit_m, option, path in sides[robot.of_joints :]:
         T = np.array(getattr(p, side))
         lengths = np.linalg.norm(T[:, :3, 3], axis=1)
         if (short := lengths < lengths.max() / MIXED).any():
@@ -391,7 +381,7 @@ def _joints(p: Poses, arm: Arm, q: Array) -> Iterator[tuple[Array, str]]:
 def _orders(p: Poses, arm: Arm, q: Array) -> list[Rows]:
     """Return the orders of the joints that the angles between poses support best."""
     given = tuple(range(q.shape[1]))
-    rows = _some(len(q), EVALUATED)
+    rows = evenly(np.arange(len(q)), EVALUATED)
     seen = _angles(p.right_side[rows])
     if len(given) <= 6:
         orders = [order for order in itertools.permutations(given) if order != given]
@@ -414,12 +404,7 @@ _LEAST_M = 0.002  # lengths that differ by less are not exchanged, m
 
 
 def require_fitting(arm: Arm, q: Array, Ts_rig_body: Array) -> None:
-    """Reject a table with which no loop may be closed.
-
-    Args:
-        arm: as its table says it is.
-        q: (N, n) joint angles of the poses, rad.
-        Ts_rig_body: (N, 4, 4) measured poses of the body, m.
+    """Reject a table with which no loop may be closed, by joint angles q (N, n), rad, and poses of the body, m.
 
     Raises:
         CalibrationError: the poses contradict the table by far more than a cheap arm's errors.
@@ -444,11 +429,11 @@ def require_fitting(arm: Arm, q: Array, Ts_rig_body: Array) -> None:
         return
     names = " or ".join(name for name in sorted(sizes, key=lambda name: sizes[name]) if sizes[name] < _ALIKE * best)
     advice = (
-        f"they fit within {1e3 * best:.1f} mm if {names}: correct the table"
-        if explained
-        else "no single sign, zero or pair of lengths explains it: check the table and the joint angles of several poses "
-        "(armsight identify)"
+        "no single sign, zero or pair of lengths explains it: check the table and the joint angles of several poses "
     )
+    advice += "(armsight identify)"
+    if explained:
+        advice = f"they fit within {1e3 * best:.1f} mm if {names}: correct the table"
     raise CalibrationError(
         f"the table of {arm.name} contradicts the measured poses by {1e3 * off[0]:.0f} mm and {np.degrees(off[1]):.1f} deg "
         f"RMS, with which no loop is closed: {advice}"
@@ -569,7 +554,7 @@ def check_plausible(arm: Arm, measured: Measured) -> None:
     if good and at.sized:
         _check_rotations(arm, measured, rows)
         step = find_step(arm, measured)
-        if step is not None and step.clear:
+        if step is not None and step.left < step.before / CLEAR:  # the poses cannot be taken together
             raise InputError(
                 f"the first {step.row} poses and those from there on are of different states (off by "
                 f"{1e3 * step.before:.1f} mm together, {1e3 * step.left:.1f} mm so): {step.text}; use one of both parts"
@@ -581,7 +566,17 @@ def check_plausible(arm: Arm, measured: Measured) -> None:
             raise InputError(
                 said.replace("OFF", f"off by {1e3 * at.right:.0f} mm as they are, {1e3 * off.right:.1f} mm so")
             )
-    raise InputError(_unit(at.scale) if good else _proposal(arm, q, p, at.right))
+    if not good:
+        raise InputError(_proposal(arm, q, p, at.right))
+    near = min(_SCALES, key=lambda s: abs(np.log(at.scale / s)))
+    if abs(np.log(at.scale / near)) < np.log1p(SCALE_OFF):
+        raise InputError(
+            f"the points are {at.scale:.4g} times as large as the arm's motions: are they in {_SCALES[near]}? "
+            "name the columns by their unit: p1_x_m or p1_x_mm"
+        )
+    raise InputError(
+        f"the points are {at.scale:.3g} times as large as this arm's motions: is it the right model, in the right unit?"
+    )
 
 
 def without_tool(arm: Arm) -> Arm:
@@ -611,35 +606,23 @@ def _readings_of(measured: Measured, rows: Rows) -> Iterator[tuple[Array, Array,
         if n - abs(shift) >= FEWEST:
             some = np.linspace(0, n - abs(shift) - 1, min(POSES, n - abs(shift))).astype(int)
             hand, seen = max(shift, 0), max(-shift, 0)
-            yield (
-                measured.q[some + hand],
-                measured.p_rig[some + seen],
+            said = (
                 f"the rows are shifted by {abs(shift)}: the joint angles of row {1 + hand} belong to the pose of row "
-                f"{1 + seen} (OFF); remove what is too much at either end, or join the tables by names or times",
             )
+            said += f"{1 + seen} (OFF); remove what is too much at either end, or join the tables by names or times"
+            yield measured.q[some + hand], measured.p_rig[some + seen], said
     if measured.R_rig_body is not None:
-        yield (
-            q,
-            -np.einsum("nji,nkj->nki", measured.R_rig_body[rows], measured.p_rig[rows]),
+        said = (
             "the poses are inverse transforms: they fit as those of the instrument in the body (OFF): invert them; the "
-            "body in the instrument's frame is needed",
         )
+        said += "body in the instrument's frame is needed"
+        yield q, -np.einsum("nji,nkj->nki", measured.R_rig_body[rows], measured.p_rig[rows]), said
     for read, unit in (
         (np.radians(q), "degrees; name the columns q1_deg .. q6_deg"),
         (np.degrees(q), "radians; name the columns q1_rad .. q6_rad"),
     ):
         if np.abs(read).max() < chain.MOST_RADIANS:
             yield read, measured.p_rig[rows], f"the motions fit if the joint angles are in {unit} (OFF)"
-
-
-def _unit(scale: float) -> str:
-    near = min(_SCALES, key=lambda s: abs(np.log(scale / s)))
-    if abs(np.log(scale / near)) < np.log1p(SCALE_OFF):
-        return (
-            f"the points are {scale:.4g} times as large as the arm's motions: are they in {_SCALES[near]}? "
-            "name the columns by their unit: p1_x_m or p1_x_mm"
-        )
-    return f"the points are {scale:.3g} times as large as this arm's motions: is it the right model, in the right unit?"
 
 
 def _proposal(arm: Arm, q: Array, p: Array, off: float) -> str:
@@ -707,11 +690,6 @@ class Step(NamedTuple):
     text: str  #: what changed
     before: float  #: RMS of the points off the arm without it, m
     left: float  #: the same with it, m
-
-    @property
-    def clear(self) -> bool:
-        """Whether the poses cannot be taken together."""
-        return self.left < self.before / CLEAR
 
 
 def find_step(arm: Arm, measured: Measured) -> Step | None:

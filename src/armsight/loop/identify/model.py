@@ -61,12 +61,9 @@ def nominal_table(arm: Arm) -> Array:
 def motion(table: Array, theta: Array, modified: bool, R_rig_0: Array, o_rig_0: Array) -> TableMotion:
     """Move frame 0, R_rig_0 (3, 3) and o_rig_0 (3,), along the chain, and note the axis of every number of the table.
 
-    Args:
-        table: (n, 5) by COLUMNS, m and rad.
-        theta: (N, n) rotation of each joint without its offset, rad.
-        modified: whether the table follows the modified convention.
-        R_rig_0: rotation of frame 0.
-        o_rig_0: its origin, m.
+    ``table``: (n, 5) by COLUMNS, m and rad. ``theta``: (N, n) rotation of each joint without its offset, rad.
+    ``modified``: whether the table follows the modified convention. ``R_rig_0``: rotation of frame 0. ``o_rig_0``: its
+    origin, m.
     """
     n = len(theta)
     R, o = np.broadcast_to(R_rig_0, (n, 3, 3)).copy(), np.broadcast_to(o_rig_0, (n, 3)).copy()
@@ -365,9 +362,15 @@ class Model(Record):
         modified = self.arm.convention == "modified"
         return motion(self.table(x), self.theta(x, q, phi), modified, T[:3, :3], T[:3, 3])
 
-    def residuals(self, x: Array, measured: Measured, phi: Array, m: TableMotion | None = None) -> Array:
-        """Return predicted minus measured, (N, M); see :class:`Measured` for its axes. ``m``: the motion, where known."""
-        m, t = self.motion(x, measured.q, phi) if m is None else m, self.tool_points(x)
+    def _phi(self, measured: Measured, phi: Array | None) -> Array:
+        return self.feature_values(measured.q, measured.approach) if phi is None else phi
+
+    def residuals(self, x: Array, measured: Measured, phi: Array | None = None, m: TableMotion | None = None) -> Array:
+        """Return predicted minus measured, (N, M); see :class:`Measured` for its axes.
+
+        ``phi``: :meth:`feature_values`, and ``m``: the motion, where they are known already.
+        """
+        m, t = self.motion(x, measured.q, self._phi(measured, phi)) if m is None else m, self.tool_points(x)
         p = m.o[:, None] + (m.R @ t.T).swapaxes(1, 2)
         if measured.length_m is not None:
             return np.asarray(np.linalg.norm(p[:, 0], axis=1) - measured.length_m)[:, None]
@@ -378,8 +381,9 @@ class Model(Record):
         angle = log_so3(back @ m.R @ self.T_6_body(x)[:3, :3])
         return np.concatenate([(back @ off.swapaxes(1, 2))[..., 0], angle], axis=1)
 
-    def linearised(self, x: Array, measured: Measured, phi: Array) -> tuple[Array, Array]:
-        """Return predicted minus measured (N, M), and its derivative (N, M, P) by the vector."""
+    def linearised(self, x: Array, measured: Measured, phi: Array | None = None) -> tuple[Array, Array]:
+        """Return predicted minus measured (N, M), and its derivative (N, M, P) by the vector; ``phi`` as above."""
+        phi = self._phi(measured, phi)
         m = self.motion(x, measured.q, phi)
         e = self.residuals(x, measured, phi, m)
         t, n, at = self.tool_points(x), len(measured), self.table_at

@@ -48,15 +48,13 @@ class Observed(NamedTuple):
 def observed(model: Model, x: Array, measured: Measured, prior: Array, noise: tuple[float, float]) -> Observed:
     """Find which parameters are observable from poses.
 
-    Args:
-        model: the arm.
-        x: (P,) base and tool estimated, the rest nominal.
-        measured: the poses.
-        prior: (P,) prior sigmas; 0 freezes.
-        noise: sigmas of the instrument.
+    ``x``: (P,) base and tool estimated, the rest nominal. ``prior``: (P,)
+    prior sigmas; 0 freezes. ``noise``: sigmas of the instrument.
     """
     T = _triangle(model, x, measured, prior, noise)
-    preference = _preference(model, x)
+    d = np.abs(model.table(x)[:, chain.D])  # of two d the larger one is preferred
+    rank = [(_PREFERENCE.index(p.kind), -d[p.joint] * (p.kind == "d")) for p in model.parameters]
+    preference = np.array(sorted(range(len(rank)), key=rank.__getitem__))
     kept, ties, weak = _gram_schmidt(T, preference, prior)
     anywhere = _ties_anywhere(model, x, measured, prior, noise, preference)
     reasons = {model.names[k]: "kept at its nominal value: a prior of zero" for k in np.flatnonzero(prior == 0)}
@@ -95,25 +93,13 @@ def _tie_texts(model: Model, ties: dict[int, list[int]], anywhere: dict[int, lis
     }
 
 
-def _preference(model: Model, x: Array) -> Array:
-    """Return the parameters (P,) in order of preference: of two d, the larger one first."""
-    table = model.table(x)
-    rank = []
-    for k, p in enumerate(model.parameters):
-        size = -abs(table[p.joint, chain.D]) if p.kind == "d" else 0.0
-        rank.append((_PREFERENCE.index(p.kind), size, k))
-    return np.array([k for _, _, k in sorted(rank)])
-
-
 def _triangle(model: Model, x: Array, measured: Measured, prior: Array, noise: tuple[float, float]) -> Array:
     """Return the triangle (P, P) of the whitened Jacobian, columns in units of the prior sigma."""
     if len(measured) > MAX_POSES:
         measured = measured.rows(np.linspace(0, len(measured) - 1, MAX_POSES).astype(int))
-    phi = model.feature_values(measured.q, measured.approach)
-    linear = linear_of(model, x, measured, phi, np.ones(len(x), bool), prior)
+    linear = linear_of(model, x, measured, np.ones(len(x), bool), prior)
     _, J = whitened(linear, variances_of(linear, noise))
-    unit = np.where(np.isfinite(prior), prior, 1.0)
-    J = J.reshape(-1, len(x)) * unit
+    J = J.reshape(-1, len(x)) * np.where(np.isfinite(prior), prior, 1.0)
     rows = max(len(x) - len(J), 0)
     return np.asarray(np.linalg.qr(np.concatenate([J, np.zeros((rows, len(x)))]), mode="r"))
 

@@ -44,11 +44,9 @@ class Odometry(NamedTuple):
 def odometry(arm: Arm, q: Array, Ts_base_tool: Array, prior: Prior | None = None) -> Odometry | None:
     """Return how far odometry is off; None where the tool travelled less than the least of ``TRAVELS_M``.
 
-    Args:
-        arm: the nominal arm.
-        q: (N, n) joint angles by their sensors, rad, in order of time; rows that are no numbers are left out.
-        Ts_base_tool: (N, 4, 4) poses of the tool then, by what is taken for the truth.
-        prior: how far the arm may be off.
+    ``arm``: the nominal arm. ``q``: (N, n) joint angles by their sensors, rad, in order of time; rows that are no
+    numbers are left out. ``Ts_base_tool``: (N, 4, 4) poses of the tool then, by what is taken for the truth. ``prior``:
+    how far the arm may be off.
     """
     prior = prior or Prior()
     kept, points = list[int](), Ts_base_tool[:, :3, 3].tolist()

@@ -89,52 +89,38 @@ def exchanged(
 ) -> tuple[Array, Array]:
     """Return poses (n, J) and sides (n, J) that together lower the error more than those given.
 
-    Args:
-        q: (n, J) joint angles to start from, rad.
-        approach: (n, J) sides.
-        information: of poses, and which are allowed.
-        P: (F, F) covariance before.
-        requested: (3 K, F) derivative of K positions, whose error is to be low.
-        limits: (J,) and (J,) least and greatest angles, rad.
-        rng: sets the levels, and the order of the joints.
+    ``q``: (n, J) joint angles to start from, rad. ``P`` and ``requested``: as for :func:`greedy`. ``limits``: (J,) and
+    (J,) least and greatest angles, rad. ``rng`` sets the levels, and the order of the joints.
     """
     q, approach, W = q.copy(), approach.copy(), requested.T @ requested
     J, _ = information(q, approach)
+    low, high = limits
+
+    def best(q: Array, approach: Array, P: Array) -> tuple[Array, Array, Array]:
+        """Return the best pose that changes of one joint after the other lead to, its sides, and its Jacobian."""
+        for joint in rng.permutation(len(q)):
+            step = (high[joint] - low[joint]) / (LEVELS - 1)
+            levels = np.clip(low[joint] + step * (np.arange(LEVELS) + rng.uniform(-0.5, 0.5)), low[joint], high[joint])
+            tried, sides = np.tile(q, (2 * LEVELS + 1, 1)), np.tile(approach, (2 * LEVELS + 1, 1))
+            tried[1:, joint] = np.tile(levels, 2)
+            sides[1 + LEVELS :, joint] *= -1
+            J, allowed = information(tried, sides)
+            allowed[0] = True  # the pose as it was: it stays where nothing is better
+            row = int(np.argmax(np.where(allowed, _gains(J, P, W), -np.inf)))
+            q, approach, kept = tried[row], sides[row], J[row]
+        return q, approach, kept
+
     H = np.linalg.inv(P) + np.einsum("nki,nkj->ij", J, J)
     reached = _rms(np.linalg.inv(H), W, len(requested))
     for _ in range(SWEEPS):
         for k in range(len(q)):
             others = H - J[k].T @ J[k]
-            q[k], approach[k], J[k] = _best(q[k], approach[k], information, np.linalg.inv(others), W, limits, rng)
+            q[k], approach[k], J[k] = best(q[k], approach[k], np.linalg.inv(others))
             H = others + J[k].T @ J[k]
         before, reached = reached, _rms(np.linalg.inv(H), W, len(requested))
         if reached > (1 - MIN_GAIN) * before:
             break
     return q, approach
-
-
-def _best(
-    q: Array,
-    approach: Array,
-    information: Information,
-    P: Array,
-    W: Array,
-    limits: tuple[Array, Array],
-    rng: np.random.Generator,
-) -> tuple[Array, Array, Array]:
-    """Return the best pose that changes of one joint after the other lead to, its sides, and its Jacobian."""
-    low, high = limits
-    for joint in rng.permutation(len(q)):
-        step = (high[joint] - low[joint]) / (LEVELS - 1)
-        levels = np.clip(low[joint] + step * (np.arange(LEVELS) + rng.uniform(-0.5, 0.5)), low[joint], high[joint])
-        tried, sides = np.tile(q, (2 * LEVELS + 1, 1)), np.tile(approach, (2 * LEVELS + 1, 1))
-        tried[1:, joint] = np.tile(levels, 2)
-        sides[1 + LEVELS :, joint] *= -1
-        J, allowed = information(tried, sides)
-        allowed[0] = True  # the pose as it was: it stays where nothing is better
-        best = int(np.argmax(np.where(allowed, _gains(J, P, W), -np.inf)))
-        q, approach, kept = tried[best], sides[best], J[best]
-    return q, approach, kept
 
 
 CANDIDATES, PROBES = 800, 200  # candidates sampled, and positions of the workspace at which the error is predicted
@@ -211,7 +197,7 @@ def plan_joints(
         P = np.linalg.inv(np.linalg.inv(P) + Jd.T @ Jd)
     J = scene.whitened(seen)[:, :, free]
     part = seen.rows(rng.choice(len(seen), min(PROBES, len(seen)), replace=False))
-    by = model.linearised(x, part, model.feature_values(part.q, part.approach))[1]
+    by = model.linearised(x, part)[1]
     requested = by[:, :3, free].reshape(-1, int(free.sum()))
 
     def information(q: Array, approach: Array) -> tuple[Array, Mask]:
@@ -262,13 +248,14 @@ class _Scene(Record):
         done: Measured | None,
     ) -> _Scene:
         """Return the scene; ``done`` shows from which sides the body is seen."""
-        scene = _Scene(model, x, noise if rig is None else BESIDES, floor_m, rig)
-        if rig is None or done is None or done.R_rig_body is None:
-            return scene
+        if rig is None:
+            return _Scene(model, x, noise, floor_m, None)
+        if done is None or done.R_rig_body is None:
+            return _Scene(model, x, BESIDES, floor_m, rig)
         Ts = pose(done.R_rig_body, done.p_rig[:, 0])
         axes = _to_cameras(rig, Ts).mean(axis=0)
         axes /= np.linalg.norm(axes, axis=1, keepdims=True)
-        return replace(scene, sides=(axes, _rotated(rig, Ts, axes).max(axis=0)))
+        return _Scene(model, x, BESIDES, floor_m, rig, (axes, _rotated(rig, Ts, axes).max(axis=0)))
 
     @property
     def limits(self) -> tuple[Array, Array]:
@@ -321,9 +308,7 @@ class _Scene(Record):
 
     def whitened(self, measured: Measured) -> Array:
         """Return the whitened Jacobians (N, M, P)."""
-        phi = self.model.feature_values(measured.q, measured.approach)
-        everything = np.ones(len(self.x), bool)
-        linear = linear_of(self.model, self.x, measured, phi, everything, np.full(len(self.x), np.inf))
+        linear = linear_of(self.model, self.x, measured, np.ones(len(self.x), bool), np.full(len(self.x), np.inf))
         variances = np.append(variances_of(linear, self.noise), CHANCE_RAD**2)
         return whitened(replace(linear, own=linear.own | {"joints": by_joints(self.model, linear.J)}), variances)[1]
 

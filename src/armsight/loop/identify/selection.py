@@ -48,9 +48,7 @@ def scaled_prior(model: Model, start: Solution, measured: Measured, free: Mask, 
     if not kinds:
         return prior
     of = np.array([kinds.index(p.kind) if p.kind in kinds else -1 for p in model.parameters])
-    part = measured.rows(start.used)
-    phi = model.feature_values(part.q, part.approach)
-    linear = linear_of(model, start.x, part, phi, free, prior)
+    linear = linear_of(model, start.x, measured.rows(start.used), free, prior)
     scaled, unit = of[free] >= 0, prior[free]
     shared = {kind: linear.J[:, :, of[free] == k] * unit[of[free] == k] for k, kind in enumerate(kinds)}
     at = np.where(scaled, linear.at, 0.0)  # what is scaled is about zero, at the nominal arm
@@ -127,18 +125,12 @@ def forward_selection(
 ) -> Selection:
     """Select error sources, starting from base and tool alone.
 
-    Args:
-        model: the arm with every error source.
-        start: a fit to linearise at, with the poses used and the noise.
-        measured: the poses.
-        free: (P,) the candidates.
-        prior: (P,) prior sigmas.
-        together: (P,) harmonics and loads that may also be added as a whole.
-        progress: called with a line of text after each step.
+    ``model``: the arm with every error source. ``start``: a fit to linearise at, with the poses used and the noise.
+    ``free``: (P,) the candidates. ``prior``: (P,) prior sigmas. ``together``: (P,) harmonics
+    and loads that may also be added as a whole. ``progress``: called with a line of text after each step.
     """
     part = measured.rows(start.used)
-    phi = model.feature_values(part.q, part.approach)
-    linear = linear_of(model, start.x, part, phi, np.ones(len(prior), bool), prior)
+    linear = linear_of(model, start.x, part, np.ones(len(prior), bool), prior)
     folds = Folds.of(linear, variances_of(linear, start.noise), folds_of(part.q))
     groups = _groups(model, free, together)
     kept = free & np.array([p.kind in PLACEMENT for p in model.parameters])

@@ -37,7 +37,7 @@ FAR_M = 0.1
 
 def errors(model: Model, x: Array, measured: Measured) -> Errors:
     """Return the errors of a parameter vector on poses."""
-    e = model.residuals(x, measured, model.feature_values(measured.q, measured.approach))
+    e = model.residuals(x, measured)
     if measured.length_m is not None:
         return Errors(np.abs(e), np.zeros(0))
     if measured.R_rig_body is None:
@@ -90,17 +90,17 @@ def placement_refitted(found: Identified, measured: Measured) -> tuple[Model, Ar
     """Return the model, the nominal and the identified vector with base and tool fitted to other poses."""
     model, start = with_placement(found.model, measured)
     placement = np.array([p.kind in PLACEMENT for p in model.parameters]) & found.solution.free
-    out = []
-    for x in (found.nominal, found.solution.x):
-        out.append(fit(model, np.where(placement, start, x), measured, placement, found.prior).x)
-    return model, out[0], out[1]
+    nominal, identified = (
+        fit(model, np.where(placement, start, x), measured, placement, found.prior).x
+        for x in (found.nominal, found.solution.x)
+    )
+    return model, nominal, identified
 
 
 def _over(model: Model, found: Identified, x: Array, measured: Measured) -> float:
     """Return the RMS of residuals over their predicted sigma: noise and the parameters' covariance."""
     weighted, free = with_joint_noise(model, x, measured, found.joint_sigma_rad), found.solution.free
-    phi = model.feature_values(measured.q, measured.approach)
-    linear = linear_of(model, x, weighted, phi, free, found.prior)
+    linear = linear_of(model, x, weighted, free, found.prior)
     by_fit = linear.J @ found.solution.cov[np.ix_(free, free)] @ linear.J.swapaxes(1, 2)
     C = covariances(linear, variances_of(linear, found.solution.noise)) + by_fit
     squares = np.einsum("ni,nij,nj->", linear.e, np.linalg.inv(C), linear.e)
@@ -161,28 +161,22 @@ def identify_held_out(
 
 def check_other(arm: Arm, measured: Measured, other: Measured, name: str) -> None:
     """Reject poses to validate with that cannot be of the arm, before anything is fitted; ``name`` is for the error."""
+    arm, where = without_tool(arm), f"{name}: "
     try:
-        _check_other(arm, measured, other)
+        require_alike(other, measured.points, measured.R_rig_body is not None)
+        if len(other) >= MIN_POSES:
+            where += "the poses to validate with: "
+            check_plausible(arm, other)
+            return
+        check_plausible(arm, measured)  # or its placement means nothing
     except InputError as error:
-        raise InputError(f"{name}: {error}") from None
-
-
-def _check_other(arm: Arm, measured: Measured, other: Measured) -> None:
-    """Reject poses to validate with that cannot be of the arm, before anything is fitted."""
-    require_alike(other, measured.points, measured.R_rig_body is not None)
-    if len(other) >= MIN_POSES:
-        try:
-            check_plausible(without_tool(arm), other)
-        except InputError as error:
-            raise InputError(f"the poses to validate with: {error}") from None
-        return
-    check_plausible(without_tool(arm), measured)  # or its placement means nothing
-    model, x = with_placement(Model.of(without_tool(arm), measured, backlash=False).with_features(()), measured)
+        raise InputError(f"{where}{error}") from None
+    model, x = with_placement(Model.of(arm, measured, backlash=False).with_features(()), measured)
     off = float(np.median(errors(model, x, other).position_m))
     if off > FAR_M:
         raise InputError(
-            f"the {len(other)} poses to validate with are {1e3 * off:.0f} mm from where the arm reaches at their angles: "
-            f"other joints, or another set-up, for which {MIN_POSES} poses are needed"
+            f"{name}: the {len(other)} poses to validate with are {1e3 * off:.0f} mm from where the arm reaches at their "
+            f"angles: other joints, or another set-up, for which {MIN_POSES} poses are needed"
         )
 
 

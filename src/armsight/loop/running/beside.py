@@ -51,9 +51,8 @@ class FusedRow:
     windows: int  #: of its readings that were used or rejected
     outliers: int  #: of them rejected
     begin_s: float  #: since when it was used, s: before, the camera's delay is learned
-    residual_over_sigma: (
-        float  #: root mean square; half is usual, as links count as loose; from ``HONEST`` on it disagrees
-    )
+    #: root mean square; half is usual, as links count as loose; from ``HONEST`` on it disagrees
+    residual_over_sigma: float
     agrees: bool  #: whether it agrees with joints and vision
     rejected_s: float | None  #: when it was dropped as images contradict it, s; None where it was not
     moved_rms_m: float | None  #: distance of the estimates from those recorded before, m; None where there are none
@@ -189,12 +188,8 @@ class Fused:
         if not self.windows or not len(covs):
             raise InputError("; ".join((f"{self.entry.where}: {self._unused()}", *self.losses)))
         ratio = float(np.sqrt(self._squares / max(self.windows - self.outliers, 1)))
-        agrees = (
-            self.outliers < OUTLIERS * self.windows
-            and self.rejected_s is None
-            and ratio < self.honest
-            and not self._off
-        )
+        agrees = self.outliers < OUTLIERS * self.windows and ratio < self.honest
+        agrees = agrees and self.rejected_s is None and not self._off
         sigma = float(np.sqrt(np.einsum("nii->ni", covs)[:, :3].sum(axis=1).mean()))
         moved, without = (None, None) if before is None else before
         said = self.windows, self.outliers, self.begin_s, ratio, agrees, self.rejected_s
@@ -258,16 +253,8 @@ class Witness(Fused):
         agrees = abs(off.angle_rad) < AGREES * off.sigma_rad
         says = not self._stuck and (off.sigma_rad < SAYS_RAD or not agrees)
         disturbed = float(np.median(off.disturbance_t))
-        return HeadingRow(
-            sensor.name,
-            self.windows,
-            self.begin_s,
-            off.angle_rad,
-            off.sigma_rad,
-            agrees if says else None,
-            disturbed,
-            self.losses,
-        )
+        said = off.angle_rad, off.sigma_rad, agrees if says else None, disturbed
+        return HeadingRow(sensor.name, self.windows, self.begin_s, *said, self.losses)
 
 
 class Ranged(Fused):

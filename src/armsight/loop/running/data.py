@@ -83,9 +83,8 @@ class JointsDatum(Record):
     """One batch of joint readings, and the estimate that followed from it."""
 
     states: JointStates  #: the readings
-    T_base_tool: Array | None = (
-        None  #: (4, 4) estimated pose of the tool at the newest reading; None without an estimator
-    )
+    #: (4, 4) estimated pose of the tool at the newest reading; None without an estimator
+    T_base_tool: Array | None = None
     cov: Array | None = None  #: (6, 6) its covariance, right tangent [m; rad]
     vision_age_s: float = np.inf  #: time since the newest measurement used, s; infinite before the first
     #: name and samples of the reference that came after these readings; None without.
@@ -118,9 +117,8 @@ class NoteDatum:
     time_s: float  #: when, s
     text: str  #: the line
     level: str = "info"  #: info, warning or error
-    findings: tuple[str, ...] | None = (
-        None  #: of a health monitor, those that hold now; None where it says nothing of them
-    )
+    #: of a health monitor, those that hold now; None where it says nothing of them
+    findings: tuple[str, ...] | None = None
 
     def to_json(self, body: Body) -> dict[str, Any]:
         """Return the object that streams hold; ``body`` is not needed."""
@@ -187,12 +185,9 @@ def remeasured_event(poses: Sequence[tuple[float, PoseEstimate | Missed]]) -> di
     for t_s, pose in poses:
         rows.append({"t_s": t_s, "T_left_body": None})
         if isinstance(pose, PoseEstimate):
-            named = (
-                ("T_left_body", pose.T_left_body),
-                ("covariance_body", pose.cov),
-                ("covariance_precision_body", pose.cov_noise),
-            )
-            rows[-1] |= {name: value.tolist() for name, value in named}
+            named = {"T_left_body": pose.T_left_body, "covariance_body": pose.cov}
+            named |= {"covariance_precision_body": pose.cov_noise}
+            rows[-1] |= {name: value.tolist() for name, value in named.items()}
     return {"event": "remeasured", "shots": rows}
 
 

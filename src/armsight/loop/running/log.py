@@ -26,16 +26,13 @@ from armsight.vision.rig import StereoRig
 
 #: Name, time stamp (what a clock that was followed was off removed) and pose of a shot, or why there is none.
 Seen = tuple[str, float, PoseEstimate | Missed]
-APART_S = (
-    0.5  # s; two poses further apart give no speed; half: slow cameras give none, double: a curve counts as straight
-)
+#: s; two poses further apart give no speed; half: slow cameras give none, double: a curve counts as straight
+APART_S = 0.5
 NEWEST_SHOTS = 2000  # shots kept in memory, to put a rig right; half: 17 s at 60 Hz may not suffice, double: 16 MB more
 _NEWEST_LIVE = 100  # live estimates kept, 0.4 s; half: the motion about a late exposure is unknown, double: nothing
 _BLOCK = 8192  # numbers that are written together, 64 kB; half: twice as many writes, double: a longer pause for each
-_MOST_SHOTS, _DIFFERENT = (
-    400,
-    0.01,
-)  # detections kept, and by how much their poses differ, m, rad; half: more of the same
+#: Detections kept, and by how much their poses differ, m, rad; half: more of the same
+_MOST_SHOTS, _DIFFERENT = 400, 0.01
 _REASONS = 200  # reasons that are counted, as some have figures; half: rare ones are named less, double: nothing
 
 
@@ -160,9 +157,8 @@ class Log:
     readings: Rows = field(default_factory=Rows)  #: rows of time, s, and joint angles (n,), rad
     #: rows of time, s, pose (4, 4) and covariance (6, 6) of every live estimate of the tool.
     lives: Rows = field(default_factory=Rows)
-    fused: Rows = field(
-        default_factory=Rows
-    )  #: the same of the smoothed track, with measurements up to RECORD_LAG_S later
+    #: the same of the smoothed track, with measurements up to RECORD_LAG_S later
+    fused: Rows = field(default_factory=Rows)
     #: rows of time stamp, s, T_left_body (4, 4), its covariance and that of its noise (6, 6) of every pose.
     measured: Rows = field(default_factory=Rows)
     missed: Counter[str] = field(default_factory=Counter)  #: how many shots gave no pose, by reason
@@ -260,10 +256,8 @@ class Log:
 
     def _draw(self, name: str, t_s: float, pose: PoseEstimate) -> None:
         """Keep the detections of a shot whose pose differs from the last: others say little more about the cameras."""
-        if (
-            self._drawn_at is not None
-            and np.abs(log_se3(inverse(self._drawn_at) @ pose.T_left_body)).max() <= _DIFFERENT
-        ):
+        before = self._drawn_at
+        if before is not None and np.abs(log_se3(inverse(before) @ pose.T_left_body)).max() <= _DIFFERENT:
             return
         self._drawn_at = pose.T_left_body
         if self._drawn_seen % self._drawn_every == 0:
@@ -280,13 +274,9 @@ class Log:
     def counts(self) -> dict[str, int]:
         """Return how many shots were measured, missed and rejected, and how often contradictions reopened the estimator."""
         missed, found = sum(self.missed.values()), self.outcomes
+        used = {"measured": self.shots - missed, "missed": missed}
         rejected = found[Outcome.OUTLIER] + found[Outcome.TOO_LATE]
-        return {
-            "measured": self.shots - missed,
-            "missed": missed,
-            "rejected": rejected,
-            "reopened": found[Outcome.REOPENED],
-        }
+        return used | {"rejected": rejected, "reopened": found[Outcome.REOPENED]}
 
     def mounting_at(self, t_s: float, first: Mounting) -> Mounting:
         """Return the mounting that was used for a shot of a time, s; the first one before any correction."""

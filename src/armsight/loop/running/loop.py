@@ -421,11 +421,8 @@ class Loop:
     def run(self, controller: Controller, duration_s: float, segment: RunSegment, *, watch: bool = True) -> None:
         """Let a controller command the joints for some time, s; the segment is logged with its times.
 
-        Args:
-            controller: computes the commands.
-            duration_s: how long, s.
-            segment: the entry of the log.
-            watch: whether shots are measured.
+        ``controller``: computes the commands. ``duration_s``: how long, s. ``segment``: the entry of the log.
+        ``watch``: whether shots are measured.
 
         Raises:
             DeviceError: the board left the enabled state (the message has its faults), the cameras stalled, or a device
