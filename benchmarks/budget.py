@@ -34,7 +34,7 @@ from armsight.files import write_text
 from armsight.geometry.pose import exp_se3, inverse, log_se3, pose, transform
 from armsight.geometry.rigid import fit_rigid
 from armsight.sim.budget.chart import marker_noise
-from armsight.sim.budget.plan import MOST_SQUARE_PX, PRICES, RigPlan, catalogue, length_m, planned
+from armsight.sim.budget.plan import PRICES, RigPlan, catalogue, length_m, planned
 from armsight.sim.budget.result import BOUNDS, CHANGES, RigBudget, best, kept, loss
 from armsight.sim.camera.pipeline import SimulatedCamera
 from armsight.sim.camera.stages import Defocus
@@ -157,7 +157,7 @@ def calibrated(plan: RigPlan, given: Conditions, z: Array, rng: np.random.Genera
     model = replace(model, shape_sigma_m=sigma_m)
     true = model.body(sigma_m * z[1:])
     px = board.square_m * plan.focal_px / float(np.median(Ts[:, 2, 3]))
-    noise = marker_noise(plan.pipeline, "square", min(px, MOST_SQUARE_PX))
+    noise = marker_noise(plan.pipeline, "square", px)
     p = np.einsum("sij,mj->smi", Ts[:, :3, :3], true) + Ts[:, None, :3, 3]
     uv = np.stack([each.reshape(S, M, 2) for each in plan.stereo_rig.project(p.reshape(-1, 3))], axis=1).reshape(-1, 2)
     uv += noise * rng.standard_normal(uv.shape)
@@ -481,7 +481,7 @@ def real(options: argparse.Namespace) -> None:
         counts = (int(n) for n in np.rint(np.ptp(drawing, axis=0)[:2] / square_m) + 1)
         Ts = board_poses(rng, rig, chessboard(*counts, square_m), 200)
         px = square_m * plan.focal_px / float(np.median(Ts[:, 2, 3]))
-        noise = marker_noise(plan.pipeline, marker, min(px, MOST_SQUARE_PX))
+        noise = marker_noise(plan.pipeline, marker, px)
         model, square = printed_board(drawing), []
         for T in Ts:
             wrong = rig.perturbed(rng.multivariate_normal(np.zeros(len(cov)), cov))

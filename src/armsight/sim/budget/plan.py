@@ -54,7 +54,6 @@ from armsight.vision.rig import StereoRig
 #: A disc's diameter, a tag's and a square's side in the image below which detection is left to luck, px; half: half of them
 #: are lost, double: bodies twice as large are asked for.
 _LEAST_PX = {"disc": 8.0, "tag": 24.0, "square": 8.0}
-MOST_SQUARE_PX = 60.0  # px; larger squares' corners are no better; half: their noise is a tenth too large
 #: Sets of poses of the board, whose mean is taken; half: sigma differs by 10 % by chance, double: half a second more.
 _SETS = 3
 #: Lengths that a table-top cell has, m: what lies outside is mm given as m.
@@ -551,7 +550,7 @@ def _calibrated(plan: RigPlan) -> Array:
     px, least_px = size_m * plan.focal_px / float(np.median(np.concatenate(sets)[:, 2, 3])), _LEAST_PX[kind]
     if px < least_px:
         raise InputError(f"a {kind} of {plan.board} is {px:.1f} px, at least {least_px:g} are needed")
-    sigma, bent_m = marker_noise(plan.pipeline, kind, min(px, MOST_SQUARE_PX)), length_m(plan.board_bent, "board_bent")
+    sigma, bent_m = marker_noise(plan.pipeline, kind, px), length_m(plan.board_bent, "board_bent")
     covs = [calibration_covariance(rig, board.body.points, Ts, sigma, bent_m) for Ts in sets]
     return np.asarray(np.mean(covs, axis=0))
 
