@@ -251,14 +251,18 @@ def pose_budget(rig: StereoRig, points: Array, normals: Array, views: list[Predi
 def gates(rig: StereoRig, target: Composite, seen: PredictedView, noise_px: float, sigma_m: float) -> Gates:
     """Ask ``measure``, by bisection, with what both cameras would detect; ``sigma_m``: of the motion along each axis."""
     limits, most_m = [np.inf, np.inf], _SURELY * sigma_m
-    if not sigma_m or len(seen.paired) < 3 or not _found(rig, target, seen, noise_px, np.zeros(3)):
+    if not sigma_m or len(seen.paired) < 3:
         return Gates()
     p = transform(seen.T_left_body, target.body.points[seen.paired]).mean(axis=0)
-    for k, axis in enumerate(axes := _between_exposures(rig, p)):
-        low, high = (most_m, np.inf) if _found(rig, target, seen, noise_px, most_m * axis) else (0.0, most_m)
-        for _ in range(_HALVED if high < np.inf else 0):
+    axes = _between_exposures(rig, p)
+    limited = [k for k in (0, 1) if not _found(rig, target, seen, noise_px, most_m * axes[k])]
+    if not limited or not _found(rig, target, seen, noise_px, np.zeros(3)):
+        return Gates()
+    for k in limited:
+        low, high = 0.0, most_m
+        for _ in range(_HALVED):
             middle = (low + high) / 2
-            low, high = (middle, high) if _found(rig, target, seen, noise_px, middle * axis) else (low, middle)
+            low, high = (middle, high) if _found(rig, target, seen, noise_px, middle * axes[k]) else (low, middle)
         limits[k] = (low + high) / 2
     both = np.isfinite(limits).all() and _found(rig, target, seen, noise_px, _CORNER * np.array(limits) @ axes)
     return Gates(limits[0] / float(np.linalg.norm(p)), limits[1], together=not both)
