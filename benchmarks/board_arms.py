@@ -74,6 +74,7 @@ PLANT_ARRAYS = {
     "blocked": "blocked",
 }
 POT_NAMES = {
+    PotFault.OPEN: (Fault.POT_OPEN,),
     PotFault.STUCK: (Fault.POT_FROZEN,),
     PotFault.FROZEN: (Fault.POT_FROZEN,),
     PotFault.INVERTED: (Fault.POT_INVERTED,),

@@ -1,6 +1,6 @@
 """Figure 1: every class of board_arms.py and board_motors.py, named by the right part or not; one row a class.
 
-    python benchmarks/board_campaign.py 100 --seed 9902      rounds of 42 cases each
+    python benchmarks/board_campaign.py 100 --seed 9902      rounds of 62 cases each
 
 ``right``: the first code is the broken part's, and its alone; ``both``: it is latched beside another one that cannot be
 distinguished from it; ``silent``: no fault. Healthy classes begin with H: there no fault is right.
@@ -9,13 +9,14 @@ distinguished from it; ``silent``: no fault. Healthy classes begin with H: there
 from __future__ import annotations
 
 import argparse
+import functools
 from collections import Counter, defaultdict
 
 import numpy as np
 
 import board_arms
 import board_motors
-from board_arms import NAMED_TICKS, POT_NAMES, SIZES, Fault
+from board_arms import NAMED_TICKS, POT_NAMES, SIZES, Fault, PotFault
 
 PARTS = {
     board_motors.offset: Fault.CURRENT_SENSOR,
@@ -25,6 +26,8 @@ PARTS = {
     board_motors.shorted: Fault.MOTOR,
     board_motors.stuck: Fault.BRIDGE,
 }
+#: Of a potentiometer as the emergency stop comes: no bridge, for which all drivers would sleep.
+STOPPED_POTS = (PotFault.FROZEN, PotFault.INVERTED, PotFault.LAG, PotFault.OPEN)
 HEALTHY = (
     "healthy",
     "pushed",
@@ -80,6 +83,12 @@ class Campaign:
         print("ran on, beyond 1.1 of the limit and not asleep within 60 ms:", dict(+self.ran))
 
 
+def stopped(table, name, part, library, seed, hurt, ms):
+    """Count a sensor that fails so many ms before the emergency stop."""
+    label = f"{name}, stop after {ms} ms"
+    table.run(label, part, board_motors.broken, library, seed, table, label, hurt, moving=True, stop_ms=ms)
+
+
 def main():
     parser = argparse.ArgumentParser()
     parser.add_argument("rounds", type=int, nargs="?", default=100)
@@ -116,6 +125,15 @@ def main():
                     table.run(label, None, board_motors.warming, library, next(seeds), table, **options)
         for case in (board_motors.enabled_warm, board_motors.offset_from_start):
             table.run(f"H {case.__name__}", None, case, library, next(seeds), table)
+        for kind in STOPPED_POTS:
+            for ms in (0, 20):
+                seed = next(seeds)
+                size = float(SIZES.get(kind, lambda rng: 0.0)(np.random.default_rng([seed, 12])))
+                hurt = functools.partial(board_motors.break_pot, kind=kind, size=size)
+                stopped(table, f"pot {kind.name.lower()}", POT_NAMES[kind][0], library, seed, hurt, ms)
+        for hurt in (board_motors.offset, board_motors.gain, board_motors.sign):
+            for ms in (0, 20):
+                stopped(table, hurt.__name__, Fault.CURRENT_SENSOR, library, next(seeds), hurt, ms)
     table.show()
 
 

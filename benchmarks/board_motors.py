@@ -206,6 +206,10 @@ def shorted(arm, joint):
     arm.plant._model[1, joint] *= arm.rng.uniform(0.7, 0.95)
 
 
+def break_pot(arm, joint, *, kind, size):
+    arm.plant.break_pot(joint, kind, size)
+
+
 def sound(arm, joint):
     pass
 
