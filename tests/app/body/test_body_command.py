@@ -468,6 +468,9 @@ def test_split_is_offered_where_a_drawing_is_too_large_and_changes_none_that_fit
     assert armsight("body", "draw", PLATE, "-o", tmp_path / "c.pdf", "--split").code == 0
     assert (tmp_path / "b.pdf").read_bytes() == (tmp_path / "c.pdf").read_bytes()
     assert_rejected(armsight("body", "draw", "dartboard:3:4", "-o", tmp_path / "d.pdf"), "unknown board", "chessboard:")
+    meant = armsight("body", "draw", "chesboard:9x6:20mm", "-o", tmp_path / "d.pdf")
+    assert_rejected(meant, "unknown board 'chesboard:9x6:20mm'; did you mean chessboard:COLUMNSxROWS:SQUARE")
+    assert "charuco" not in meant.err
 
 
 def test_a_board_and_a_body_are_one_print(armsight, tmp_path):

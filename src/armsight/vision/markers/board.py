@@ -6,6 +6,7 @@ To add a kind of board: write one file with a class that fulfils :class:`Calibra
 from __future__ import annotations
 
 from collections.abc import Callable
+from difflib import get_close_matches
 from functools import partial
 from pathlib import Path
 
@@ -110,6 +111,8 @@ def open_board(spec: str | Path) -> CalibrationBoard:
         spec = kalibr_spec(spec)
     kind, *values = spec.strip().split(":")
     if kind not in BOARDS:
-        raise InputError(f"unknown board {spec!r}; known are {'; '.join(form for form, _ in BOARDS.values())}")
+        near = get_close_matches(kind, BOARDS, 1)
+        forms = "; ".join(BOARDS[each][0] for each in near or BOARDS)
+        raise InputError(f"unknown board {spec!r}; {'did you mean' if near else 'known are'} {forms}")
     form, make = BOARDS[kind]
     return make(Fields(spec, form, tuple(values)))

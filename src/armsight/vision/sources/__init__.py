@@ -73,6 +73,8 @@ def check_source(spec: str) -> None:
         hint = ""
         if "://" in spec or spec.startswith("/dev/video"):
             hint = f" ({'url' if '://' in spec else 'usb'}:LEFT,RIGHT?)"
+        elif spec.replace(",", "").isdecimal():
+            hint = f" (usb:{spec}?)"
         elif os.path.isfile(os.path.expanduser(spec)):
             from armsight.vision.sources.bag.reader import SUFFIXES
 
