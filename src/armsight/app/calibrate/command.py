@@ -53,8 +53,8 @@ def command(o: CalibrateOptions) -> int:
     """Calibrate two cameras, and evaluate the calibration on pairs held out of the fit.
 
     From images of a board; from a recording of one that moves before cameras that may not expose at one time; or from
-    detections of a known body with known intrinsics. Exit code 3: the images contradict each other, and the rig must not
-    be used.
+    detections of a known body with known intrinsics. Exit code 3: the images contradict each other, or the grade is poor:
+    the rig must not be used.
     """
     images = not o.source.startswith(DETECTIONS)
     if images == (o.cameras is not None):
@@ -66,6 +66,7 @@ def command(o: CalibrateOptions) -> int:
     if o.alone is not None and not images:
         raise InputError("--alone goes with images of a board")
 
+    from armsight.app.calibrate.assessment import assess
     from armsight.app.calibrate.report import REPORT_FILES, calibration_report
     from armsight.app.calibrate.run import GivenDetections, GivenImages, provenance
     from armsight.app.show.plotting import require_matplotlib
@@ -97,4 +98,4 @@ def command(o: CalibrateOptions) -> int:
     if o.report is not None:
         found.write(o.report)
     found.echo(as_json=o.as_json)
-    return UNTRUSTED if contradicted(calibration) else 0
+    return UNTRUSTED if contradicted(calibration) or assess(calibration).grade == "poor" else 0

@@ -60,7 +60,8 @@ def handeye_report(run: HandEyeAnswer) -> Report:
     worst = out[np.argsort(-found.distance[out])]
     blunders = [f"{names_[k]}: {np.sqrt(found.distance[k]):.0f} sigma from the others" for k in worst]
     why = _untrusted(run)
-    decided = [Note("weak", said.removeprefix("; "))] if (said := found.decided_by(names_)) else []
+    remarks = found.changed_at(names_), found.decided_by(names_).removeprefix("; ")
+    decided = [Note("weak", each) for each in remarks if each]
     values = {
         **found.to_dict(),
         "untrusted": why,

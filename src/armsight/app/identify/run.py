@@ -11,7 +11,7 @@ from armsight.data import Array, Record
 from armsight.errors import CalibrationError, noted
 from armsight.loop.identify.identify import ALIKE, Identified, Validation
 from armsight.loop.identify.measured import Measured
-from armsight.loop.identify.misread import find_step, without_tool
+from armsight.loop.identify.selection import change_text
 from armsight.loop.identify.validate import check_other, identify_held_out
 from armsight.robot.kinematics.arm import Arm
 
@@ -81,10 +81,13 @@ def _notes(arm: Arm, found: Identified, measured: Measured, lines: Array) -> lis
         shown = ", ".join(f"{lines[k]:.0f}" for k in found.left_out[:8]) + (", .." if len(found.left_out) > 8 else "")
         poses = f"{len(found.left_out)} pose{'s' if len(found.left_out) > 1 else ''}"
         notes.append(f"{poses} taken for mistakes and left out: line {shown}")
-    if measured.length_m is None and (step := find_step(without_tool(arm), measured)) is not None:
+    if (change := found.change) is not None:
+        what = change_text(found.model, change) + (
+            "" if change.sure else ", or the model lacks what depends on the pose"
+        )
         notes.append(
-            f"from line {lines[step.row]:.0f} on the poses seem to be of another state: {step.text} (off by "
-            f"{1e3 * step.before:.1f} mm together, {1e3 * step.left:.1f} mm so); identify from one of both parts"
+            f"from line {lines[change.row]:.0f} on the poses are of another state: {what}; the arm is of neither, "
+            "and its sigmas allow for that: identify from one of both parts, and give the other by --validate"
         )
     numbers, parameters = len(measured) * measured.size, len(found.model.nominal())
     if numbers < 3 * parameters:

@@ -255,7 +255,7 @@ def _errors_after_m(run: HandEyeRun, Ts_base_flange: Array) -> Array:
     """Return (C,) the predicted error after one more of the poses (C, 4, 4) of the flange, m."""
     covs = np.tile(run.covs.mean(axis=0), (len(Ts_base_flange), 1, 1))
     poses = Poses(Ts_base_flange, run.found.predict(Ts_base_flange), covs, False, np.zeros(3))
-    known = np.linalg.inv(run.found.cov) + (J := run.found.whitened(poses)).swapaxes(1, 2) @ J
+    known = np.linalg.inv(run.found.cov) + (J := run.found.whitened(poses)[1]).swapaxes(1, 2) @ J
     return _errors_m(run, np.asarray(np.linalg.inv(known), float))
 
 

@@ -31,6 +31,7 @@ from scipy.special import chdtri, expit, fdtri
 from armsight.data import Array, Record
 from armsight.errors import CalibrationError, InputError, noted, require
 from armsight.estimate.chance import squares_of
+from armsight.estimate.change import StateChange, changed, matters, robust
 from armsight.estimate.linear import Linear
 from armsight.estimate.solve import Solved, covariances, left_out, log_density, solve
 from armsight.estimate.variance import SPEAKS, integrate, most_probable, posterior, scores
@@ -138,6 +139,8 @@ class HandEye(Record):
         common: (K,) the errors that all poses share (``Poses.common``), as found, in sigmas.
         common_m: what they move the body's middle by, RMS of the distance, m.
         leverage: (N,) by which factor a sigma grows where that pose is left out, the worst direction's; 1 unused.
+        change: how what stands still, or what is held, was displaced while the poses were taken, which ``cov`` allows
+            for; None where neither was.
     """
 
     eye: Eye
@@ -162,6 +165,7 @@ class HandEye(Record):
     common: Array
     common_m: float
     leverage: Array
+    change: StateChange | None = None
 
     def __repr__(self) -> str:
         """Return the error on poses left out of the fit, and both translations with one sigma, mm."""
@@ -172,7 +176,8 @@ class HandEye(Record):
             shown.append(f"{name} at {', '.join(f'{x:.2f} +- {sigma:.2f}' for x, sigma in both)} mm")
         return (
             f"HandEye({self.eye}, {int(self.used.sum())} of {len(self.used)} poses; held out {1e3 * position_m:.3f} mm "
-            f"RMS, {np.degrees(angle_rad):.3f} deg; {'; '.join(shown)}{self.decided_by()})"
+            f"RMS, {np.degrees(angle_rad):.3f} deg; {'; '.join(shown)}{self.decided_by()}"
+            f"{'; ' * (self.change is not None)}{self.changed_at()})"
         )
 
     def decided_by(self, names: Sequence[str] = ()) -> str:
@@ -182,6 +187,21 @@ class HandEye(Record):
             return ""
         size = "undetermined" if self.leverage[k] > UNDETERMINED else f"{self.leverage[k]:.0f} times less certain"
         return f"; one pose decides: without {names[k] if names else f'pose {k}'} a direction is {size}"
+
+    def changed_at(self, names: Sequence[str] = ()) -> str:
+        """Return a remark where something was displaced between two poses, by name or number; empty where not."""
+        if self.change is None:
+            return ""
+        to_hand = {"still": "the rig, or the robot's base,", "held": "the body on the flange"}
+        in_hand = {"still": "the body, or the robot's base,", "held": "the rig on the flange"}
+        step, row = self.change.step[self.change.columns], self.change.row
+        first = names[row] if names else f"pose {row}"
+        unsure = "" if self.change.sure else ", or arm or rig are off by what depends on the pose"
+        return (
+            f"from {first} on {(in_hand if self.eye == 'in_hand' else to_hand)[self.change.way]} stands elsewhere, by "
+            f"{1e3 * np.linalg.norm(step[:3]):.1f} mm and {np.degrees(np.linalg.norm(step[3:])):.2f} deg{unsure}; the "
+            "transforms are of neither state, and their sigmas allow for that: use one of both parts"
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Return the transforms, their covariance and the errors on poses left out, as lists and numbers, SI units."""
@@ -237,14 +257,15 @@ class HandEye(Record):
         """Error of the flange by the joints from pose to pose: sigmas along one axis, m, and about one, rad."""
         return self.sigmas.get("flange_m", 0.0), self.sigmas.get("flange_rad", 0.0)
 
-    def whitened(self, poses: Poses) -> Array:
-        """Return the derivative (N, 6, 12) of further poses by the right tangents, over the root of their covariance."""
+    def whitened(self, poses: Poses) -> tuple[Array, Array]:
+        """Return residuals (N, 6) of poses over the root of their covariance, and their derivative (N, 6, 12)."""
         e, J, carry = residuals(poses, self.T_base_still, self.T_flange_held)
         maps, C = error_maps(poses, 0 * e, carry, None), poses.cov + np.diag(np.repeat([LEAST_M**2, LEAST_RAD**2], 3))
         for name, sigma in self.sigmas.items():
             if (M := maps.get(MAP_OF.get(name, name))) is not None:
                 C = C + sigma**2 * M @ np.swapaxes(M, 1, 2)
-        return np.asarray(np.linalg.inv(np.linalg.cholesky(C)) @ J)
+        half = np.linalg.inv(np.linalg.cholesky(C))
+        return (half @ e[..., None])[..., 0], half @ J
 
     def predict(self, Ts_base_flange: Array) -> Array:
         """Return T_rig_body (..., 4, 4) at poses of the flange (..., 4, 4)."""
@@ -438,7 +459,22 @@ def calibrate_poses(
     left = {name: getattr(found, name) for name in ("held_out", "held_out_nominal", "held_out_geometry")}
     as_given: dict[str, Any] = {name: None if each is None else each.rows(back) for name, each in left.items()}
     as_given |= {name: getattr(found, name)[back] for name in ("used", "distance", "leverage")}
+    if not quick and (change := _change(found, poses)) is not None:
+        as_given |= {"change": change, "cov": found.cov + change.off.T @ change.off}
     return replace(found, **as_given)
+
+
+def _change(found: HandEye, poses: Poses) -> StateChange | None:
+    """Return how what stands still, or is held, was displaced in the order of the poses; None where sources walk, too."""
+    if not _TIMED.isdisjoint(found.sigmas):
+        return None
+    poses, ways = poses if poses.common is None else poses.corrected(found.common), np.arange(12).reshape(2, 6)
+    B = poses.B.copy()
+    B[:, :3, 3] *= found.scale
+    e, J = robust(*found.whitened(replace(poses, B=B)))
+    by_pose = log_se3(inverse(mean_pose(poses.A)) @ poses.A)
+    change = changed(-e, J, dict(zip(("still", "held"), ways, strict=True)), by_pose)
+    return change if change is not None and matters(change.off, found.cov, 6) else None
 
 
 def evenly(rows: NDArray[np.int64], most: int) -> NDArray[np.int64]:
@@ -744,7 +780,7 @@ def _weighed(
 
 def _leverage(found: HandEye, poses: Poses) -> Array:
     """Return by which factor the sigma of some direction grows without each pose (N,): of the hat matrix (Belsley 1980)."""
-    J = found.whitened(poses) * found.used[:, None, None]
+    J = found.whitened(poses)[1] * found.used[:, None, None]
     share = np.linalg.eigvalsh(J @ np.linalg.pinv(np.einsum("nij,nik->jk", J, J)) @ np.swapaxes(J, 1, 2))[:, -1]
     return np.asarray(1 / np.sqrt(np.maximum(1 - share, UNDETERMINED**-2 / 4)))
 

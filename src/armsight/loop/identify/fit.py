@@ -136,7 +136,7 @@ def fit(
     ``noise``: to start from; None: from the residuals at the start.
     """
     phi = model.feature_values(measured.q, measured.approach)
-    noise = _robust_noise(model.residuals(x, measured, phi)) if noise is None else noise
+    noise = robust_noise(model.residuals(x, measured, phi)) if noise is None else noise
     keep = _sane(model, x, measured, phi, noise) if used is None else used
     history: list[float] = []
 
@@ -159,7 +159,7 @@ def fit(
         taken = len(s.x) - float(linear.known @ (s.root**2).sum(axis=1))  # parameters, less what priors determine
         if linear.e.size - taken >= MIN_FREEDOM * linear.e.size:
             # What is not there shrinks; from far below the residuals nothing would grow.
-            start = np.fmax(noise, _robust_noise(linear.e))
+            start = np.fmax(noise, robust_noise(linear.e))
             sigmas = np.sqrt(restricted(linear, np.square(start[: len(linear.own)]), MIN_NOISE, MAX_NOISE))
             noise = (float(sigmas[0]), float(sigmas[1]) if len(sigmas) > 1 else 0.0)
         kept, keep = keep, (_sane(model, x, measured, phi, noise) if used is None else keep)
@@ -183,7 +183,7 @@ def _spread(s: Solved, free: Mask) -> Array:
     return cov
 
 
-def _robust_noise(e: Array) -> tuple[float, float]:
+def robust_noise(e: Array) -> tuple[float, float]:
     """Return sigmas along one axis from median residuals."""
     if e.shape[1] == 1:
         return max(float(np.median(np.abs(e)) / np.sqrt(chdtri(1, 0.5))), MIN_NOISE), MIN_NOISE

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from armsight.data import Array, Record
 from armsight.errors import CalibrationError, InputError, nearest
+from armsight.estimate.change import StateChange
 from armsight.geometry.pose import left_jacobian
 from armsight.loop.identify.fit import Mask, Solution, covariance, fit, joint_noise, prior_sigma, with_joint_noise
 from armsight.loop.identify.measured import Measured
@@ -106,6 +107,8 @@ class Identified(Record):
             not known, because the joints' and the instrument's share cannot be separated then.
         held_out: how it does on poses left out; None where none were.
         notes: what a person should know, such as why none were.
+        change: how base, tool or a joint's zero changed while the poses were taken, which ``cov`` allows for; None where
+            they did not.
     """
 
     model: Model
@@ -121,6 +124,7 @@ class Identified(Record):
     joint_sigma_rad: Array
     held_out: LeftOut | None = None
     notes: tuple[str, ...] = ()
+    change: StateChange | None = None
 
     def __repr__(self) -> str:
         """Return how many numbers were fitted, and from how many poses."""

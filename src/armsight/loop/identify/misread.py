@@ -17,19 +17,20 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import orth
-from scipy.special import fdtrc
 
 from armsight.data import Array
 from armsight.errors import CalibrationError, InputError
+from armsight.estimate.change import StateChange
 from armsight.geometry.pose import inverse, log_se3, mean_pose
 from armsight.geometry.rotation import log_so3, nearest_rotation
 from armsight.loop.handeye.handeye import CONTRADICTS, evenly, rotations_of, scale_between
 from armsight.loop.handeye.poses import LEVER_M, Poses, kronecker, residuals, starts
 from armsight.loop.handeye.recording import PairedPoses
-from armsight.loop.identify.fit import SIGMA
+from armsight.loop.identify.fit import SIGMA, prior_sigma, robust_noise
 from armsight.loop.identify.measured import Measured
-from armsight.loop.identify.placement import linear_placement, rigid_placement
+from armsight.loop.identify.model import Model
+from armsight.loop.identify.placement import linear_placement, rigid_placement, with_placement
+from armsight.loop.identify.selection import PLACEMENT, change_at, change_text
 from armsight.robot.kinematics import chain
 from armsight.robot.kinematics.arm import Arm
 from armsight.robot.models import MODELS
@@ -476,10 +477,7 @@ SCALE_OFF = 0.2  # a scale off by more than this is a unit
 BAD_RAD = 2 * np.sqrt(6) * np.hypot(SIGMA["offset"], SIGMA["alpha"])
 #: Poses looked at, those that every order and sign is tried on, and the fewest that shifted rows do not fit by chance.
 POSES, FEW, FEWEST = 80, 24, 12
-#: Poses on either side of a step, RMS of what is looked into, m, and length of a body's axes, m.
-FEWEST_A_PART, LEAST_M, AXES_M = 6, 2e-4, 0.1
-SIMPLER = 1.2  # one joint is preferred to the whole base where it explains all but this many times as well
-CHANCE = 1e-8  # a step is one where chance explains as much with this probability at most, by one row and one joint
+LEAST_M = 2e-4  # RMS, m, from which a change makes poses useless; half: of a fine tracker, too, double: 0.3 mm do not
 MAX_JOINT_ORDERS = 40  # orders whose signs are tried, best first
 _SCALES = {1e-3: "m, not mm", 1e3: "mm, not m", 1e-1: "dm or cm", 10.0: "cm", 1 / 25.4: "inches", 25.4: "inches"}
 
@@ -553,11 +551,12 @@ def check_plausible(arm: Arm, measured: Measured) -> None:
     good = at.right < (limit if at.sized else max(limit, BAD_M * at.scale))
     if good and at.sized:
         _check_rotations(arm, measured, rows)
-        step = find_step(arm, measured)
-        if step is not None and step.left < step.before / CLEAR:  # the poses cannot be taken together
+        found = placed_change(arm, measured)
+        if found is not None and found[1].sure and found[1].left < found[1].before / CLEAR:
+            model, change = found
             raise InputError(
-                f"the first {step.row} poses and those from there on are of different states (off by "
-                f"{1e3 * step.before:.1f} mm together, {1e3 * step.left:.1f} mm so): {step.text}; use one of both parts"
+                f"the first {change.row} poses and those from there on are of different states, which fit "
+                f"{change.before / change.left:.1f} times as well: {change_text(model, change)}; use one of both parts"
             )
         return
     for q_read, p_read, said in _readings_of(measured, rows):
@@ -683,70 +682,20 @@ def _fitting(arm: Arm, q: Array, p: Array, tried: list[Mistakes], limit: float) 
     return sorted((m for m in every if best <= limit and m.off < CLEAR * best), key=lambda m: (m.number, m.off))
 
 
-class Step(NamedTuple):
-    """A change of state between two poses."""
+def placed_change(arm: Arm, measured: Measured) -> tuple[Model, StateChange] | None:
+    """Return how base, tool or a joint's zero changed in the order of the rows, and the model it is of.
 
-    row: int  #: the first pose after it, in the order of the rows
-    text: str  #: what changed
-    before: float  #: RMS of the points off the arm without it, m
-    left: float  #: the same with it, m
-
-
-def find_step(arm: Arm, measured: Measured) -> Step | None:
-    """Return the pose from which on a joint's zero, or the base, is another, in the order of the rows; None without.
-
-    Base, tool and zeros are fitted to all, linearised; then the step that explains most is looked for. It must explain
-    twice what steps explain where the poses are ordered by a joint's angle: those show what else is wrong with the arm.
+    Base, tool and zeros are fitted to all, linearised; None where one state of them fits all.
     """
     rows = np.linspace(0, len(measured) - 1, min(POSES, len(measured))).astype(int)
-    if len(rows) < 2 * FEWEST_A_PART:
+    model, x = with_placement(Model.of(arm, measured, backlash=False).with_features(()), measured.rows(rows))
+    free = np.array([p.kind in (*PLACEMENT, "offset") for p in model.parameters])
+    part = replace(measured.rows(rows), cov=None)
+    noise = robust_noise(model.residuals(x, part))
+    change = change_at(model, x, part, free, prior_sigma(model), noise)
+    if change is None or change.before * noise[0] < LEAST_M:
         return None
-    q, p = measured.q[rows], measured.p_rig[rows]
-    if measured.R_rig_body is not None:
-        p = np.concatenate([p, p + AXES_M * measured.R_rig_body[rows].swapaxes(1, 2)], axis=1)
-    n, K = p.shape[:2]
-    T = arm.forward(q)
-    M, _, t, _ = rigid_placement(T[:, :3, :3], T[:, :3, 3], p)
-    here, there = p @ M.T, _points(T, t)
-    here += (there - here).mean(axis=(0, 1))
-    J, arms = arm.jacobian(q)[:, None], there - T[:, None, :3, 3]
-    joints = [J[..., :3, j] + np.cross(J[..., 3:, j], arms) for j in range(arm.joints)]
-    base = [*np.broadcast_to(np.eye(3)[:, None, None], (3, n, K, 3)), *(np.cross(axis, here) for axis in np.eye(3))]
-    tool = [np.eye(K)[k][:, None] * T[:, None, :3, i] for k in range(K) for i in range(3)]
-    common = np.stack([*base, *tool, *joints]).reshape(-1, n * K * 3).T
-    Q = orth(common / np.maximum(np.linalg.norm(common, axis=0), 1e-12), rcond=1e-6)
-    e = (here - there).ravel()
-    e -= Q @ (Q.T @ e)
-    total = float(e @ e)
-    if np.sqrt(total / (n * K)) < LEAST_M:
-        return None
-
-    def explained(ways: list[Array], order: Rows) -> tuple[float, int, Array]:
-        best = (0.0, 0, np.zeros(len(ways)))
-        for at in range(FEWEST_A_PART, n - FEWEST_A_PART + 1):
-            after = np.isin(np.arange(n), order[at:])[:, None, None]
-            C = np.stack([np.where(after, way, 0.0) for way in ways]).reshape(len(ways), -1).T
-            C -= Q @ (Q.T @ C)
-            x = np.linalg.lstsq(C, e, rcond=1e-6)[0]
-            best = max(best, (float(e @ C @ x), at, x), key=lambda one: one[0])
-        return best
-
-    steps = [explained([joint], np.arange(n)) for joint in joints]
-    joint = max(range(arm.joints), key=lambda k: steps[k][0])
-    whole = explained(base, np.arange(n))
-    one = total - steps[joint][0] < SIMPLER**2 * (total - whole[0])
-    (by, at, x), ways = (steps[joint], [joints[joint]]) if one else (whole, base)
-    free = n * min(3 * K, 6) - Q.shape[1] - len(x)
-    if fdtrc(len(x), free, by / len(x) / (total - by) * free) > CHANCE:
-        return None
-    if any(2 * explained(ways, np.argsort(angles))[0] > by for angles in q.T):
-        return None
-    text = "the base, or the instrument, was displaced"
-    if one:
-        text = f"the zero of joint {joint + 1} changed by {np.degrees(x[0]):+.2f} deg (it slipped, or lost steps)"
-        text += ", or the base was rotated" if joint == 0 else ""
-    before, left = (float(np.sqrt(squares / (n * K))) for squares in (total, total - by))
-    return Step(int(rows[at]), text, before, left)
+    return model, replace(change, row=int(rows[change.row]))
 
 
 def _points(T: Array, t: Array) -> Array:

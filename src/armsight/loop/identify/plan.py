@@ -390,7 +390,7 @@ def plan_mounting(found: HandEye, poses: Poses, count: int) -> MountingPlan:
     within its space, a fifth more, and the target within the part of the image and the distances in which it was seen.
     """
     A, B = _near(found, poses.rows(found.used), np.random.default_rng(0))
-    J = found.whitened(Poses(A, B, np.tile(poses.cov.mean(axis=0), (len(A), 1, 1)), poses.in_hand, poses.centre))
+    J = found.whitened(Poses(A, B, np.tile(poses.cov.mean(axis=0), (len(A), 1, 1)), poses.in_hand, poses.centre))[1]
     chosen, _ = greedy(J, found.cov, np.diag(np.concatenate([np.zeros(6), np.repeat([1.0, LEVER_M], 3)])), count)
     informations = np.cumsum(J[chosen].swapaxes(1, 2) @ J[chosen], axis=0)
     covs = [found.cov, *np.linalg.inv(np.linalg.inv(found.cov) + informations)]

@@ -23,8 +23,9 @@ from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
 
 from armsight.data import Array
+from armsight.estimate.change import StateChange, changed, robust
 from armsight.estimate.select import Folds, Mask, Removal
-from armsight.estimate.solve import condensed, solve
+from armsight.estimate.solve import condensed, solve, whitened
 from armsight.estimate.variance import restricted
 from armsight.loop.identify.fit import Solution, linear_of, variances_of
 from armsight.loop.identify.measured import Measured, visits
@@ -261,3 +262,34 @@ def _not_improving(losses_with: Array, folds: Folds, rms: float) -> str:
     text = f"falls by {-100 * change:.2g} %, no more than chance" if change < 0 else f"rises by {100 * change:.2g} %"
     text = text if abs(change) > 1e-6 else "stays as it is"
     return f"not selected: with it the held-out error {text}"
+
+
+def change_at(
+    model: Model, x: Array, measured: Measured, free: Mask, prior: Array, noise: tuple[float, float]
+) -> StateChange | None:
+    """Return how the arm's state changed, in the order of the rows; its unknowns are all parameters (P,).
+
+    ``free``: (P,) what may be off. ``noise``: beyond the covariance given.
+    """
+    linear = linear_of(model, x, measured, free, prior)
+    e, J = robust(*whitened(linear, variances_of(linear, noise)))
+    column, ways = np.cumsum(free) - 1, dict[str, list[int]]()
+    for k in np.flatnonzero(free):
+        p = model.parameters[k]
+        if p.kind in (*PLACEMENT, "offset"):
+            ways.setdefault(p.kind if p.kind in PLACEMENT else p.name, []).append(int(column[k]))
+    found = changed(-e, J, {name: np.array(columns) for name, columns in ways.items()}, measured.q, known=linear.known)
+    return None if found is None else found.over_all(free)
+
+
+def change_text(model: Model, change: StateChange) -> str:
+    """Return what changed, by how much."""
+    step = change.step[[k for k, p in enumerate(model.parameters) if change.way in (p.kind, p.name)]]
+    if change.way not in PLACEMENT:
+        joint = change.way.removeprefix("offset")
+        said = f"the zero of joint {joint} changed by {np.degrees(step[0]):+.2f} deg (it slipped, or lost steps)"
+        return said + (", or the base was rotated" if joint == "1" else "")
+    whose = "the base, or the instrument," if change.way == "base" else "the tool, or what is seen of it,"
+    size = f"{1e3 * np.linalg.norm(step[:3]):.1f} mm"
+    size += f" and {np.degrees(np.linalg.norm(step[3:])):.2f} deg" if model.full or change.way == "base" else ""
+    return f"{whose} was displaced by {size}"

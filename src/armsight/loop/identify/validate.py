@@ -14,6 +14,7 @@ from scipy.special import chdtri
 
 from armsight.data import Array
 from armsight.errors import CalibrationError, InputError, noted, require
+from armsight.estimate.change import matters
 from armsight.estimate.solve import covariances
 from armsight.loop.identify.fit import fit, linear_of, variances_of, with_joint_noise
 from armsight.loop.identify.identify import Errors, Identified, LeftOut, Validation, identify
@@ -21,7 +22,7 @@ from armsight.loop.identify.measured import Measured, Read, measured_of, visits
 from armsight.loop.identify.misread import check_plausible, without_tool
 from armsight.loop.identify.model import Model
 from armsight.loop.identify.placement import with_placement
-from armsight.loop.identify.selection import PLACEMENT
+from armsight.loop.identify.selection import PLACEMENT, change_at, change_text
 from armsight.robot.kinematics.arm import Arm
 
 OTHER = 5.0  # another set-up: the error is this many times that with base and tool fitted again,
@@ -148,7 +149,9 @@ def identify_held_out(
             held_out = _left_out(arm, measured.rows(found.solution.used), priors, progress)
         except (InputError, CalibrationError) as error:  # the whole was identified: its parts are too small
             why = f"no pose was left out, and the sigmas are the fit's own, not scaled: {error}"
-            return replace(found, notes=(*found.notes, f"{why}, without a fifth of {len(measured)}"))
+            return with_change_allowed(
+                replace(found, notes=(*found.notes, f"{why}, without a fifth of {len(measured)}")), measured
+            )
         apart = f", {len(found.left_out)} taken for mistakes apart" if len(found.left_out) else ""
     else:
         held_out = LeftOut(validate(found, other), other.q, f"{len(other)} poses of another file")
@@ -156,7 +159,20 @@ def identify_held_out(
     over, numbers = held_out.validation.residual_over_predicted, len(held_out.q) * measured.size
     scale = over if over**2 > chdtri(numbers, TOO_SMALL) / numbers else 1.0
     held_out = held_out._replace(how=held_out.how + apart, scale=scale)
-    return replace(found, cov=scale**2 * found.cov, held_out=held_out)
+    return with_change_allowed(replace(found, cov=scale**2 * found.cov, held_out=held_out), measured)
+
+
+def with_change_allowed(found: Identified, measured: Measured) -> Identified:
+    """Return an identified arm whose covariance allows for a change of state among its poses, which it names."""
+    free = np.diag(found.cov_everything) > 0
+    weighted = with_joint_noise(found.model, found.solution.x, measured, found.joint_sigma_rad)
+    change = change_at(found.model, found.solution.x, weighted, free, found.prior, found.solution.noise)
+    fitted = found.solution.free
+    if change is None or not matters(change.off[:, fitted], found.cov[np.ix_(fitted, fitted)], len(change.columns)):
+        return found
+    off = np.where(fitted, change.off, 0.0)
+    note = f"from pose {change.row} on {change_text(found.model, change)}: the sigmas allow for it"
+    return replace(found, cov=found.cov + off.T @ off, change=change, notes=(*found.notes, note))
 
 
 def check_other(arm: Arm, measured: Measured, other: Measured, name: str) -> None:

@@ -191,4 +191,5 @@ def _bad_pairs(
         elif len(common) < LEAST_CORNERS and np.ptp(observations.camera[mine]) > 0:
             bad[int(j)] = f"only {len(common)} corners are good in both images, {LEAST_CORNERS} are needed"
     worst = max(level.values(), default=0.0)
-    return {j: reason for j, reason in bad.items() if level[j] > worst / 3 or level[j] <= PAIR_RATIO * usual}
+    empty = set(kept) - set(observations.shot[good].tolist())
+    return {j: why for j, why in bad.items() if j in empty or level[j] > worst / 3 or level[j] <= PAIR_RATIO * usual}

@@ -8,6 +8,7 @@ from numpy.polynomial.chebyshev import chebvander2d
 from armsight.data import Array
 from armsight.errors import CalibrationError
 from armsight.estimate.chance import chi_square_limit
+from armsight.files import natural_key
 from armsight.vision.calibrate.motion import ExposureMotion
 from armsight.vision.calibrate.result import Calibration, corner_variance_px2
 
@@ -101,7 +102,12 @@ def _pairs(calibration: Calibration) -> str | None:
         hidden = ", and one whose board moved between the images may go unnoticed" if used < _TESTED else ""
         return f"only {used} pairs were used{hidden}: take {_GOOD_PAIRS} or more, near and far and tilted every way"
     if used < (1 - _REJECTED_SHARE) * found:
-        return f"{found - used} of {found} pairs were rejected: see the reasons; hold the board still for every shot"
+        said = f"{found - used} of {found} pairs were rejected: "
+        parts = calibration.pairs, {each.pair for each in calibration.rejected} - set(calibration.pairs)
+        first, last = sorted(sorted(map(natural_key, part)) for part in parts)
+        if first and first[-1] < last[0]:
+            said += "all on one side of the others in their order: did board or cameras change there? Else "
+        return f"{said}see the reasons; hold the board still for every shot"
     return None
 
 
