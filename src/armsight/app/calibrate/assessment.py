@@ -164,7 +164,7 @@ def graded_metrics(calibration: Calibration) -> tuple[GradedMetric, ...]:
     large = max(1.0, max(max(camera.image_size_px) for camera in c.rig.cameras) / LARGE_PX)
     epipolar = (large * EPIPOLAR_PX[0], large * EPIPOLAR_PX[1])
     overfit = h.epipolar_rms_px / fit if fit > 0 else 1.0
-    honesty = max(h.normalised_rms, 1 / h.normalised_rms) if h.normalised_rms > 0 else math.inf
+    honesty = max(h.normalised_rms, 1 / h.normalised_rms) if h.normalised_rms > 0 else math.nan
     rescaled = c.rig.sigma_px / before if before > 0 else 1.0
     by_print = f"It includes the {deviation_mm:.2g} mm by which the {what} itself differs from its drawing. "
     multiplied = f" All sigmas of this rig have been multiplied by {rescaled:.2f} to match."
