@@ -20,8 +20,7 @@ from armsight.geometry.pose import inverse, transform
 from armsight.geometry.rigid import fit_rigid, fit_scale
 from armsight.geometry.rotation import skew
 from armsight.vision.calibrate import MODELS
-from armsight.vision.calibrate.change import change_of
-from armsight.vision.calibrate.motion import ExposureMotion
+from armsight.vision.calibrate.motion import ExposureMotion, change_of
 from armsight.vision.calibrate.result import LEAST_SIGMA_PX, Calibration, HeldOutErrors, PairErrors, RejectedPair
 from armsight.vision.calibrate.screen import noise_px
 from armsight.vision.calibrate.weak import weaknesses

@@ -5,6 +5,8 @@ and large for a few: normal with a variance of the pair's own, whose inverse is 
 of Student's t distribution (Lange, Little and Taylor, "Robust statistical modeling using the t distribution", 1989).
 Scale and weights are found by EM, with MacKay's step for the scale, which reaches zero where nothing moves. A pair that
 moved far pulls less on the relative pose of the cameras, and none on what is inside them.
+
+And whether the cameras changed between two pairs (:func:`change_of`): refocused, zoomed, cropped, shifted, knocked.
 """
 
 from __future__ import annotations
@@ -15,9 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array, Record
-from armsight.geometry.pose import transform
+from armsight.estimate.change import changed, matters
+from armsight.geometry.pose import inverse, transform
 from armsight.geometry.rotation import skew
-from armsight.vision.pose.bundle import BundleSolution
+from armsight.vision.pose.bundle import CAUCHY_SCALE, BundleSolution, whiteners
+from armsight.vision.pose.projection import BundleModel, Observations, predict
+from armsight.vision.rig import StereoRig
+from armsight.vision.triangulate import optimal_points
 
 #: Degrees of freedom of the motions' distribution: four leave the variance finite, and let one pair move five times as
 #: far as the rest.
@@ -86,3 +92,85 @@ class ExposureMotion(Record):
         scales = np.maximum(np.sqrt(moved / np.maximum(freed, 1e-3)), _LEAST)
         rms = np.sqrt((estimate + unsure).reshape(-1, 2, 3).mean(axis=(0, 2)))
         return ExposureMotion(scales, weights, rms), float(freed.sum())
+
+
+@dataclass(frozen=True, eq=False)
+class CameraChange(Record):
+    """What changed in the cameras between two pairs."""
+
+    row: int  #: the first pair after it
+    what: str  #: the part that changed, and by how much: "the right focal length by +1.0 %"; empty: or the lens model
+    off: Array  #: (2, P) the rig's parameters before and after it less those of the fit to all pairs
+    shift_m: float  #: by how much it displaces the points that the pairs measured, median, m
+
+
+def _condensed(
+    model: BundleModel, solution: BundleSolution, seen: Observations, free: NDArray[np.bool_]
+) -> tuple[Array, Array]:
+    """Return P + 1 residuals of each shot, (S, P + 1), that say all it says of the rig, and their derivative.
+
+    They are whitened, and by the P free parameters of the rig; the shot's own are eliminated.
+    """
+    uv, by_shared, by_own = predict(model, solution.state, seen)
+    W, count = whiteners(seen, solution.sigma_px), by_shared.shape[2] - len(model.modes)
+    white = (W @ (seen.uv - uv)[..., None])[..., 0]
+    weigh = 1.0 / np.sqrt(1.0 + np.einsum("ni,ni->n", white, white) / CAUCHY_SCALE**2)[:, None]
+    J = np.concatenate([W @ by_own, W @ by_shared[:, :, :count], white[..., None]], axis=2) * weigh[..., None]
+    own, total = by_own.shape[2], np.empty((seen.shot_count, J.shape[2], J.shape[2]))
+    for shot in range(seen.shot_count):
+        rows = J[seen.shot == shot].reshape(-1, J.shape[2])
+        total[shot] = rows.T @ rows
+    if own > 6:  # the motion between the exposures has a prior
+        still, ours = model.motion_sigmas**-2.0, np.arange(6, own)
+        total[:, ours, ours] += still
+        pull = still * solution.state.motions
+        total[:, ours, -1] -= pull
+        total[:, -1, ours] -= pull
+        total[:, -1, -1] += (pull * solution.state.motions).sum(axis=1)
+    left = total[:, own:, own:] - total[:, own:, :own] @ np.linalg.solve(total[:, :own, :own], total[:, :own, own:])
+    kept = np.append(free, True)
+    left = left[:, kept][:, :, kept]
+    unit = 1 / np.sqrt(np.maximum(np.einsum("sii->i", left), 1e-300))
+    values, axes = np.linalg.eigh(unit[:, None] * left * unit)
+    rows = np.sqrt(np.maximum(values, 0.0))[..., None] * axes.swapaxes(1, 2) / unit
+    return rows[:, :, -1], rows[:, :, :-1]
+
+
+def change_of(
+    model: BundleModel, solution: BundleSolution, seen: Observations, rig: StereoRig, pairs: int
+) -> CameraChange | None:
+    """Return how the cameras changed among the first ``pairs`` shots; later ones are of one camera alone."""
+    count = rig.left.parameters.size
+    left, right, both = np.arange(2), count + np.arange(2), np.array([0, 1, count, count + 1])
+    focal = {"the left focal length": left, "the right focal length": right, "both focal lengths": both}
+    names = "the left image's position", "the right image's position", "the positions of both images"
+    named = focal | dict(zip(names, (left + 2, right + 2, both + 2), strict=True))
+    named["the relative pose of the cameras"] = np.arange(len(rig.cov) - 6, len(rig.cov))
+    free = np.diag(rig.cov) > 0
+    column_of, named = np.cumsum(free) - 1, {name: p for name, p in named.items() if free[p].all()}
+    ways = {name: column_of[p] for name, p in named.items()}
+    middle = transform(solution.state.Ts_left_body, model.body(np.zeros(len(model.modes))).mean(axis=0))
+    sight = middle[:, :2] / middle[:, 2:]
+    off_axis = np.linalg.norm(sight - sight[:pairs].mean(axis=0), axis=1)
+    poses = np.column_stack([sight, np.log(middle[:, 2]), solution.state.Ts_left_body[:, :2, 2], off_axis])
+    found = changed(*_condensed(model, solution, seen, free), ways, poses, count=pairs)
+    if found is None or not matters(found.off, rig.cov[np.ix_(free, free)], int(free.sum())):
+        return None
+    off, p = found.over_all(free).off, named[found.way]
+    points = transform(solution.state.Ts_left_body[:pairs, None], model.body(solution.state.shape)).reshape(-1, 3)
+    views = points, transform(inverse(rig.T_left_right), points)
+    uv = np.stack([camera.project(p) for camera, p in zip(rig.cameras, views, strict=True)], axis=1)
+    by_rig = optimal_points(rig, uv, np.broadcast_to(np.eye(2), (len(uv), 2, 2, 2)))[2]
+    shift_m = float(np.nanmedian(np.linalg.norm(by_rig @ (off[1] - off[0]), axis=1)))
+    what = f"{found.way} by {_amount(rig, p, (off[1] - off[0])[p])}" if found.sure else ""
+    return CameraChange(found.row, what, off, shift_m)
+
+
+def _amount(rig: StereoRig, p: NDArray[np.intp], step: Array) -> str:
+    """Write a step of the rig's parameters ``p``: focal lengths, principal points, or the relative pose."""
+    if len(p) == 6:
+        return f"{1e3 * np.linalg.norm(step[:3]):.2g} mm and {np.degrees(np.linalg.norm(step[3:])):.2g} degrees"
+    if p[0] in (0, rig.left.parameters.size):
+        focal = np.concatenate([rig.left.parameters, rig.right.parameters])[p]
+        return " and ".join(f"{100 * share:+.2g} %" for share in (step / focal).reshape(-1, 2).mean(axis=1))
+    return " and ".join(f"{np.linalg.norm(each):.2g} px" for each in step.reshape(-1, 2))

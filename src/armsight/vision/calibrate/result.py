@@ -9,8 +9,7 @@ import numpy as np
 
 from armsight.data import Array, Body, Record
 from armsight.plots import new_figure
-from armsight.vision.calibrate.change import CameraChange
-from armsight.vision.calibrate.motion import ExposureMotion
+from armsight.vision.calibrate.motion import CameraChange, ExposureMotion
 from armsight.vision.pose.bundle import BundleSolution, Observations
 from armsight.vision.rig import StereoRig
 
