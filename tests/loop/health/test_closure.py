@@ -118,7 +118,7 @@ def test_what_is_kept_is_bounded_and_old_changes_stay_found(monkeypatch):
     watch = watched(11, "rig", SHIFT, seconds=180.0)
     assert sum(watch._merged) > 200
     assert len(watch._t) < 80
-    assert [len(each) for each in (watch._e, watch._H, watch._merged, watch._sums.rows)] == 4 * [len(watch._t)]
+    assert [len(each) for each in (watch._e, watch._H, watch._merged, watch._sums)] == 4 * [len(watch._t)]
     found, change = finding(watch.changes, ARM.joint_names), watch.changes[0]
     assert (found.cause, change.suspect.kind) == ("fixed", "rig")
     assert found.since_s == pytest.approx(AT_S, abs=4.0)

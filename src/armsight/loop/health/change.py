@@ -46,9 +46,7 @@ class ToolView(Record):
         Points appear nearer along the optical axis by that share of their depth; the body is fitted to them. With A the
         scatter of its points and a the axis, it rotates by -(tr A - A)^-1 (A a x a) about their mean.
 
-        Args:
-            R: (..., 3, 3) rotation of the tool in the base.
-            p: (..., 3) its position, m.
+        ``R``: (..., 3, 3) rotation of the tool in the base. ``p``: (..., 3) its position, m.
         """
         origin, axis, middle = self.T_base_rig[:3, 3], self.T_base_rig[:3, 2], self.points.mean(axis=0)
         A = (self.points - middle).T @ (self.points - middle)
@@ -240,25 +238,15 @@ def suspected(measurement: PoseMeasurement, changes: Sequence[Change]) -> Array 
         for each, share in zip(some, probabilities(some) if some else (), strict=True):
             if each.suspect.moves and t_s >= each.begin_s:
                 shift, cov = each.displacement(T, t_s)
-                cov = cov + _second_order(shift)
+                metres, radians = np.linalg.norm(shift.reshape(2, 3), axis=1).tolist()
+                # It was estimated as if rotations were small; and a drift does something else beside it.
+                variances = np.array([(0.5 * radians * metres) ** 2, (0.5 * radians**2) ** 2])
                 if each.suspect.kind == "drift":
-                    cov = cov + _otherwise(shift)
-                extra += share * (np.outer(shift, shift) + cov)
+                    variances += (_OTHERWISE * metres) ** 2, (_OTHERWISE * radians) ** 2
+                extra += share * (np.outer(shift, shift) + cov + np.diag(np.repeat(variances, 3)))
     for each in shaken:
         extra += each.displacement(T, t_s)[1]
     return extra if extra.any() else None
-
-
-def _second_order(shift: Array) -> Array:
-    """Return the covariance (6, 6) of what a shift (6,) leaves out: it was estimated as if rotations were small."""
-    metres, radians = np.linalg.norm(shift.reshape(2, 3), axis=1).tolist()
-    return np.diag(np.repeat([(0.5 * radians * metres) ** 2, (0.5 * radians**2) ** 2], 3))
-
-
-def _otherwise(shift: Array) -> Array:
-    """Return the covariance (6, 6) of what a drift does beside the shift (6,) that was estimated."""
-    sizes = _OTHERWISE * np.linalg.norm(shift.reshape(2, 3), axis=1)
-    return np.diag(np.repeat(sizes**2, 3))
 
 
 def widened(measurement: PoseMeasurement, changes: Sequence[Change]) -> PoseMeasurement:

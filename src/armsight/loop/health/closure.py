@@ -91,41 +91,6 @@ class _Block:
         self.t, self.e, self.H, self.clock_s = 0.0, np.zeros(6), np.zeros((6, size)), 0.0
 
 
-class _RunningSums:
-    """Running sums over blocks: what steps and ramps of the parameters that may change need, one row a block."""
-
-    def __init__(self) -> None:
-        self.rows: list[tuple[Array, ...]] = []
-
-    def add(self, t_s: Array, across: Array, inner: Array, right: Array) -> None:
-        """Add blocks' (B, ...) information between the model's parameters and the changes, among these, and right sides."""
-        t = t_s[:, None, None]
-        ramp, half, push = across[:, :, :RAMPS], inner[:, :RAMPS, :RAMPS], right[:, :RAMPS]
-        new = (across, t * ramp, inner, t * half, t**2 * half, right, t[:, 0] * push)
-        for k in range(len(t_s)):
-            self.rows.append(
-                tuple(each[k] + last for each, last in zip(new, self.rows[-1], strict=True))
-                if self.rows
-                else tuple(each[k] for each in new)
-            )
-
-    def since(self, rows: Array, starts_s: Array, end_s: float) -> tuple[Array, ...]:
-        """Return (S, ...) across, inner and right side of steps at rows (S,), then those of ramps from times (S,), s."""
-        across, t_across, inner, t_inner, tt_inner, right, t_right = (
-            last - np.array([self.rows[k - 1][n] for k in rows]) for n, last in enumerate(self.rows[-1])
-        )
-        s, length = starts_s[:, None, None], (end_s - starts_s)[:, None, None]
-        half = inner[:, :RAMPS, :RAMPS]
-        return (
-            across,
-            inner,
-            right,
-            (t_across - s * across[:, :, :RAMPS]) / length,
-            (tt_inner - 2.0 * s * t_inner + s**2 * half) / length**2,
-            (t_right - s[:, 0] * right[:, :RAMPS]) / length[:, 0],
-        )
-
-
 class ClosureWatch:
     """Watches a whole run for changes.
 
@@ -160,7 +125,10 @@ class ClosureWatch:
 
     def _clear(self) -> None:
         size = len(self._model)
-        self._N, self._b, self._square, self._sums = np.eye(size), np.zeros(size), 0.0, _RunningSums()
+        self._N, self._b, self._square = np.eye(size), np.zeros(size), 0.0
+        # Up to each block: the information between the model and what may change (steps, then these times the time), that
+        # among what may change, and its right side.
+        self._sums: list[tuple[Array, Array, Array]] = []
 
     def take(self, agreed: Sequence[Innovation]) -> None:
         """Take what the estimator did with a measurement, in order of time, and those before it that it accepted now."""
@@ -215,7 +183,7 @@ class ClosureWatch:
             for values in every:
                 values[k : k + 2] = [(n * values[k] + m * values[k + 1]) / (n + m)]
             self._merged[k : k + 2] = [n + m]
-            self._sums.rows[k : k + 2] = [self._sums.rows[k + 1]]
+            self._sums[k : k + 2] = [self._sums[k + 1]]
 
     def _whitened(self, blocks: slice) -> tuple[Array, Array, Array]:
         """Return of B blocks the derivatives (B, 6, K) by the model, by what may change (B, 6, D), and residuals (B, 6)."""
@@ -233,9 +201,24 @@ class ClosureWatch:
         self._N += flat.T @ flat
         self._b += flat.T @ e.ravel()
         self._square += float(np.vdot(e, e))
-        changes_T, H_T = np.swapaxes(changes, 1, 2), np.swapaxes(H, 1, 2)
-        right = (changes_T @ e[..., None])[..., 0]
-        self._sums.add(np.array(self._t[blocks]), H_T @ changes, changes_T @ changes, right)
+        changes = np.concatenate([changes, np.array(self._t[blocks])[:, None, None] * changes[:, :, :RAMPS]], axis=2)
+        changes_T = np.swapaxes(changes, 1, 2)
+        new = np.swapaxes(H, 1, 2) @ changes, changes_T @ changes, changes_T @ e[..., None]
+        for across, inner, right in zip(*new, strict=True):
+            before = self._sums[-1] if self._sums else (0.0, 0.0, 0.0)
+            self._sums.append((before[0] + across, before[1] + inner, before[2] + right[:, 0]))
+
+    def _since(self, begins: Array) -> tuple[Array, Array, Array]:
+        """Return (S, ...) the same sums of steps at beginnings (S,), and of ramps from the blocks before them until now."""
+        across, inner, right = (
+            last - np.array([self._sums[k - 1][n] for k in begins]) for n, last in enumerate(self._sums[-1])
+        )
+        starts_s = np.array(self._t)[begins - 1, None]
+        lengths_s, count, ramps = self._t[-1] - starts_s, right.shape[1], np.arange(RAMPS)
+        by = np.tile(np.eye(count), (len(begins), 1, 1))  # of a ramp: (time - start) / length
+        by[:, ramps, count - RAMPS + ramps] = -starts_s / lengths_s
+        by[:, count - RAMPS + ramps, count - RAMPS + ramps] = 1.0 / lengths_s
+        return across @ by, np.swapaxes(by, 1, 2) @ inner @ by, np.einsum("sc,scd->sd", right, by)
 
     def _estimate_noise(self) -> None:
         """Estimate the covariance of the blocks' errors from what the model leaves of them; sum all blocks anew with it."""
@@ -243,7 +226,7 @@ class ClosureWatch:
         for _ in range(2):
             # Akaike's criterion: by as much as it explains, less what its parameters explain by chance.
             begins = _begins(len(errors))
-            tested = self._tested(begins, suspects(self._parts.joints))
+            tested = self._tested(begins)
             best = max(tested, key=lambda each: each.chi_square - 2.0 * len(each.size))
             A, e, numbers = blocks.copy(), errors.copy(), errors.size
             closest = max(self._closest(begins, tested), key=lambda each: each.above, default=best)
@@ -279,12 +262,11 @@ class ClosureWatch:
             return []
         rows = {int(np.searchsorted(begins, each.begin)) for each in near}
         between = np.unique(np.concatenate([self._between(begins, row) for row in rows]))
-        everything = suspects(self._parts.joints)
-        finest = self._finest_of(between, everything)
+        finest = self._finest_of(between)
         first = max(finest, key=lambda each: each.above).begin
         beside = [k for k in (first - 1, first + 1) if 1 <= k < len(self._t) and k not in between]
         if beside:
-            pairs = zip(finest, self._finest_of(np.array(beside), everything), strict=True)
+            pairs = zip(finest, self._finest_of(np.array(beside)), strict=True)
             finest = [max(pair, key=lambda each: each.above) for pair in pairs]
         return finest
 
@@ -305,12 +287,13 @@ class ClosureWatch:
         # Once something was reported, what explains it best replaces it, also where it is smaller than is reported first.
         if changes and (self.changes or (certain and _matters(changes[0]))):
             # What was reported before is not undone by something else that began later.
-            self.changes = (*changes, *happened_besides(self._reported(), changes[0]))
+            first = tuple(each for each in self.changes if each.besides) or self.changes
+            self.changes = (*changes, *happened_besides(first, changes[0]))
 
     def _best(self) -> tuple[tuple[Change, ...], bool]:
         """Test all hypotheses at some beginnings, the best of them at those between; return whether they are certain."""
         begins = _begins(len(self._t))
-        found = self._tested(begins, suspects(self._parts.joints))
+        found = self._tested(begins)
         limits = _limits(self._parts.joints)
         at_first = {n: limits[n] + more for n, more in self._unsure.items()}
         self.strongest = max(self.strongest, *(each.chi_square / at_first[each.suspect.freedom] for each in found))
@@ -326,15 +309,11 @@ class ClosureWatch:
         certain = best.above > self._unsure[best.suspect.freedom]
         return ranked([self._change(each, best.left) for each in finest]), certain
 
-    def _reported(self) -> tuple[Change, ...]:
-        """Return what was reported to have happened first, as alternatives of each other."""
-        return tuple(each for each in self.changes if each.besides) or self.changes
-
-    def _finest_of(self, between: Array, hypotheses: Sequence[Suspect]) -> list[_Tested]:
-        """Return hypotheses, each at the best of some beginnings, the block into which the change fell left out."""
+    def _finest_of(self, between: Array) -> list[_Tested]:
+        """Return all hypotheses, each at the best of some beginnings, the block into which the change fell left out."""
         solved = np.linalg.solve(np.linalg.cholesky(self._N), self._b)
         with_all = self._square - float(solved @ solved)
-        tested = [self._tested(np.array([k]), hypotheses, (k - 1, with_all)) for k in between]
+        tested = [self._tested(np.array([k]), (k - 1, with_all)) for k in between]
         return [max(each, key=lambda one: one.above) for each in zip(*tested, strict=True)]
 
     def _between(self, begins: Array, row: int) -> Array:
@@ -358,23 +337,20 @@ class ClosureWatch:
         size, cov = found.size, left * found.cov
         return Change(found.suspect, begin_s, end_s, size, cov, chi_square, score, effect, T, seen=self._seen)
 
-    def _tested(
-        self, begins: Array, hypotheses: Sequence[Suspect], without: tuple[int, float] | None = None
-    ) -> list[_Tested]:
-        """Test hypotheses at beginnings (S,); return each at the one of largest chi-square.
+    def _tested(self, begins: Array, without: tuple[int, float] | None = None) -> list[_Tested]:
+        """Test all hypotheses at beginnings (S,); return each at the one of largest chi-square.
 
         ``without``: a block that is left out, as the change fell into it, and what the model leaves unexplained with
         it; what leaving it out explains counts for the beginning.
         """
-        t = np.array(self._t)
         N, b, square, gained = self._N, self._b, self._square, 0.0
         if without is not None:
             k, gained = without
             (H,), _, (e,) = self._whitened(slice(k, k + 1))
             N, b, square = N - H.T @ H, b - H.T @ e, square - float(e @ e)
         L = np.linalg.cholesky(N)
-        steps, step_C, step_b, ramps, ramp_C, ramp_b = self._sums.since(begins, t[begins - 1], t[-1])
-        whole = np.moveaxis(np.concatenate([steps, ramps], axis=2), 1, 0).reshape(len(self._model), -1)
+        across, C, right = self._since(begins)
+        whole = np.moveaxis(across, 1, 0).reshape(len(self._model), -1)
         solved = np.linalg.solve(L, np.column_stack([whole, b]))
         b, white = solved[:, -1], np.moveaxis(solved[:, :-1].reshape(len(self._model), len(begins), -1), 1, 0)
         # What the model leaves beyond the blocks' errors widens them.
@@ -384,20 +360,19 @@ class ClosureWatch:
         gained = 0.0 if without is None else (gained - left) / excess
         limits, found = _limits(self._parts.joints), list[_Tested]()
         wide = np.append(self._wide, self._wide[:RAMPS])
-        right = (np.concatenate([step_b, ramp_b], axis=1) - b @ white) * wide / excess
-        first = steps.shape[2]  # of the ramps
+        right = (right - b @ white) * wide / excess
+        first = len(self._wide)  # of the ramps
         # Of single numbers, whose information is one number each.
-        own = np.concatenate([np.einsum("scc->sc", step_C), np.einsum("scc->sc", ramp_C)], axis=1)
-        own = (own - np.einsum("skc,skc->sc", white, white)) * (wide**2 / excess) + 1.0
+        own = (np.einsum("scc->sc", C) - np.einsum("skc,skc->sc", white, white)) * (wide**2 / excess) + 1.0
         best = np.argmax(right**2 / own, axis=0)
-        for each in hypotheses:
+        for each in suspects(self._parts.joints):
             part = slice(each.columns.start + first * each.slow, each.columns.stop + first * each.slow)
             by = wide[part]
             if len(by) == 1:
                 n = int(best[part.start])
                 cov = (by**2 / own[n, part])[:, None]
             else:
-                G, inner = white[:, :, part], (ramp_C if each.slow else step_C)[:, each.columns, each.columns]
+                G, inner = white[:, :, part], C[:, part, part]
                 inner = (inner - np.swapaxes(G, 1, 2) @ G) * (by[:, None] * (by / excess)) + np.eye(len(by))
                 solved = np.linalg.solve(inner, right[:, part, None])[..., 0]
                 n = int(np.argmax(np.einsum("sc,sc->s", right[:, part], solved)))

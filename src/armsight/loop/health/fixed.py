@@ -86,9 +86,8 @@ class FixedWatch:
         self._C, self._b = np.zeros((0, self._columns, self._columns)), np.zeros((0, self._columns))
         self._squares, self._weights = np.zeros(0), np.zeros(0)
         self._ramp_rows = np.array(rows[:RAMPS])
-        self._shots: list[
-            tuple[Innovation, float]
-        ] = []  # since the newest beginning, each so long after the one before, s
+        # Since the newest beginning, each so long after the one before, s.
+        self._shots = list[tuple[Innovation, float]]()
         self._newest: Innovation | None = None
         self._last_s = -np.inf
         #: the hypotheses of the test that found the clearest change, the best first; empty where none was found
@@ -174,12 +173,10 @@ class FixedWatch:
     def _decide(self, innovation: Innovation) -> None:
         """Test all beginnings; the hypotheses are what they are at the newest measurement."""
         moving = [each for each in self._suspects if each.cause == "fixed"]
-        explained = [self._fitted(each).chi_squares for each in moving]
-        alarms = np.array(
-            [gained - (_RARER if each.slow else 0.0) for each, gained in zip(moving, explained, strict=True)]
-        )
+        explained = np.array([self._fitted(each).chi_squares for each in moving])
+        alarms = explained - _RARER * np.array([[each.slow] for each in moving])
         kind, n = np.unravel_index(int(np.argmax(alarms)), alarms.shape)
-        found = float(explained[int(kind)][n])
+        found = float(explained[kind, n])
         strongest = max((each.chi_square for each in self.changes if each.suspect.cause == "fixed"), default=0.0)
         if found <= max(_LIMITS[6], strongest):
             return
@@ -211,11 +208,9 @@ class FixedWatch:
     def findings(self) -> tuple[HealthFinding, ...]:
         """Return that the estimator dropped what it had learned; nothing where it did not."""
         count, first_s = self.reopened
-        return (
-            ()
-            if not count
-            else (make_finding("reopened", (float(count), 0.0), first_s, words={"plural": "s" * (count != 1)}),)
-        )
+        if not count:
+            return ()
+        return (make_finding("reopened", (float(count), 0.0), first_s, words={"plural": "s" * (count != 1)}),)
 
 
 #: Terms of the polynomial that is removed of each window; half: arms' errors shake, double: below 4 Hz nothing does.
@@ -245,11 +240,8 @@ class Unrest:
     def take(self, t_s: Array, values: Array, covs: Array, excess: float = 1.0) -> None:
         """Take a window.
 
-        Args:
-            t_s: (N,) times, s.
-            values: (N, D) of its shots.
-            covs: (N, D, D) covariances of their noise.
-            excess: by how much the variance of the noise is larger than they say.
+        ``t_s``: (N,) times, s. ``values``: (N, D) of its shots. ``covs``: (N, D, D) covariances of their noise.
+        ``excess``: by how much the variance of the noise is larger than they say.
         """
         if len(t_s) < _LEAST or not np.ptp(t_s) > 0.0:
             return

@@ -111,15 +111,12 @@ class RigCorrection(Record):
         """Return what was put right as one line for people."""
         if self.update is None:
             shift, rotation = (float(np.linalg.norm(part)) for part in (self.motion[:3], self.motion[3:]))
+            tool_mm = None if self.tool_m is None else (1e3 * self.tool_m[0], 1e3 * self.tool_m[1])
             what = (
-                f"it had moved against the base of the arm by {1e3 * shift:.2f} mm and {np.degrees(rotation):.3f} deg"
+                f"it had moved against the base of the arm by {1e3 * shift:.2f} mm and {np.degrees(rotation):.3f} deg, "
             )
-            if self.tool_m is None:
-                what += ", as fixed bodies show"
-            else:
-                what += (
-                    f", the tool had appeared displaced by {1e3 * self.tool_m[0]:.2f} +- {1e3 * self.tool_m[1]:.2f} mm"
-                )
+            what += "as fixed bodies show" if tool_mm is None else "the tool had appeared displaced by "
+            what += "" if tool_mm is None else f"{tool_mm[0]:.2f} +- {tool_mm[1]:.2f} mm"
         else:
             what = "; ".join(self.update.lines())
         how = "put right" if self.refines is None else f"put right again (of {self.refines.at_s:.1f} s)"
@@ -149,11 +146,9 @@ class RigFollower:
     ) -> Callable[[], RigCorrection | None] | None:
         """Return what computes a correction, or why there is none; None where nothing is found to have moved.
 
-        Args:
-            monitor: what was found.
-            poses: returns time, s, and pose of the newest shots, measured with the rig as it is, in order of time.
-            T_base_rig: (4, 4) the rig in the base as it is taken to be, m.
-            at_s: the time, s.
+        ``monitor``: what was found. ``poses``: returns time, s, and pose of the newest shots, measured with the rig as
+        it is, in order of time. ``T_base_rig``: (4, 4) the rig in the base as it is taken to be, m. ``at_s``: the time,
+        s.
         """
         again = monitor.changes or monitor.rig_moved() is not None or monitor.cameras_moved() is not None
         if self._put_right is not None and again:
@@ -204,27 +199,20 @@ class RigFollower:
         return self.cameras(since_s, poses, at_s, mounted=True)
 
     def cameras(
-        self,
-        since_s: float,
-        poses: Sequence[tuple[float, PoseEstimate]],
-        at_s: float,
-        mounted: bool = False,
+        self, since_s: float, poses: Sequence[tuple[float, PoseEstimate]], at_s: float, mounted: bool = False
     ) -> RigCorrection | None:
         """Return the cameras put right; None where the poses do not suffice, as ``rejected`` says.
 
-        Args:
-            since_s: since when the cameras are found to have moved, s.
-            poses: time, s, and pose of shots measured with the rig as it is, in order of time.
-            at_s: the time, s.
-            mounted: whether hand-eye stands on the poses before: then only the change may be estimated, which needs them.
+        ``since_s``: since when the cameras are found to have moved, s. ``poses``: time, s, and pose of shots measured
+        with the rig as it is, in order of time. ``at_s``: the time, s. ``mounted``: whether hand-eye stands on the
+        poses before: then only the change may be estimated, which needs them.
         """
         used = _differing([pose for t_s, pose in poses if t_s >= since_s + TEST_S])
         before = _differing([pose for t_s, pose in poses if t_s < since_s - TEST_S])
         new = _differing([pose for t_s, pose in poses if t_s > max(self._tried_s, since_s + TEST_S)])
         if len(used) < LEAST_STAYS or len(new) < _NEW * self._tried:
-            self.rejected = (
-                self.rejected or f"cameras: {len(used)} shots since they moved differ, {LEAST_STAYS} are needed"
-            )
+            few = f"cameras: {len(used)} shots since they moved differ, {LEAST_STAYS} are needed"
+            self.rejected = self.rejected or few
             return None
         if mounted and len(before) < LEAST_STAYS:
             self.rejected = f"cameras: {len(before)} shots from before they moved differ, {LEAST_STAYS} are needed"
@@ -252,11 +240,9 @@ class RigFollower:
     ) -> RigCorrection | None:
         """Return the rig put right by what fixed bodies show; None where that does not suffice, as ``rejected`` says.
 
-        Args:
-            since_s: since when the cameras are found to have moved, s.
-            motion: (6,) of the cameras, right tangent in the left one's frame, [m; rad], and its covariance.
-            at_s: the time, s.
-            p_left: (3,) where the body on the tool is, in the left camera's frame, m.
+        ``since_s``: since when the cameras are found to have moved, s. ``motion``: (6,) of the cameras, right tangent
+        in the left one's frame, [m; rad], and its covariance. ``at_s``: the time, s. ``p_left``: (3,) where the body on
+        the tool is, in the left camera's frame, m.
         """
         at_body = np.hstack([np.eye(3), -skew(p_left)])
         sigma_m = float(np.sqrt(np.linalg.eigvalsh(at_body @ motion[1] @ at_body.T)[-1]))
@@ -306,11 +292,8 @@ class RigFollower:
     ) -> RigCorrection | None:
         """Return a correction by the arm's poses that replaces an earlier one; None where they hardly say more of it.
 
-        Args:
-            right: the earlier one.
-            T_base_rig: (4, 4) the rig as it was put right, m.
-            at_s: the time, s.
-            moved: what is left of the motion.
+        ``right``: the earlier one. ``T_base_rig``: (4, 4) the rig as it was put right, m. ``at_s``: the time, s.
+        ``moved``: what is left of the motion.
         """
         assert right.tool_m is not None
         if moved is None:
@@ -354,12 +337,9 @@ def _differing(poses: Sequence[PoseEstimate]) -> list[PoseEstimate]:
 
 
 def _some(poses: Sequence[PoseEstimate]) -> list[SeenShot]:
-    return [seen_shot(str(k), pose) for k, pose in enumerate(poses[:: -(-len(poses) // _MOST_SHOTS) or 1])]
-
-
-def seen_shot(name: str, pose: PoseEstimate) -> SeenShot:
-    """Return the detections of a measured pose."""
-    seen = pose.points.seen
-    paired = seen.paired
-    ids = seen.ids[paired]
-    return SeenShot(name, (ids, ids), (seen.uv[paired, 0], seen.uv[paired, 1]))
+    shots = list[SeenShot]()
+    for k, pose in enumerate(poses[:: -(-len(poses) // _MOST_SHOTS) or 1]):
+        seen = pose.points.seen
+        ids, uv = seen.ids[seen.paired], seen.uv[seen.paired]
+        shots.append(SeenShot(str(k), (ids, ids), (uv[:, 0], uv[:, 1])))
+    return shots

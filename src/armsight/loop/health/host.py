@@ -48,18 +48,12 @@ class HostWatch:
 
     def findings(self) -> tuple[HealthFinding, ...]:
         """Return what was found so far; nothing while all is well."""
-        return (*self._repetition(), *self._stalling())
-
-    def _stalling(self) -> tuple[HealthFinding, ...]:
-        if self._stalls < max(_STALLS, _STALLED_SHARE * self._periods) and self._longest_s < _LONG_S:
-            return ()
-        times = "once" if self._stalls == 1 else f"{self._stalls} times"
-        return (make_finding("stalled", (self._longest_s, 0.0), self._stalled_s, words={"times": times}),)
-
-    def _repetition(self) -> tuple[HealthFinding, ...]:
-        if self._repeated < max(_LEAST, _SHARE * self._shots):
-            return ()
-        share = self._repeated / self._shots
-        sigma = float(np.sqrt(share * (1.0 - share) / self._shots))
-        counts = {"count": self._repeated, "shots": self._shots}
-        return (make_finding("repeated", (share, sigma), self._first_s, words=counts),)
+        found = list[HealthFinding]()
+        if self._repeated >= max(_LEAST, _SHARE * self._shots):
+            share, counts = self._repeated / self._shots, {"count": self._repeated, "shots": self._shots}
+            sigma = float(np.sqrt(share * (1.0 - share) / self._shots))
+            found.append(make_finding("repeated", (share, sigma), self._first_s, words=counts))
+        if self._stalls >= max(_STALLS, _STALLED_SHARE * self._periods) or self._longest_s >= _LONG_S:
+            times = "once" if self._stalls == 1 else f"{self._stalls} times"
+            found.append(make_finding("stalled", (self._longest_s, 0.0), self._stalled_s, words={"times": times}))
+        return tuple(found)

@@ -129,9 +129,7 @@ class HealthMonitor:
     def measured(self, pose: PoseEstimate, t_s: float | None) -> PoseEstimate:
         """Take a measured pose, in order of time; return it with what is suspected added to its covariance.
 
-        Args:
-            pose: as it was measured.
-            t_s: time of its shot, s; None where it has none.
+        ``pose``: as it was measured. ``t_s``: time of its shot, s; None where it has none.
         """
         self._take(pose, t_s)
         return self._widened(pose)
@@ -214,9 +212,7 @@ class HealthMonitor:
 
     def cameras_moved(self) -> RigWatch | None:
         """Return a copy of the watch of the cameras that found a change, for another thread; None where it found none."""
-        if self._rig is None or not self._rig.wrong_at_rest:
-            return None
-        return self._rig.copied()
+        return self._rig.copied() if self._rig is not None and self._rig.wrong_at_rest else None
 
     def rig_moved(self) -> tuple[float, Array, Array] | None:
         """Return since when, s, and by which motion (6,), with covariance, fixed bodies show that both cameras moved."""
@@ -300,7 +296,8 @@ class HealthMonitor:
 
     def _explained(self, found: HealthFinding, correction: RigCorrection) -> bool:
         """Return whether a correction puts right what was found: not a body that others prove not to be fixed."""
-        if self._landmarks is not None and found in self._landmarks.not_fixed:
+        marks = self._landmarks
+        if marks is not None and found in marks.not_fixed:
             return False
         return correction.cause in (found.cause, *found.alternatives)
 

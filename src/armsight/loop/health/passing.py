@@ -361,12 +361,7 @@ class Passing:
         return len(self.nods) >= _LEAST
 
     def decide(
-        self,
-        every: ResidualSums,
-        stays: Staying,
-        size: int,
-        times: Times | None,
-        nods: Nods | None,
+        self, every: ResidualSums, stays: Staying, size: int, times: Times | None, nods: Nods | None
     ) -> tuple[Passes | None, tuple[float, ...]]:
         """Decide what explains the doubtful tests best, all together: what stays has one value in them, what passes many.
 
@@ -404,13 +399,10 @@ class Passing:
     def _list(self, tests: Sequence[_Doubtful]) -> None:
         """Take over what the doubtful tests show now; those that are no more among them stay as they were."""
         first_s = tests[0].every.begin_s
-        apart = [*(each for each in self.apart if each[0] < first_s)]
-        focal = [*(each for each in self.focal if each[0] < first_s)]
-        for each in tests:
-            if each.counted == "time" and each.times is not None:
-                apart.append((each.every.begin_s, each.times.found))
-            elif each.counted == "lens":
-                focal.append((each.every.begin_s, each.focal_share))
+        apart = [each for each in self.apart if each[0] < first_s]
+        focal = [each for each in self.focal if each[0] < first_s]
+        apart += [(each.every.begin_s, each.times.found) for each in tests if each.counted == "time" and each.times]
+        focal += [(each.every.begin_s, each.focal_share) for each in tests if each.counted == "lens"]
         nods = (each for each in self.nods if each < first_s)
         self.nods = (*nods, *(each.every.begin_s for each in tests if each.counted == "rig"))[-_LISTED:]
         # Of those of hours the first says since when.
@@ -459,9 +451,8 @@ class Passing:
         information = np.sum([each.information for each in tests], axis=0)
         mean_s = np.linalg.solve(information, np.sum([each.information @ each.shared_s for each in tests], axis=0))
         sigmas_s = np.sqrt(np.diag(np.linalg.inv(information)))
-        shown = np.array(
-            [max(each.gained - each.occam, 1e-9) for each in tests]
-        )  # a body that rests shows nothing of it
+        # A body that rests shows nothing of it.
+        shown = np.array([max(each.gained - each.occam, 1e-9) for each in tests])
         own_s = math.sqrt(float(np.average([each.apart_s**2 for each in tests], weights=shown)))
         k = int(np.argmax(np.abs(mean_s[:3])))
         if own_s > _CONSTANT * abs(mean_s[k]):
@@ -470,9 +461,8 @@ class Passing:
         # What the velocity lacks is lacking in all shots alike.
         size_s, sigma_s = float(mean_s[k]), math.hypot(float(sigmas_s[k]), 0.5 * UNKNOWN_SHARE * float(mean_s[k]))
         if k:
-            return make_finding(
-                "rolls", (2.0 * size_s, 2.0 * sigma_s), since_s, words={"side": ("right", "left")[k - 1]}
-            )
+            words = {"side": ("right", "left")[k - 1]}
+            return make_finding("rolls", (2.0 * size_s, 2.0 * sigma_s), since_s, words=words)
         return make_finding("skewed", (size_s, sigma_s), since_s)
 
     def _lens_finding(self, *, timed: bool) -> HealthFinding:

@@ -177,17 +177,8 @@ class RigWatch:
         many = len(body.points) > len(rows)
         points = np.asarray(body.points, float)[rows]
         self._focal = _focal_changes(rig, self._size)
-        self._shape = ShapeWatch(
-            self._size,
-            self._focal,
-            count + 1,
-            points,
-            names,
-            SHAPE_M,
-            TEST_S,
-            rigid=printed or many,
-            strained=not printed,
-        )
+        sizes = self._size, self._focal, count + 1
+        self._shape = ShapeWatch(*sizes, points, names, SHAPE_M, TEST_S, rigid=printed or many, strained=not printed)
         # (K, K + 7 + C) what parameters, seven numbers and the shape's candidates change of the parameters, over
         # priors.
         self._scaled = np.hstack([self.prior, self._by_fault * _WIDE, self._shape.by_wide])
@@ -232,11 +223,21 @@ class RigWatch:
         """Take a measured pose with its time, s; return (6, 6) what the suspected errors add to its covariance."""
         now_s, self._timed = (float(self._shots), False) if t_s is None else (t_s, True)
         self._shots += 1
-        if estimate.exposures is not None:
-            self._expose(estimate.exposures.cov_shared)
-        is_new = self._is_new(estimate)
+        if estimate.exposures is not None:  # skew and readout, which all shots share, are constants with a prior
+            values, vectors = np.linalg.eigh(estimate.exposures.cov_shared[::-1, ::-1])
+            shared = slice(self._size - 2, self._size)
+            self.prior[shared, shared] = vectors * np.sqrt(np.maximum(values, 0.0))
+            self._scaled[:, shared] = self._with_lens[: self._size, shared] = self.prior[:, shared]
+        seen = estimate.points.seen.uv.tobytes()
+        is_new = seen not in self._images  # the same images say nothing new
+        self._images[seen] = None
+        if len(self._images) > _IMAGES:
+            del self._images[next(iter(self._images))]
         self.reader.track.append((now_s, estimate.T_left_body))
-        if self._redundant(estimate.T_left_body, now_s):
+        # It adds too little to what was taken just before it, whose errors are its own, too.
+        passed_s, began = now_s - self._taken_s, self._began
+        alike = self._timed and 0.0 <= passed_s < _LIKE_S
+        if alike and (passed_s < _LEAST_S or (began is not None and not differ(began, estimate.T_left_body))):
             return self._newest_added
         self._taken_s = now_s
         found = self.reader.read(estimate, now_s)
@@ -245,7 +246,7 @@ class RigWatch:
         self._effects.append((found.response, estimate.cov))
         if is_new:
             self._sum(found, estimate)
-        cov = self._to_and_fro_cov
+        cov = self._swung if self.passing.swings else self._unrest.cov  # of what moves to and fro
         self.noise = self._nodding(found.response, estimate.T_left_body, cov if cov.any() else self._unrest.suspected)
         added = self._added(found) + self.noise
         if added.any():  # of a body that is far off more than what is linear
@@ -253,22 +254,6 @@ class RigWatch:
             added += np.outer(off, off)
         self._newest_added = added
         return added
-
-    def _expose(self, cov: Array) -> None:
-        """Take the covariance (2, 2) of skew and readout, s^2, that all shots share: as constants with a prior."""
-        values, vectors = np.linalg.eigh(cov[::-1, ::-1])
-        shared = slice(self._size - 2, self._size)
-        self.prior[shared, shared] = vectors * np.sqrt(np.maximum(values, 0.0))
-        self._scaled[:, shared] = self._with_lens[: self._size, shared] = self.prior[:, shared]
-
-    def _is_new(self, estimate: PoseEstimate) -> bool:
-        """Return whether a shot's detections differ from those of the shots before: the same images say nothing new."""
-        seen = estimate.points.seen.uv.tobytes()
-        known = seen in self._images
-        self._images[seen] = None
-        if len(self._images) > _IMAGES:
-            del self._images[next(iter(self._images))]
-        return not known
 
     def _nodding(self, response: Array, T: Array, cov: Array) -> Array:
         """Return the covariance (6, 6) that a camera which nods or a lens that breathes adds to a pose (4, 4)."""
@@ -285,11 +270,6 @@ class RigWatch:
         """Return the derivatives (n, 4) of a shot's rows by what moves to and fro."""
         return np.asarray(rows[:, 1 : 1 + self._size] @ self._to_and_fro)
 
-    @property
-    def _to_and_fro_cov(self) -> Array:
-        """Covariance (4, 4) of what moves to and fro, from test to test or within a second."""
-        return np.asarray(self._swung if self.passing.swings else self._unrest.cov)
-
     def _scattered(self, stays: Sequence[Sequence[ShotResiduals]]) -> tuple[Array, Array, Array, float]:
         """Return of a test times (N,), s, what its shots say of what moves to and fro (N, 4), noise, and Birge's ratio."""
         shots = [shot for stay in stays for shot in stay]
@@ -300,12 +280,6 @@ class RigWatch:
         freedom = sum(map(len, r)) - 10.0 * len(shots)
         excess = (sum(float(e @ e) for e in r) - float(np.vdot(b, d))) / max(freedom, 1.0)
         return np.array([each.t_s for each in shots]), d, cov, max(excess, 1.0)
-
-    def _unrest_began(self, stays: Sequence[Sequence[ShotResiduals]]) -> bool:
-        """Return whether the shots of a test show that a camera's rotation or a focal length moves to and fro since it."""
-        rested = not self._unrest.cov.any()
-        self._unrest.take(*self._scattered(stays))
-        return rested and bool(self._unrest.cov.any())
 
     def _swing(self) -> None:
         """Estimate what moves to and fro, too slowly for one second to show it, from all tests that this explains."""
@@ -325,11 +299,10 @@ class RigWatch:
         self, stays: Sequence[Sequence[ShotResiduals]], *, every: bool
     ) -> list[tuple[Array, Array, float]]:
         """Return of each shot its rows, what the times of its exposures do to them (n, 10), and its weight."""
-        parts = list[tuple[Array, Array, float]]()
-        for stay in stays:
-            for shot in stay:
-                rows, moved = shot.every if every else shot.rows, shot.exposed[every].whitened()
-                parts.append((self._unrest_weighed(rows), self._unrest_weighed(rows, moved), 1.0 / len(stay)))
+        weigh, parts = self._unrest_weighed, list[tuple[Array, Array, float]]()
+        for shot, count in ((shot, len(stay)) for stay in stays for shot in stay):
+            rows, moved = shot.every if every else shot.rows, shot.exposed[every].whitened()
+            parts.append((weigh(rows), weigh(rows, moved), 1.0 / count))
         return parts
 
     def _added(self, found: ShotResiduals) -> Array:
@@ -352,13 +325,6 @@ class RigWatch:
             shift = by_fault @ self.suspected.f
             added += np.outer(shift, shift) + by_fault @ self.suspected.cov @ by_fault.T
         return added
-
-    def _redundant(self, T: Array, now_s: float) -> bool:
-        """Return whether a shot adds too little to what was taken just before it, whose errors are its own, too."""
-        passed_s = now_s - self._taken_s
-        if not self._timed or not 0.0 <= passed_s < _LIKE_S:
-            return False
-        return passed_s < _LEAST_S or (self._began is not None and not differ(self._began, T))
 
     def information(self, estimates: Sequence[PoseEstimate]) -> tuple[ResidualSums, int]:
         """Return the sums of measured poses, and how many of these differ: consecutive ones that are alike count as one."""
@@ -412,17 +378,10 @@ class RigWatch:
     ) -> ResidualSums:
         """Return the sums of stays, each the mean of its shots, without ``own`` times of exposure and what moves."""
         M, freedom = np.zeros((1 + self._full, 1 + self._full)), 0.0
-        for alone in (True, False):  # those of one shot are summed at once
-            shots = [
-                (self._unrest_weighed(each.every if every else each.rows, cov=cov), len(stay))
-                for stay in stays
-                for each in stay
-                if (len(stay) == 1) is alone
-            ]
-            if shots:
-                rows = np.concatenate([each if alone else each / np.sqrt(count) for each, count in shots])
-                M += rows.T @ rows
-                freedom += sum((len(each) - 6.0) / count for each, count in shots)
+        shots = [(each.every if every else each.rows, len(stay)) for stay in stays for each in stay]
+        if shots:
+            rows = np.concatenate([self._unrest_weighed(each, cov=cov) / np.sqrt(count) for each, count in shots])
+            M, freedom = rows.T @ rows, sum((len(each) - 6.0) / count for each, count in shots)
         sums = ResidualSums(M, freedom, stays[0][0].t_s if stays else 0.0)
         return sums if own is None else eliminate(own, self._weighed_parts(stays, every=every), sums)[0]
 
@@ -439,16 +398,14 @@ class RigWatch:
             self._leftover.take(self._counted.pop(0))
         self._shape.decide(*self._every, ends=ends)
         self._decided(change)
-        if self._timed and not newest.passes and self._unrest_began(stays):  # newest sums do not have it in their noise
+        rested = not self._unrest.cov.any()
+        if self._timed and not newest.passes:
+            self._unrest.take(*self._scattered(stays))
+        due = 0 < self._alarms <= FRESH or self._fits[0].count % _LENS_TESTS == 0
+        if rested and self._unrest.cov.any():  # the newest sums do not have what moves to and fro in their noise
             self._take_back([each.begin_s for each in self._fits[0].kept[-TOGETHER:]])
-        elif self._lens_is_due():
+        elif due and self._poses >= _LENS_POSES:
             self.lens = self._lens()
-
-    def _lens_is_due(self) -> bool:
-        """Return whether the lenses are looked at with the newest test."""
-        tests = self._fits[0].count
-        due = 0 < self._alarms <= FRESH or tests % _LENS_TESTS == 0
-        return due and self._poses >= _LENS_POSES
 
     def _keep(self, newest: _Newest, *, again: bool) -> None:
         if newest.every is not newest.fits and self._every is self._fits:

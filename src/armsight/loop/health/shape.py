@@ -32,7 +32,7 @@ from typing import NamedTuple
 import numpy as np
 
 from armsight.data import Array, Ids, Record
-from armsight.estimate.chance import chi_square_limit
+from armsight.estimate.chance import chi_square_limit, squares_of
 from armsight.geometry.rotation import skew
 from armsight.loop.finding import ALIKE, HealthFinding, alarm_limit, make_finding, sized
 from armsight.loop.health.residuals import (
@@ -100,10 +100,6 @@ class ShapeError(Record):
     def seven_needed(self) -> bool:
         """Whether a change of the seven numbers is needed besides."""
         return bool(self.seven > chi_square_limit(7, NECESSARY))
-
-    def is_of(self, other: ShapeError | None) -> bool:
-        """Whether both name the same candidate first."""
-        return other is not None and self.chosen[0] == other.chosen[0]
 
 
 #: Stand for the focal lengths and for a smooth deformation among the rows of the points.
@@ -201,13 +197,10 @@ class ShapeWatch:
     def take(self, t_s: float, rows: Array, T: Array, response: Array, cov: Array, moved: bool) -> None:
         """Take a shot.
 
-        Args:
-            t_s: its time, s.
-            rows: (n, 1 + K) its residuals and their derivatives, all points included, its pose eliminated.
-            T: (4, 4) pose T_left_body.
-            response: (6, K) of a pose measured with all points to the parameters.
-            cov: (6, 6) covariance of the pose.
-            moved: whether its pose differs from the one before; single shots are asked only then.
+        ``t_s``: its time, s. ``rows``: (n, 1 + K) its residuals and their derivatives, all points included, its pose
+        eliminated. ``T``: (4, 4) pose T_left_body. ``response``: (6, K) of a pose measured with all points to the
+        parameters. ``cov``: (6, 6) covariance of the pose. ``moved``: whether its pose differs from the one before;
+        single shots are asked only then.
         """
         self._effects = (*self._effects, (response, cov))[-POSES:]
         if not moved:
@@ -227,7 +220,8 @@ class ShapeWatch:
         self._suspect = None if before is None and self.doubt is None else self._suspected(before)
         self._alarms = 0 if self._suspect is None else self._alarms + 1
         # What a change leaves in the test in which it began may look like a displaced point, once.
-        again = before is not None and before.is_of(self._suspect)
+        now = self._suspect
+        again = before is not None and now is not None and before.chosen[0] == now.chosen[0]
         self.found = self._suspect if again or (ends and len(tests.kept) == 1) else None
         self.said = self.found or self.said
         if self.found is not None:
@@ -245,9 +239,8 @@ class ShapeWatch:
         windows = tests.windows(every=True) if before is None else [before.onset]
         shown = next(filter(None, map(self._shown, windows)), None)
         if shown is not None and (self._alarms < FRESH or tests.count % STEPS == 0):
-            return self._shown(
-                tests.dated(9 + 3 * len(self._candidates), None if self._alarms < FRESH else shown.begin_s)[1]
-            )
+            oldest_s = None if self._alarms < FRESH else shown.begin_s
+            return self._shown(tests.dated(9 + 3 * len(self._candidates), oldest_s)[1])
         return shown
 
     def _doubted(self, *, every: bool) -> tuple[float, Array | None]:
@@ -317,7 +310,10 @@ class ShapeWatch:
         """Return what the tests show for certain of a change that began at some time; None where that is nothing."""
         sums = self._tests.reduced(onset)
         views = np.array([view for t_s, view in self._views if t_s >= onset.begin_s])
-        if len(views) < _LEAST_POSES or not _differ(views):
+        if len(views) < _LEAST_POSES:
+            return None
+        mean = views.mean(axis=0)
+        if np.min(views @ mean) >= np.cos(_VIEWS_RAD) * np.linalg.norm(mean):
             return None
         found, newest = _reduced(sums), _reduced(self._tests.kept[-1].reduced(self._size))
         error = self._focal_alone(found, onset)
@@ -417,14 +413,11 @@ class ShapeWatch:
         columns = _columns([which])
         (d, cov), (now, cov_now) = (self._values(each, columns, 0.0) for each in (whole, newest))
         d, off = d[columns], (now - d)[columns]
-        each = (cov + cov_now)[np.ix_(columns, columns)]
-        if float(off @ np.linalg.solve(each, off)) > newest.excess(newest.gain(columns)) * chi_square_limit(
-            len(off), UNLIKE
-        ):
+        apart = float(squares_of(off, (cov + cov_now)[np.ix_(columns, columns)]))
+        unlike = newest.excess(newest.gain(columns)) * chi_square_limit(len(off), UNLIKE)
+        if apart > unlike or len(self._shots) < _LEAST_SHOTS:
             return False
         first = 1 + self._first + 3 * which
-        if len(self._shots) < _LEAST_SHOTS:
-            return False
         begins = np.cumsum([0, *map(len, self._shots)])[:-1]
         rows = np.concatenate(self._shots)
         along = rows[:, first : first + 3] @ d
@@ -459,9 +452,8 @@ class ShapeWatch:
             share, goes_on = float(error.value[0]), " so far, and it goes on" * error.onset.goes_on
             longer, shorter = ("left", "right") if share > 0 else ("right", "left")
             words = {"longer": longer, "shorter": shorter, "more": goes_on}
-            return make_finding(
-                "focal", (abs(share), float(np.sqrt(error.cov[0, 0]))), since_s, cost_m=cost_m, words=words
-            )
+            evidence = abs(share), float(np.sqrt(error.cov[0, 0]))
+            return make_finding("focal", evidence, since_s, cost_m=cost_m, words=words)
         if error.chosen[0] == SMOOTH:
             return self._smooth_finding(error, since_s, cost_m)
         points = [(each, _columns([each])) for each in error.chosen]
@@ -471,7 +463,7 @@ class ShapeWatch:
         words = {"points": ", ".join(moved), "point": self._names[error.chosen[0]]}
         words["more"] = f"; it may be {others} instead" if others else ""
         name, evidence = (
-            "points" if len(points) > 1 else "point",
+            "point" + "s" * (len(points) > 1),
             sized(error.value[largest], error.cov[np.ix_(largest, largest)]),
         )
         return make_finding(name, evidence, since_s, cost_m=cost_m, words=words)
@@ -486,10 +478,8 @@ class ShapeWatch:
         k = int(np.linalg.norm(shifts, axis=1).argmax())
         rows = slice(2 + 3 * k, 5 + 3 * k)
         strain = 50.0 * float(np.ptp(np.linalg.eigvalsh(rigid + rigid.T)))
-        evidence = sized(shifts[k], error.cov[rows, rows])
-        return make_finding(
-            "strained", evidence, since_s, cost_m=cost_m, words={"strain": strain, "point": self._names[k]}
-        )
+        evidence, words = sized(shifts[k], error.cov[rows, rows]), {"strain": strain, "point": self._names[k]}
+        return make_finding("strained", evidence, since_s, cost_m=cost_m, words=words)
 
 
 def _reduced(sums: ResidualSums) -> _Reduced:
@@ -546,9 +536,3 @@ def _one_is_enough(found: _Reduced) -> bool:
     whole, without = found
     gain, seven = without.gain(_columns([FOCAL])), without.square - whole.square
     return gain >= seven - ALIKE * without.excess(max(gain, seven))
-
-
-def _differ(views: Array) -> bool:
-    """Return whether directions (N, 3) differ enough from their mean."""
-    mean = views.mean(axis=0)
-    return bool(np.min(views @ mean) < np.cos(_VIEWS_RAD) * np.linalg.norm(mean))
