@@ -156,10 +156,10 @@ static void rest(core_state *core)
         governor_hold(&joint->reference, joint->pot.angle_rad);
         joint->released = 0u;
         joint->motor.alone = 0u;
-        joint->pid.integral_duty = 0.0f;
-        joint->pid.duty = 0.0f;
-        joint->pid.error_rad = 0.0f;
-        joint->pid.reference_rad_s = 0.0f;
+        if (joint->pid.duty != 0.0f && motor_stepped(&joint->motor)) { /* its current's answer to the end shows its sign */
+            joint->motor.dither_vv = joint->motor.dither_va = joint->motor.dither_aa = joint->motor.dithers = 0.0f;
+        }
+        joint->pid.integral_duty = joint->pid.duty = joint->pid.error_rad = joint->pid.reference_rad_s = 0.0f;
         joint->limited = 0u;
     }
 }

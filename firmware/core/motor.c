@@ -948,7 +948,7 @@ bool motor_disobeys(const motor_state *motor, const motor_config *config, float 
     const bool as_much = !off || number_size(ir_v - emf_v) < INVERTED * number_size(terminal_v);
     if (number_size(terminal_v - applied_v * per_tick) < STUCK_SUPPLY * supply_v + unsure_v ||
         (as_much && motor->damping_share == 0.0f &&
-         config->resistance_ohm * motor->dither_va < -ANSWER_NONE * motor->dither_vv)) {
+         config->resistance_ohm * motor->dither_va < -ANSWER_NONE * (motor->dither_vv + ANSWER_VV))) {
         return false;
     }
     if (off) { /* the current drives it on, or would if nothing held it: shorted windings brake */
