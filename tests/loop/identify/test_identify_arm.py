@@ -81,6 +81,20 @@ def test_what_is_observable_alone_is_within_its_sigma(scene):
     assert np.sqrt(np.mean(off**2)) < 1.5
 
 
+def test_predicted_poses_and_a_tied_sum_are_within_their_sigma(scene):
+    """J cov J^T is the covariance of poses not fitted: neither the fit's alone, nor one that forgets what is correlated."""
+    w, _, found, _ = scene
+    q, approach = poses(w.nominal, 100, np.random.default_rng(5))
+    T = w.T_rig_body(q, approach)
+    unseen = Measured(q, T[:, None, :3, 3], T[:, :3, :3], None, approach)
+    e, J = found.model.linearised(found.solution.x, unseen)
+    squares = np.einsum("ni,nij,nj->n", e, np.linalg.inv(J @ found.cov @ J.swapaxes(1, 2)), e) / 6
+    assert 0.4 < squares.mean() < 2.5
+    value, sigma = found.value("d2")  # axes 2, 3 and 4 are parallel: it holds the offsets along all of them
+    assert abs(value - w.nominal.d[1] - (w.true.d - w.nominal.d)[1:4].sum()) < 3 * sigma
+    assert "its value also holds what is off in d3, d4" in str(found)
+
+
 def test_hayatis_angle_stands_where_axes_are_parallel_and_nowhere_else(scene):
     _, _, found, _ = scene
     assert "not needed" in found.reasons["beta1"]

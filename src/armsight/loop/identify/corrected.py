@@ -64,7 +64,8 @@ class Corrected(Record):
     @staticmethod
     def of(found: Identified) -> Corrected:
         """Return what was identified, ready for use."""
-        return Corrected(found.model, found.solution.x, np.sqrt(np.diag(found.cov)), found.moved_all_over())
+        sigma = np.where(found.solution.free, np.sqrt(np.diag(found.cov)), 0.0)
+        return Corrected(found.model, found.solution.x, sigma, found.moved_all_over())
 
     def zeros_rad(self) -> Array:
         """Return by how much each joint is further than it reads at zero (n,), rad, beside the nominal table."""

@@ -99,6 +99,7 @@ class Identified(Record):
         prior: (P,) prior sigmas, those of the error sources as large as the data show them to be.
         cov: (P, P) covariance of all that may be off, fitted or not: a fitted number's sigma includes what the error
             sources that were not selected, or hardly show, could still be, and how far leaving them out has moved it.
+            Of a predicted pose it is J cov J^T, J (6, P) by all of them: where the poses are, most of that cancels.
             ``solution.cov`` is that of the fitted ones, the rest taken for nominal.
         cov_everything: (P, P) covariance of all that may be off in the fit of all of it, ``solution.x - moved``.
         moved: (P,) fitted numbers less those of the fit of everything that can be observed: what the selection has
@@ -141,7 +142,8 @@ class Identified(Record):
         lines = [repr(self)]
         for k in np.flatnonzero(self.solution.free):
             p, (value, sigma) = self.model.parameters[k], self.value(self.model.names[k])
-            lines.append(f"{p.name:<16} {value_text(p, value):>16} +- {value_text(p, sigma)}")
+            why = self.reasons.get(p.name, "")
+            lines.append(f"{p.name:<16} {value_text(p, value):>16} +- {value_text(p, sigma)}  {why}".rstrip())
         return "\n".join(lines)
 
     @property
@@ -216,8 +218,7 @@ class Identified(Record):
     def correlation(self, rows: NDArray[np.int64]) -> Array:
         """Return the correlations (R, R) of fitted parameters: how badly these poses distinguish them.
 
-        They are those of the fit. ``cov`` also has what the choice of the model moves, each number by itself, which would
-        hide the correlations of the terms of a sensor's curve.
+        They are those of the fit, without what the choice of the model moves.
         """
         sigma = self.solution.sigma()[rows]
         return np.asarray(self.solution.cov[np.ix_(rows, rows)] / np.outer(sigma, sigma))
@@ -332,7 +333,7 @@ def _identified(
     model = model.with_seen(measured.q[solution.used])
     everything = covariance(model, solution, measured, observable.possible, prior)
     moved = solution.x - whole.x
-    cov = np.where(selection.free[:, None] & selection.free, everything + np.diag(moved**2), 0.0)
+    cov = everything + np.outer(moved, moved)
     found = (model, nominal.x, solution, reasons, selection.steps, observable.singular_values)
     return Identified(*found, prior, cov, everything, moved, scatter_rad)
 

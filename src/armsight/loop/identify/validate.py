@@ -100,9 +100,9 @@ def placement_refitted(found: Identified, measured: Measured) -> tuple[Model, Ar
 
 def _over(model: Model, found: Identified, x: Array, measured: Measured) -> float:
     """Return the RMS of residuals over their predicted sigma: noise and the parameters' covariance."""
-    weighted, free = with_joint_noise(model, x, measured, found.joint_sigma_rad), found.solution.free
-    linear = linear_of(model, x, weighted, free, found.prior)
-    by_fit = linear.J @ found.solution.cov[np.ix_(free, free)] @ linear.J.swapaxes(1, 2)
+    weighted = with_joint_noise(model, x, measured, found.joint_sigma_rad)
+    linear = linear_of(model, x, weighted, np.ones(len(x), bool), found.prior)
+    by_fit = linear.J @ found.cov @ linear.J.swapaxes(1, 2)
     C = covariances(linear, variances_of(linear, found.solution.noise)) + by_fit
     squares = np.einsum("ni,nij,nj->", linear.e, np.linalg.inv(C), linear.e)
     return float(np.sqrt(squares / linear.e.size))
@@ -170,9 +170,8 @@ def with_change_allowed(found: Identified, measured: Measured) -> Identified:
     fitted = found.solution.free
     if change is None or not matters(change.off[:, fitted], found.cov[np.ix_(fitted, fitted)], len(change.columns)):
         return found
-    off = np.where(fitted, change.off, 0.0)
     note = f"from pose {change.row} on {change_text(found.model, change)}: the sigmas allow for it"
-    return replace(found, cov=found.cov + off.T @ off, change=change, notes=(*found.notes, note))
+    return replace(found, cov=found.cov + change.off.T @ change.off, change=change, notes=(*found.notes, note))
 
 
 def check_other(arm: Arm, measured: Measured, other: Measured, name: str) -> None:
