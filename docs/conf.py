@@ -43,11 +43,11 @@ nitpick_ignore_regex = [
     (
         r"py:.*",
         r"armsight\.(loop\.(estimators\.readings|handeye\.poses|identify\.(fit|model|identify|selection))"
-        r"|robot\.trajectories\.limits|tables\.poses)\.\w+",
+        r"|robot\.trajectories\.limits|tables\.poses|estimate\.change)\.\w+",
     ),
     (
         r"py:.*",
-        r"armsight\.vision\.(calibrate\.(change|motion)|markers\.(body_file|targets|disc\.target|discs|spec))\.\w+",
+        r"armsight\.vision\.(calibrate\.motion|markers\.(body_file|targets|disc\.target|discs|spec))\.\w+",
     ),
     (r"py:.*", r"armsight\.sim\.(budget\.plan\.CameraClass|camera\.stages\.\w+)"),
 ]

@@ -294,7 +294,7 @@ def test_without_sigmas_it_is_said_and_rows_that_agree_to_the_last_digit_may(tmp
 
 def test_a_motion_file_is_distinguished_from_attained_poses(tmp_path, capsys):
     assert said(capsys, "plan", "--arm", "six_r", "--test", "line", "-o", tmp_path / "line.toml").code == 0
-    assert_rejected(said(capsys, tmp_path / "line.toml"), "line.toml", "armsight run --motion")
+    assert_rejected(said(capsys, tmp_path / "line.toml"), "line.toml", "a motion file, which --motion")
 
 
 def test_a_row_far_from_its_pose_is_named_and_the_sequence_of_rows_has_no_effect(tmp_path, capsys):

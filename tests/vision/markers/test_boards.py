@@ -366,7 +366,7 @@ def test_boards_are_frozen():
 @pytest.mark.parametrize(
     ("spec", "texts"),
     [
-        ("chessbord:9x6:25mm", ["unknown board", *BOARDS]),
+        ("chessbord:9x6:25mm", ["unknown board", "chessboard:9x6:25mm"]),
         ("chessboard:9x6:25", ["no unit", "mm, cm, m, in"]),
         ("chessboard:9x6:1unit", ["'unit'", "mm, cm, m, in"]),
         ("chessboard:9x6:25MM", ["'MM'"]),

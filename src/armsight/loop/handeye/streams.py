@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.signal import correlate
 
 from armsight.data import Array, Record
 from armsight.errors import CalibrationError, InputError
@@ -151,6 +150,8 @@ def _speeds(stream: PoseStream, step: float, over: int) -> tuple[float, Array, A
 
 def _agreement(hand: PoseStream, eye: PoseStream, step: float, over: int) -> tuple[float, float]:
     """Return how much the speeds differ at best, as a share of what they differ by at other offsets, and the offset, s."""
+    from scipy.signal import correlate  # takes 25 MB, which the live page does not need
+
     (t_hand, a, in_a), (t_eye, b, in_b) = (_speeds(stream, step, over) for stream in (hand, eye))
     most = FASTER * min(float(np.quantile(speed, 0.99)) for speed in (a, b))
     a, in_a, b, in_b = np.where(a > most, 0.0, a), in_a * (a <= most), np.where(b > most, 0.0, b), in_b * (b <= most)
