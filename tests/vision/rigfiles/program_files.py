@@ -239,12 +239,10 @@ def orbslam2():
 
 
 def toml_camera(table, T_camera_world, K, d, rotation="vector", scale=1.0, more=""):
-    r = T_camera_world[:3, :3]
-    r = log_so3(r).tolist() if rotation == "vector" else r.tolist()
-    t = (scale * T_camera_world[:3, 3]).tolist()
+    r = log_so3(T_camera_world[:3, :3]) if rotation == "vector" else T_camera_world[:3, :3]
     return (
         f"[{table}]\n{more}size = {list(SIZE)}\nmatrix = {K.tolist()}\ndistortions = {d.tolist()}\n"
-        f"translation = {t}\nrotation = {r}\n\n"
+        f"translation = {(scale * T_camera_world[:3, 3]).tolist()}\nrotation = {r.tolist()}\n\n"
     )
 
 
@@ -404,6 +402,8 @@ PROGRAMS = {
         {"camera_array.toml": caliscope("matrix")}, {}),
     "aniposelib": ("aniposelib 0.4, CameraGroup.dump; a board in mm", "caliscope",
         {"calibration.toml": caliscope(scale=1e3, tables=("cam_0", "cam_1"), more='name = "A"\nfisheye = false\n') + "[metadata]\nadjusted = false\nerror = 0.26\n"}, MM),
+    "pose2sim": ("pose2sim 0.10.49 of EasyMocap: the size is twice the principal point", "caliscope",
+        {"Calib.toml": caliscope().replace(str(list(SIZE)), "[1266.2, 705.4]", 1).replace(str(list(SIZE)), "[1282.4, 732.8]")}, {"image_size_px": SIZE}),
     "multical": ("multical 0.2, io/export_calib.py with a master", "multical", {"calibration.json": multical(True)}, {}),
     "multical no master": ("multical 0.2, io/export_calib.py", "multical", {"calibration.json": multical(False)}, {}),
     "mrcal 5": ("mrcal 2.4, cameramodel, OPENCV5", "mrcal", {f"{s}.cameramodel": mrcal(s) for s in ("left", "right")}, {}),

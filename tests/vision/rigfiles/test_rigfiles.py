@@ -436,7 +436,7 @@ ROS_DAMAGE = [
     ({"projection_matrix": data(*([0.0] * 12))}, "projection_matrix must be"),
     ({"projection_matrix": data(*np.eye(3, 4).ravel().tolist())}, "holds no baseline"),
     ({"projection_matrix": data(*KR_RIGHT.round(5).ravel().tolist())}, "baseline is lost; run armsight calibrate"),
-    ({"image_width": 12.5}, "whole pixels"),
+    ({"image_width": 12.5}, "whole pixels, got 12.5 x .*: give --image-size"),
     ({"image_width": None}, "image size"),
 ]
 KALIBR_DAMAGE = [
