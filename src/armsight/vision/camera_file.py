@@ -123,7 +123,7 @@ def camera_of(entry: Mapping[str, Any], given_px: tuple[int, int] | None = None)
 def image_size(entry: Mapping[str, Any], given_px: tuple[int, int] | None) -> tuple[tuple[int, int], list[str]]:
     """Return (width, height), px, of an entry or of a person, and notes.
 
-    They must agree, but for a size that a program computed as twice the principal point (Pose2Sim 0.10.49, of EasyMocap).
+    They must agree, but for a broken size that is twice the principal point (Pose2Sim 0.10.49 computes it of EasyMocap's).
     """
     pair = found(entry, SIZE)
     for names in _SIZE_PAIRS:
@@ -138,14 +138,14 @@ def image_size(entry: Mapping[str, Any], given_px: tuple[int, int] | None) -> tu
         return given_px, []
     size = checked(np.ravel(np.asarray(pair, object)), (2,), "image size")
     said = f"{size[0]:g} x {size[1]:g}"
-    if given_px in (None, tuple(size)) and (size >= 1).all() and (size == size.round()).all():
+    if (size != size.round()).any() and given_px and np.allclose(size, 2 * _intrinsics(entry)[2:], rtol=1e-6):
+        return given_px, [f"the file's image size, {said}, is twice its principal point: the one given was taken"]
+    if (size < 1).any() or (size != size.round()).any():
+        raise InputError(f"image size must be whole pixels, got {said}: give --image-size WIDTHxHEIGHT")
+    if given_px in (None, tuple(size)):
         return (int(size[0]), int(size[1])), []
     if given_px == tuple(size[::-1]):
         return given_px, [f"the file's image size is {said}, rows first; read as the {size[1]:g} x {size[0]:g} given"]
-    if given_px is not None and np.allclose(size, 2 * _intrinsics(entry)[2:], rtol=1e-6):
-        return given_px, [f"the file's image size, {said}, is twice its principal point: the one given was taken"]
-    if given_px is None or (size != size.round()).any() or (size < 1).any():
-        raise InputError(f"image size must be whole pixels, got {said}: give --image-size WIDTHxHEIGHT")
     raise InputError(f"the images are {said}, which is not the {given_px[0]} x {given_px[1]} given")
 
 

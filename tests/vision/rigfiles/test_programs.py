@@ -39,6 +39,7 @@ from program_files import (
 from armsight.errors import InputError
 from armsight.geometry.pose import inverse, pose
 from armsight.geometry.rotation import exp_so3
+from armsight.vision.camera_file import camera_of
 from armsight.vision.rigfiles import FORMATS, import_rig, open_format
 
 
@@ -254,6 +255,7 @@ SIZES = [
     for name in ("ros files", "rostopic", "camchain", "openvins", "euroc", "basalt", "orbslam3", "caliscope", "multical", "mrcal 5")
 ] + [
     ("stereo_calib", MM | SHARED, None, r"principal point \(633.1, 352.7\) lies outside of images of|principal point"),
+    ("pose2sim", SHARED, None, r"1266.2 x 705.4, is twice its principal point: the one given|lies outside of images of 640x480"),
     ("zed", SHARED, None, r"resolutions in it: HD 1280x720; give --image-size"),
 ]  # fmt: skip
 
@@ -274,6 +276,12 @@ def test_whose_files_units_and_sizes(tmp_path, name, options, format_, said):
     paths = write(tmp_path, PROGRAMS[name][2])
     lines = reported(format_, paths, PROGRAMS[name][3] | options)
     assert any(re.search(said, line) for line in lines), lines
+
+
+def test_a_whole_size_that_is_twice_the_principal_point_must_agree():
+    entry = {"size": [1280, 720], "matrix": [[800, 0, 640], [0, 800, 360], [0, 0, 1]], "distortions": [0.0] * 5}
+    with pytest.raises(InputError, match="1280 x 720, which is not the 1920 x 1080 given"):
+        camera_of(entry, (1920, 1080))
 
 
 @pytest.mark.parametrize(("name", "some", "said"), COUNTS)
