@@ -22,8 +22,9 @@ import armsight
 from armsight.app.identify.report import assess, headline
 from armsight.errors import InputError
 from armsight.geometry.pose import pose
+from armsight.loop.handeye.poses import HeldOut
 from armsight.loop.identify.corrected import Corrected
-from armsight.loop.identify.identify import Errors, Validation
+from armsight.loop.identify.identify import Validation
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.model import Model
 from armsight.loop.identify.read import read_measured, read_poses
@@ -90,7 +91,7 @@ def test_an_identified_arm_is_better_only_where_it_corrects_something_by_more_th
 
     def grade(less_m, fitted, poses=40):
         off = (2e-3 + noise[:poses], 2e-3 - less_m + 0 * noise[:poses])
-        held_out = Validation(*(Errors(each, np.zeros(0)) for each in off), False, 1.0)
+        held_out = Validation(*(HeldOut(each, np.zeros(0)) for each in off), False, 1.0)
         model = SimpleNamespace(parameters=[SimpleNamespace(kind="a")])
         found = SimpleNamespace(
             model=model, solution=SimpleNamespace(free=np.array([fitted])), moved_all_over=lambda: (1.0, 0.0)

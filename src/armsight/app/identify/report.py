@@ -237,7 +237,7 @@ def _is_better(run: Identification) -> bool:
 
 def assess(run: Identification) -> tuple[Grade, str]:
     """Return the grade of an identification, and in one sentence what to do with it."""
-    before, after = (1e3 * e.summary()["mean_m"] for e in (run.held_out.nominal, run.held_out.identified))
+    before, after = (1e3 * e.mean()[0] for e in (run.held_out.nominal, run.held_out.identified))
     if not _is_better(run):
         why = f"the nominal arm of {run.arm.name} predicts as well"
         return "poor", f"Do not use this identification: {why}; take more poses."

@@ -12,8 +12,9 @@ Kronecker product", J. Mechanisms Robotics 5(3), 2013).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -160,33 +161,38 @@ Eye = Literal["to_hand", "in_hand", "to-hand", "in-hand"]
 MIN_POSES = 4  # fewest poses: three determine both transforms, and what is left out must leave three
 
 
-@dataclass(frozen=True, eq=False)
-class HeldOut(Record):
-    """Prediction errors of poses left out of the fit.
+class HeldOut(NamedTuple):
+    """Prediction errors of poses left out of the fit."""
 
-    Attributes:
-        position_m: (N,) distance between the body's middle measured and predicted; NaN where a pose was not used.
-        angle_rad: (N,) angle between the body's rotations measured and predicted.
-    """
-
+    #: (N,) distance between the body's middle measured and predicted, (N, K) of K points; NaN of a pose not used
     position_m: Array
-    angle_rad: Array
+    angle_rad: Array  #: (N,) angle between the body's rotations measured and predicted; empty with points only
 
     def mean(self) -> tuple[float, float]:
-        """Return the means, m and rad."""
-        return float(np.nanmean(self.position_m)), float(np.nanmean(self.angle_rad))
+        """Return the means, m and rad; NaN where there are none, also below."""
+        return self._by(np.nanmean)
 
     def rms(self) -> tuple[float, float]:
         """Return the root mean squares, m and rad."""
-        return float(np.sqrt(np.nanmean(self.position_m**2))), float(np.sqrt(np.nanmean(self.angle_rad**2)))
+        return self._by(lambda e: np.sqrt(np.nanmean(e**2)))
 
     def rows(self, rows: NDArray[np.int64]) -> HeldOut:
-        """Return a part of the poses."""
+        """Return a part of full poses."""
         return HeldOut(self.position_m[rows], self.angle_rad[rows])
 
     def most(self) -> tuple[float, float]:
         """Return the greatest, m and rad."""
-        return float(np.nanmax(self.position_m)), float(np.nanmax(self.angle_rad))
+        return self._by(np.nanmax)
+
+    def summary(self) -> dict[str, float]:
+        """Return mean_m, rms_m and max_m, and of full poses also mean_rad, rms_rad and max_rad."""
+        each = {"mean": self.mean(), "rms": self.rms(), "max": self.most()}
+        units = ("m", "rad") if self.angle_rad.size else ("m",)
+        return {f"{name}_{unit}": values[k] for k, unit in enumerate(units) for name, values in each.items()}
+
+    def _by(self, law: Callable[[Array], float]) -> tuple[float, float]:
+        position, angle = (float(law(e)) if e.size else np.nan for e in self)
+        return position, angle
 
 
 def is_in_hand(eye: Eye) -> bool:

@@ -18,6 +18,7 @@ from armsight.data import Array, Record
 from armsight.errors import CalibrationError, InputError, nearest
 from armsight.estimate.change import StateChange
 from armsight.geometry.pose import left_jacobian
+from armsight.loop.handeye.poses import HeldOut
 from armsight.loop.identify.fit import Mask, Solution, covariance, fit, joint_noise, prior_sigma, with_joint_noise
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.misread import check_plausible, without_tool
@@ -38,27 +39,11 @@ CORRELATED = 0.9  # correlations larger than this are reported
 _TABLE = ("offset", "d", "a", "alpha", "beta")
 
 
-class Errors(NamedTuple):
-    """Distances between the predicted and the measured tool."""
-
-    position_m: Array  #: (N, K) of every point
-    angle_rad: Array  #: (N,) of the body's rotation; empty with points only
-
-    def summary(self) -> dict[str, float]:
-        """Return mean_m, rms_m and max_m, and of full poses also mean_rad, rms_rad and max_rad."""
-        out: dict[str, float] = {}
-        for name, e in (("m", self.position_m), ("rad", self.angle_rad)):
-            if e.size:
-                out |= {f"mean_{name}": float(e.mean()), f"rms_{name}": float(np.sqrt(np.mean(e**2)))}
-                out[f"max_{name}"] = float(e.max())
-        return out
-
-
 class Validation(NamedTuple):
     """Nominal and identified arm on one set of poses."""
 
-    nominal: Errors  #: errors of the nominal arm, its base and tool fitted to the same poses as the identified one's
-    identified: Errors  #: errors of the identified arm
+    nominal: HeldOut  #: errors of the nominal arm, its base and tool fitted to the same poses as the identified one's
+    identified: HeldOut  #: errors of the identified arm
     placement_refitted: bool  #: whether base and tool were fitted to these very poses
     residual_over_predicted: float  #: RMS residual over the predicted sigma; 1 where the sigmas are honest
 
@@ -69,7 +54,7 @@ class Validation(NamedTuple):
 
     def __repr__(self) -> str:
         """Return the mean errors of both arms, mm, and whether the sigmas are honest."""
-        mean, nominal = (1e3 * float(each.position_m.mean()) for each in (self.identified, self.nominal))
+        mean, nominal = (1e3 * each.mean()[0] for each in (self.identified, self.nominal))
         return (
             f"Validation({len(self.identified.position_m)} poses: {mean:.3f} mm mean, nominal arm {nominal:.3f} mm; "
             f"residual over sigma {self.residual_over_predicted:.2f})"

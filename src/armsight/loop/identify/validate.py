@@ -16,8 +16,9 @@ from armsight.data import Array
 from armsight.errors import CalibrationError, InputError, noted, require
 from armsight.estimate.change import matters
 from armsight.estimate.solve import covariances
+from armsight.loop.handeye.poses import HeldOut
 from armsight.loop.identify.fit import fit, linear_of, variances_of, with_joint_noise
-from armsight.loop.identify.identify import Errors, Identified, LeftOut, Validation, identify
+from armsight.loop.identify.identify import Identified, LeftOut, Validation, identify
 from armsight.loop.identify.measured import Measured, Read, measured_of, visits
 from armsight.loop.identify.misread import check_plausible, without_tool
 from armsight.loop.identify.model import Model
@@ -36,14 +37,14 @@ TOO_SMALL = 1e-3
 FAR_M = 0.1
 
 
-def errors(model: Model, x: Array, measured: Measured) -> Errors:
+def errors(model: Model, x: Array, measured: Measured) -> HeldOut:
     """Return the errors of a parameter vector on poses."""
     e = model.residuals(x, measured)
     if measured.length_m is not None:
-        return Errors(np.abs(e), np.zeros(0))
+        return HeldOut(np.abs(e), np.zeros(0))
     if measured.R_rig_body is None:
-        return Errors(np.linalg.norm(e.reshape(len(e), -1, 3), axis=2), np.zeros(0))
-    return Errors(np.linalg.norm(e[:, None, :3], axis=2), np.linalg.norm(e[:, 3:], axis=1))
+        return HeldOut(np.linalg.norm(e.reshape(len(e), -1, 3), axis=2), np.zeros(0))
+    return HeldOut(np.linalg.norm(e[:, None, :3], axis=2), np.linalg.norm(e[:, 3:], axis=1))
 
 
 def validate(found: Identified, measured: Measured | Read) -> Validation:
@@ -212,7 +213,7 @@ def _left_out(
         done.append(validate(identify(arm, others, priors=priors), measured.rows(part)))
     over = float(np.sqrt(np.mean([v.residual_over_predicted**2 for v in done])))
     nominal, identified = (
-        Errors(*map(np.concatenate, zip(*each, strict=True)))
+        HeldOut(*map(np.concatenate, zip(*each, strict=True)))
         for each in ([v.nominal for v in done], [v.identified for v in done])
     )
     rows, again = np.concatenate(tried), len(which) - len(shuffled)
