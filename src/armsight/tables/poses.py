@@ -75,6 +75,7 @@ class PoseTable(Record):
     missed: tuple[str, ...] = ()  #: (N,) why a row has no pose, and another's stands there; "" where it has one
     of_joints: bool = False  #: whether the poses are those of the joints by the model
     unused: tuple[str, ...] = ()  #: the columns that were not read
+    located: bool = False  #: whether there are columns of positions, read or not
 
     def without_missed(self) -> PoseTable:
         """Return the rows that have a pose, with a note on the others."""
@@ -139,7 +140,8 @@ def read_pose_table(
         )
     nothing = np.zeros((len(table.rows), 0))
     numbers, written, convention, unit_m, of_joints = nothing, nothing, "", 1.0, False
-    if q is None or (table.at.keys() & {"x", "x_m", "x_mm"} and not (only_joints and arm is not None)):
+    located = bool(table.at.keys() & {"x", "x_m", "x_mm"})
+    if q is None or (located and not (only_joints and arm is not None)):
         p, unit_m, found_out = _positions(table, unit, detect_units, side)
         notes = (*notes, *found_out)
         R, numbers, convention, written = table.rotations(rotation, PREFIX[side])
@@ -161,9 +163,8 @@ def read_pose_table(
     if unused and not only_joints and not set(table.at) >= _MEASURED:
         notes = (*notes, f"{path}: {columns_unused(unused)}")
     missed = tuple(table.missed or ())
-    found = PoseTable(
-        path, lines, Ts, numbers, written, convention, q, t_s, row_names, unit_m, notes, missed, of_joints, unused
-    )
+    rows, how = (lines, Ts, numbers, written), (of_joints, unused, located)
+    found = PoseTable(path, *rows, convention, q, t_s, row_names, unit_m, notes, missed, *how)
     return found if keep_missed else found.without_missed()
 
 

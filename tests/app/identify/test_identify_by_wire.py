@@ -36,15 +36,29 @@ def files(folder, *, timed):
     return "--arm", str(arm), "--data", str(folder / "joints.csv"), "--references", str(folder / "references.toml")
 
 
+def with_positions(folder, names, numbers):
+    """Add columns to the joints, and take all out of row 10."""
+    head, *rows = (folder / "joints.csv").read_text().splitlines()
+    rows = [f"{row},{numbers}" for row in rows]
+    rows[9] = "," * rows[9].count(",")
+    (folder / "joints.csv").write_text("\n".join([f"{head},{names}", *rows]) + "\n")
+
+
 def test_one_wire_finds_a_longer_link_and_its_hooks(tmp_path, capsys):
     for timed in (False, True):
-        found = said_of(capsys, "identify", *files(tmp_path, timed=timed), "--json").one
+        given = files(tmp_path, timed=timed)
+        if not timed:
+            with_positions(tmp_path, "x_cm,y_cm,z_cm", "1,2,3")
+        found = said_of(capsys, "identify", *given, "--json", *([] if timed else ["-o", tmp_path / "out"])).one
         before, after = (found[key]["mean_m"] for key in ("nominal", "identified"))
         assert after < 0.5 * before, timed
         a2 = next(each for each in found["parameters"] if each["name"] == "a2")
         assert abs(a2["value"] - FOUR.a[1] - 4e-3) < 4 * a2["sigma"], timed
-        assert found["poses"] == ROWS - len(HOOKED), timed
+        assert found["poses"] == ROWS - len(HOOKED) - (not timed), timed
+        assert ("columns not used: x_cm, y_cm, z_cm" in json.dumps(found)) is not timed
         assert "lines 32 to 37: the wire reads" in json.dumps(found), timed  # line 1 has the names
+    assert (tmp_path / "out" / "corrected.toml").exists()
+    assert not (tmp_path / "out" / "zeros.toml").exists()  # one wire shows no zero alone
 
 
 def test_what_does_not_fit_is_one_line(tmp_path, capsys):
@@ -55,3 +69,6 @@ def test_what_does_not_fit_is_one_line(tmp_path, capsys):
     assert_rejected(said_of(capsys, "identify", *given), "joints.csv: line 1: a column t_s is needed")
     (tmp_path / "references.toml").write_text('[imu]\nkind = "inertial"\n')
     assert_rejected(said_of(capsys, "identify", *given), "0 tables of kind range; expected one, with a source")
+    files(tmp_path, timed=False)
+    with_positions(tmp_path, "x,y,z", "100,200,300")
+    assert_rejected(said_of(capsys, "identify", *given), "joints.csv: positions of up to 300 m: name x_mm, y_mm, z_mm")

@@ -146,19 +146,21 @@ def test_bad_input_is_one_line(sweep, capsys, tmp_path, toml, change, said):
 
 
 def test_gravity_shows_a_tilted_base_and_says_what_is_open(capsys, tmp_path):
-    """The nominal arm rests 30 times on a base tilted by 0.5 degrees; the sensor's mounting is not known."""
-    rng, arm = np.random.default_rng(5), open_arm("six_r")
+    """The nominal arm rests 30 times on a base tilted by 0.5 degrees; the sensor, of unknown mounting, is late."""
+    late, rng, arm = 0.3, np.random.default_rng(5), open_arm("six_r")
     q = arm.home + rng.uniform(-1.2, 1.2, (30, 6))
     true = Inertial.of("imu").moved(np.concatenate([[0.1, 0.2, -0.3], np.zeros(33), np.radians([0.5, -0.3])]))
     rows = []
     for k, T in enumerate(arm.forward(q)):
         for t in 2.0 * k + np.arange(-0.3, 0.3, 0.02):
-            rows.append([t, *rng.normal(0.0, 1e-3, 3), *(true.expected(ToolMotion(T), 1).z + rng.normal(0.0, 0.02, 3))])
+            rows.append(
+                [t + late, *rng.normal(0.0, 1e-3, 3), *(true.expected(ToolMotion(T), 1).z + rng.normal(0.0, 0.02, 3))]
+            )
     write(tmp_path / "imu.csv", np.array(rows))
     head = "t_s," + ",".join(f"q{k}_deg" for k in range(1, 7))
     rests = np.column_stack([2.0 * np.arange(30), np.degrees(q)])
     np.savetxt(tmp_path / "joints.csv", rests, "%.6f", ",", header=head, comments="")
-    (tmp_path / "r.toml").write_text('[imu]\nkind = "inertial"\nsource = "imu.csv"\n')
+    (tmp_path / "r.toml").write_text(f'[imu]\nkind = "inertial"\nsource = "imu.csv"\ndelay_s = {late}\n')
     given = "references", "gravity", tmp_path / "r.toml", "--model", "six_r", "--joints", tmp_path / "joints.csv"
     said = said_of(capsys, *given, "--json").done()
     hold_keys(given, said.out)

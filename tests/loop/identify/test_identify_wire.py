@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 
 from armsight.data import Array
-from armsight.loop.identify.lengths import identify_wire, unrounded
+from armsight.errors import InputError
+from armsight.loop.identify.lengths import identify_wire, unrounded, without_blunders
 from armsight.robot.arm_file import open_arm
 
 ROWS, NOISE_M, STEP_RAD, STEP_M = 90, 2e-4, np.deg2rad(0.1), 1e-4
@@ -44,9 +48,38 @@ def test_a_position_says_what_rounding_took_away() -> None:
     q, printed, _, p = _recording(4)
     printed[LOST, 5] *= -1
     sigma = STEP_RAD / np.sqrt(12)
-    better, agree = unrounded(open_arm("irb120"), printed, p, sigma, STEP_M / np.sqrt(12))
+    better, agree = unrounded(open_arm("irb120"), printed, p, STEP_M / np.sqrt(12))
     assert agree.all()
     T, T_true = open_arm("irb120").forward(better), open_arm("irb120").forward(q)
     apart = np.linalg.norm(T[:, :3, 3] - T_true[:, :3, 3], axis=1)
     assert apart.max() < STEP_M  # rounding alone moves it by 0.3 mm
     assert np.abs(better - printed).max() < 3 * sigma
+
+
+@pytest.mark.parametrize("step_rad", [1e-4, 1e-5, np.deg2rad(360 / 4096), np.deg2rad(1e-3), np.deg2rad(1.0)])
+def test_no_assumption_of_the_joints_step_decides(step_rad: float) -> None:
+    rng, arm = np.random.default_rng(1), open_arm("ur5")
+    q = rng.uniform(-1.5, 1.5, (60, 6))
+    p = arm.forward(q)[:, :3, 3]
+    length, printed = np.linalg.norm(p - [1.2, 0.3, 0.4], axis=1), np.round(q / step_rad) * step_rad
+    length += NOISE_M * rng.standard_normal(60)
+    off = np.round(p, 6)
+    off[[4, 30]] += 0.1
+    measured, _, blunders = without_blunders(arm, printed, length, off)
+    assert [rows.tolist() for rows, text in blunders if "contradicts" in text] == [[4], [30]]
+    good = ~np.isin(np.arange(60), [4, 30])
+    better, rounded = (
+        np.linalg.norm(arm.forward(each)[good, :3, 3] - p[good], axis=1) for each in (measured.q, printed)
+    )
+    assert np.median(better) < 0.2 * np.median(rounded)
+
+
+@pytest.mark.parametrize(
+    ("longer_m", "said"), [(1e-3, "0.58 mm as another table"), (0.02, "in 60 of 60 rows: other arm")]
+)
+def test_positions_of_another_table_are_no_rounding(longer_m: float, said: str) -> None:
+    rng, arm = np.random.default_rng(1), open_arm("ur5")
+    q = rng.uniform(-1.5, 1.5, (60, 6))
+    p = replace(arm, a=arm.a + longer_m * np.eye(6)[1]).forward(q)[:, :3, 3]
+    with pytest.raises(InputError, match=said):
+        without_blunders(arm, np.round(q, 4), np.linalg.norm(p, axis=1), np.round(p, 6))

@@ -101,7 +101,7 @@ def command(
     if output is not None:  # last: what was found is printed and stored before anything is drawn
         report.write(output)
     if output is not None and not as_json:
-        click.echo(f"\nwritten: {output}/{', '.join(FILES)}")
+        click.echo(f"\nwritten: {output}/{', '.join(each for each in FILES if (output / each).exists())}")
 
 
 def _by_wire(arm: Arm, data: Path, references: Path, columns: tuple[str, ...], progress: Callable[[str], None]) -> Read:

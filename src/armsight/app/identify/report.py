@@ -245,7 +245,7 @@ def assess(run: Identification) -> tuple[Grade, str]:
     if run.measured.length_m is not None:
         return (
             "fair",
-            f"Usable for the wire's point near these poses: {said}; one wire shows no attitude: no zeros alone.",
+            f"Usable for the wire's point near these poses: {said}; one wire shows no attitude, so there is no zeros.toml.",
         )
     if elsewhere := undetermined(*run.found.moved_all_over()):
         return "fair", f"Usable near these poses only: there {said}; {elsewhere}."
@@ -312,7 +312,10 @@ def write_results(run: Identification, report: Report, out: Path) -> None:
     corrected = Corrected.of(run.found)
     corrected.save(out / "corrected.toml")
     write_text(out / "corrected.urdf", corrected.urdf())
-    write_text(out / "zeros.toml", zeros_text(run.found))
+    if run.measured.length_m is None:
+        write_text(out / "zeros.toml", zeros_text(run.found))
+    else:  # one wire shows no joint's zero alone; those of an earlier run are not this arm's
+        (out / "zeros.toml").unlink(missing_ok=True)
     write_text(out / "parameters.csv", table_text(ParameterRow._fields, parameter_rows(run)))
     write_text(out / "identify.json", report.json_text())
 

@@ -72,7 +72,7 @@ def gravity_report(entry: Entry, model: str, joints: Path) -> Report:
     check_rests(str(joints), len(table.q))  # before the recording, which may take long
     source, t_s, z = _recording(entry)
     readings = []
-    for rest, at in enumerate(table.t_s - unit.delay_s):
+    for rest, at in enumerate(table.t_s + unit.delay_s):
         rows = np.flatnonzero(np.abs(t_s - at) <= REST_S / 2)
         if len(rows) < 8:
             raise InputError(

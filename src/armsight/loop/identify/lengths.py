@@ -3,8 +3,9 @@
 In: joint angles and lengths, and the tool's position as the controller computes it, where the file has it. Out: the
 identified arm with anchor and tool point, and which rows are blunders, with what is wrong about them.
 
-A controller prints joints to a tenth of a degree and computes its own position from unrounded ones. The position (its last
-digit's rounding, uniform) says most of what the rounding took away; a row where it does not fit contradicts itself.
+A controller prints joints to a tenth of a degree and computes its own position from unrounded ones. The position says most
+of what the rounding took away. How large that is, in whatever unit or encoder's steps, is estimated as one variance from
+how far positions are from joints; a row that is further off contradicts itself.
 
 A wire hooks or slips and reads too long for many rows in a row, and a file loses the sign of a joint for a whole block: a
 tenth of the rows and more, that agree with each other. Least squares fits them. So the search for blunders begins at the
@@ -24,6 +25,7 @@ from numpy.typing import NDArray
 from armsight.data import Array
 from armsight.errors import InputError
 from armsight.estimate.chance import chi_square_limit
+from armsight.files import columns_unused
 from armsight.loop.identify.fit import Mask, fit, prior_sigma
 from armsight.loop.identify.identify import Identified, identify
 from armsight.loop.identify.measured import Measured
@@ -36,6 +38,7 @@ from armsight.loop.references.distance import Distance
 from armsight.loop.references.file import read_lengths, read_references
 from armsight.robot.kinematics.arm import Arm
 from armsight.tables.cells import Renames
+from armsight.tables.lengths import REACH
 from armsight.tables.poses import read_pose_table
 
 SHARE = 0.75  # of the rows; the least trimmed squares fit these; half: fewer than are needed, double: blunders pull
@@ -47,7 +50,11 @@ CHANCE = 1e-4  # of a good row beyond the limit; half, double: one row in ten th
 AGREE = 1e-6  # chance of a joint's sign that is found by mistake; half, double: nothing
 REST_S = 0.25  # s; so long about a row's time the arm rests; half: noise, double: arms that go on early pull
 #: What rounding hides at least, rad and m, as positions are computed in single precision; half, double: nothing.
-LEAST_ROUNDED = np.array([1e-7, 1e-7])
+LEAST_ROUNDED = 1e-7
+MOST_ROUNDED = 5.1e-3  # rad; sigma of whole degrees; half: these are taken for another arm's, double: nothing
+#: Positions may be off by so much, m, in a way that a table of the arm explains, and by this share of the variance beside;
+#: half, double: another table or a controller's tool is found where it hardly matters, or passes where it does.
+SYSTEMATIC_M, RANDOM = 1e-4, 0.25
 JOIN = 3  # rows; blunders so near each other are one run; half: more lines for the same slip
 
 
@@ -72,21 +79,44 @@ class WireIdentified(NamedTuple):
         return -self.identified.solution.x[:3]
 
 
-def unrounded(arm: Arm, q: Array, p_base: Array, sigma_rad: float, sigma_m: float) -> tuple[Array, Mask]:
+def unrounded(arm: Arm, q: Array, p_base: Array, sigma_m: float) -> tuple[Array, Mask]:
     """Return joints (N, n) without rounding, rad, and which rows agree with the controller's position.
 
     ``arm``: as the controller has it: the nominal arm. ``q``: (N, n) rounded, rad. ``p_base``: (N, 3) the tool's origin
-    as the controller computes it, m. ``sigma_rad``: of the joints' rounding: its step over the root of 12. ``sigma_m``:
-    of the position's rounding.
+    as the controller computes it, m. ``sigma_m``: of the position's rounding.
+
+    Raises:
+        InputError: the positions are those of another table of the arm, or of a tool.
     """
     model = Model(without_tool(arm), 1, False, ())
     measured = Measured(q, p_base[:, None])
     e, J = model.linearised(model.nominal(), measured)
-    B = sigma_rad * J[:, :, model.table_at : model.sources_at : 5] * model.arm.direction
-    C = np.linalg.inv(B @ B.swapaxes(1, 2) + sigma_m**2 * np.eye(3))
-    agree = np.einsum("ni,nij,nj->n", e, C, e) < chi_square_limit(3, CHANCE / len(q))
-    off = -sigma_rad * np.einsum("nij,nik,nk->nj", B, C, e)
-    return q + off * agree[:, None], np.asarray(agree)
+    B = J[:, :, model.table_at : model.sources_at : 5] * model.arm.direction
+
+    def weighed(sigma_rad: float) -> tuple[Array, Array]:
+        C = np.linalg.inv(sigma_rad**2 * B @ B.swapaxes(1, 2) + sigma_m**2 * np.eye(3))
+        return np.asarray(C), np.asarray(np.einsum("ni,nij,nj->n", e, C, e))
+
+    low, sigma_rad = LEAST_ROUNDED, MOST_ROUNDED
+    for _ in range(30):  # the median, which blunders hardly move, is that of chi square
+        middle = float(np.sqrt(low * sigma_rad))
+        if np.median(weighed(middle)[1]) > chi_square_limit(3, 0.5):
+            low = middle
+        else:
+            sigma_rad = middle
+    C, squares = weighed(sigma_rad)
+    agree = np.asarray(squares < chi_square_limit(3, CHANCE / len(q)))
+    W = np.linalg.cholesky(C[agree]).swapaxes(1, 2)
+    left, S = (W @ e[agree][:, :, None]).ravel(), (W @ J[agree]).reshape(-1, J.shape[2])
+    step, _, rank, _ = np.linalg.lstsq(S, left)
+    off_m = float(np.sqrt(np.mean(e[agree] ** 2))) if len(left) > rank else 0.0
+    if off_m > SYSTEMATIC_M and np.sum((left - S @ step) ** 2) / (len(left) - rank) < RANDOM * np.mean(left**2):
+        raise InputError(
+            f"{arm.name}: positions are off the joints by {1e3 * off_m:.2g} mm as another table of the arm or a tool "
+            "explains: give the controller's own table and the flange's positions, or leave them out"
+        )
+    off = -(sigma_rad**2) * np.einsum("nij,nik,nk->nj", B, C, e)
+    return q + off * agree[:, None], agree
 
 
 class WireRead(NamedTuple):
@@ -111,12 +141,18 @@ def read_wire(data: Path, arm: Arm, references: Path, columns: Renames | None = 
     ranges = [each for each in read_references(references) if isinstance(each.reference, Distance)]
     if len(ranges) != 1 or (source := ranges[0].source) is None:
         raise InputError(f"{references}: {len(ranges)} tables of kind range; expected one, with a source")
-    table = read_pose_table(data, arm=arm, columns=columns, only_joints=True)
+    table = read_pose_table(data, arm=arm, columns=columns, only_joints=True, keep_missed=True)
     assert table.q is not None  # only_joints
-    p, rows, notes = None, np.arange(len(table.q)), table.notes
-    if {"x_m", "x_mm"} & set(table.unused):
+    p, good, notes = None, np.array([not why for why in table.missed]), table.without_missed().notes
+    rows = np.flatnonzero(good)
+    if table.located:
         read = read_poses(data, columns=columns, arm=arm)
-        p, rows, notes = read.measured.p_rig[:, 0], np.searchsorted(table.lines, read.lines), read.notes
+        rows, notes = np.searchsorted(table.lines, read.lines), read.notes
+        p, rows = read.measured.p_rig[good[rows], 0], rows[good[rows]]
+        if (far := np.abs(p).max()) > REACH.most_m:
+            raise InputError(f"{data}: positions of up to {far:.0f} m: name x_mm, y_mm, z_mm if they are in mm")
+    elif table.unused:
+        notes = (*notes, f"{data}: {columns_unused(table.unused)}")
     (t_s, z), lines = read_lengths(source), table.lines[rows].astype(float)
     if t_s is None:
         if len(z) != len(table.q):
@@ -146,8 +182,7 @@ def without_blunders(
     """Return rows as measured, which (N,) of them are good, and the others; arguments as for :func:`identify_wire`."""
     good, blunders = np.ones(len(q), np.bool_), []
     if p_base is not None:
-        steps = np.deg2rad(_step(np.rad2deg(q))), 1e-3 * _step(1e3 * p_base)
-        q, good = unrounded(arm, q, p_base, *np.maximum(np.array(steps) / np.sqrt(12), LEAST_ROUNDED))
+        q, good = unrounded(arm, q, p_base, max(1e-3 * _step(1e3 * p_base) / np.sqrt(12), LEAST_ROUNDED))
         if good.sum() < SHARE * len(q):
             raise InputError(
                 f"{arm.name}: positions contradict the joints in {(~good).sum()} of {len(q)} rows: other arm?"
@@ -182,7 +217,7 @@ def identify_wire(
     """Identify an arm, the anchor and the tool's point by the lengths of one wire.
 
     ``q``: (N, n) joints, rad. ``length_m``: (N,) of the wire, m. ``p_base``: (N, 3) the tool's origin as the controller
-    computes it, m; None: not known. What joints and positions are rounded to is found from them.
+    computes it, m; None: not known. What joints and positions are rounded by is found from them.
 
     Raises:
         InputError: so many rows contradict the rest that no arm of this kind explains them.
