@@ -8,7 +8,6 @@ lacks.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,6 +24,7 @@ _PARTS = 100
 #: Random orders, as many by pose, and the share of the first that may look as changed; half and double: another rate of
 #: false alarms.
 _ORDERS, _CHANCE = 200, 0.005
+_AT_ONCE = 40  # parts that orders are tested in; half: twice the memory, double: more calls
 #: Neighbours that are moved together at most, as a share of all; half: errors that they share look as a change.
 _TOGETHER = 1 / 16
 #: Least square of a change in sigmas, per number; half: changes that sigmas hold are named, double: fewer.
@@ -40,7 +40,7 @@ class StateChange(Record):
     row: int  #: the first measurement after it
     way: str  #: what changed, of the ways given
     columns: NDArray[np.intp]  #: which unknowns change so
-    off: Array  #: (2, P) the unknowns before and after it, less those of the fit to all
+    off: Array  #: (2, P) the unknowns before and after it, less those of one state of all
     sure: bool  #: whether it is larger than what the model lacks, which depends on the pose
     before: float  #: RMS of the residuals in one state, in sigmas
     left: float  #: the same in two
@@ -70,6 +70,7 @@ def changed(
     poses: Array,
     *,
     known: Array | None = None,
+    at: Array | float = 0.0,
     count: int | None = None,
 ) -> StateChange | None:
     """Return how the unknowns changed; None where one state fits all, or there are too few measurements.
@@ -80,6 +81,7 @@ def changed(
         ways: name -> which unknowns change together.
         poses: (N, F) what the model's errors may depend on, in any unit.
         known: (P,) information about the unknowns beside the residuals.
+        at: (P,) where the unknowns are, from where that information has them.
         count: the first so many are in the order of time, and the others in none; None: all are.
     """
     n = len(e) if count is None else count
@@ -92,7 +94,7 @@ def changed(
     H = flat.T @ flat + np.diag(prior)
     unit = 1 / np.sqrt(np.maximum(np.diag(H), 1e-300))
     root = np.linalg.cholesky(unit[:, None] * H * unit + _RIDGE * np.eye(len(unit)))
-    slope = solve_triangular(root, unit * (flat.T @ e.ravel()), lower=True)
+    slope = solve_triangular(root, unit * (flat.T @ e.ravel() - prior * at), lower=True)
     starts = np.unique(np.linspace(0, n, min(n, _PARTS) + 1).round().astype(int))[:-1]
     J, e = J[:n] * unit, e[:n]
     some = J[:, :, columns]
@@ -100,61 +102,65 @@ def changed(
     A, B, g = (np.add.reduceat(each, starts, axis=0) for each in cross)
     A = np.asarray(solve_triangular(root, A.swapaxes(0, 1).reshape(len(root), -1), lower=True))
     A = A.reshape(len(root), len(B), -1).swapaxes(0, 1)
-
-    def gains(order: NDArray[np.intp]) -> tuple[Array, list[Array]]:
-        """Return by how much each way lowers the squares (W, K), at each of K splits, and its steps (K, p)."""
-        A_after, B_after, g_after = (np.cumsum(each[order][::-1], axis=0)[-2::-1] for each in (A, B, g))
-        M, v = B_after - A_after.swapaxes(1, 2) @ A_after, g_after - slope @ A_after
-        steps = [np.linalg.solve(M[:, p[:, None], p] + _RIDGE * np.eye(len(p)), v[:, p, None])[..., 0] for p in own]
-        return np.array([(v[:, p] * x).sum(axis=1) for p, x in zip(own, steps, strict=True)]), steps
-
-    parts = len(starts)
-    middle = np.add.reduceat(poses[:n], starts, axis=0) / np.diff(np.append(starts, n))[:, None]
+    g = g - slope @ A
     inner = np.flatnonzero((starts[1:] >= least) & (starts[1:] <= n - least))
-    found, steps = gains(np.arange(parts))
-    random = np.random.default_rng(0)
-    by_chance, by_pose = (
-        np.array([gains(order)[0][:, inner].max(axis=1) for order in orders])
-        for orders in (_random_orders(parts, random), _orders_by(middle, np.random.default_rng(1)))
-    )
-    usual = np.maximum(by_chance.mean(axis=0), 1e-300)
-    over = (found[:, inner] / usual[:, None]).max()
-    if over <= np.quantile((by_chance / usual).max(axis=1), 1 - _CHANCE):
+
+    def gains(orders: NDArray[np.intp], p: NDArray[np.intp]) -> tuple[Array, Array]:
+        """Return by how much a way lowers the squares (R, K), in R orders at each of K splits, and its steps (R, K, p)."""
+        sums = (np.cumsum(each[orders[:, ::-1]], axis=1) for each in (A[..., p], B[:, p[:, None], p], g[:, p]))
+        A_after, B_after, v = (each[:, len(starts) - 2 - inner] for each in sums)
+        M = B_after - A_after.swapaxes(2, 3) @ A_after + _RIDGE * np.eye(len(p))
+        steps = np.linalg.solve(M, v[..., None])[..., 0]
+        return (v * steps).sum(axis=2), steps
+
+    def most(orders: NDArray[np.intp], p: NDArray[np.intp]) -> Array:
+        return np.concatenate([gains(part, p)[0].max(axis=1) for part in np.array_split(orders, _AT_ONCE)])
+
+    in_time = [gains(np.arange(len(starts))[None], p) for p in own]
+    found = np.concatenate([gain for gain, _ in in_time])
+    random = _random_orders(len(starts), np.random.default_rng(0))
+    by_chance = np.array([most(random, p) for p in own])
+    usual = by_chance.mean(axis=1)[:, None]
+    if (found - usual).max() <= np.quantile((by_chance - usual).max(axis=0), 1 - _CHANCE):
         return None
-    way, at = np.unravel_index(int(np.argmax(found[:, inner] - usual[:, None])), (len(own), len(inner)))
-    split, p = int(inner[at]), own[way]
+    way, k = np.unravel_index(int(np.argmax(found - usual)), found.shape)
+    split, p, gain = int(inner[k]), own[way], found[way, k]
+    middle = np.add.reduceat(poses[:n], starts, axis=0) / np.diff(np.append(starts, n))[:, None]
+    sure = gain > most(_orders_by(middle, np.random.default_rng(1)), p).max()
     step = np.zeros(len(unit))
-    step[columns[p]] = steps[way][split]
-    by_fit = slope - A[split + 1 :].sum(axis=0)[:, p] @ steps[way][split]
+    step[columns[p]] = in_time[way][1][0, k]
+    by_fit = -A[split + 1 :].sum(axis=0)[:, p] @ step[columns[p]]
     at_all = solve_triangular(root, by_fit, lower=True, trans="T")
     squares = float((e**2).sum() - slope @ slope)
-    before, left = (np.sqrt(each / e.size) for each in (squares, max(squares - found[way, split], 0.0)))
+    before, left = (np.sqrt(each / e.size) for each in (squares, max(squares - gain, 0.0)))
     return StateChange(
         int(starts[split + 1]),
         list(ways)[way],
         columns[p],
         np.stack([at_all, at_all + step]) * unit,
-        bool(over > (by_pose / usual).max()),
+        bool(sure),
         float(before),
         float(left),
     )
 
 
-def matters(off: Array, cov: Array, numbers: int) -> bool:
-    """Return whether changes ``off`` (2, P) of so many numbers are more than a covariance (P, P) of the unknowns holds."""
-    unit = 1 / np.sqrt(np.maximum(np.diag(cov), 1e-300))
+def matters(change: StateChange, cov: Array) -> bool:
+    """Return whether a change is more than a covariance (P, P) of the unknowns, zero of those not fitted, holds."""
+    fitted = np.diag(cov) > 0
+    off, cov = change.off[:, fitted], cov[np.ix_(fitted, fitted)]
+    unit = 1 / np.sqrt(np.diag(cov))
     off, inverse = off * unit, np.linalg.pinv(unit[:, None] * cov * unit, hermitian=True)
-    return bool(((off @ inverse) * off).sum(axis=1).max() >= _MATTERS * numbers)
+    return bool(((off @ inverse) * off).sum(axis=1).max() >= _MATTERS * len(change.columns))
 
 
-def _random_orders(n: int, random: np.random.Generator) -> list[NDArray[np.intp]]:
-    """Return orders of n parts in which neighbours stay together, in pieces of 1 to n / 16."""
+def _random_orders(n: int, random: np.random.Generator) -> NDArray[np.intp]:
+    """Return orders (K, n) of n parts in which neighbours stay together, in pieces of 1 to n / 16."""
     pieces = [np.arange(n) // (1 + k % max(int(_TOGETHER * n), 1)) for k in range(_ORDERS)]
-    return [np.argsort(random.permutation(piece[-1] + 1)[piece], kind="stable") for piece in pieces]
+    return np.array([np.argsort(random.permutation(piece[-1] + 1)[piece], kind="stable") for piece in pieces])
 
 
-def _orders_by(poses: Array, random: np.random.Generator) -> Sequence[NDArray[np.intp]]:
+def _orders_by(poses: Array, random: np.random.Generator) -> NDArray[np.intp]:
     """Return orders (K, N) of poses (N, F) by each of their numbers, and by mixtures."""
     poses = (poses - poses.mean(axis=0)) / np.maximum(poses.std(axis=0), 1e-300)
     mixtures = random.standard_cauchy((_ORDERS - poses.shape[1], poses.shape[1]))
-    return list(np.argsort(np.concatenate([np.eye(poses.shape[1]), mixtures]) @ poses.T, axis=1))
+    return np.argsort(np.concatenate([np.eye(poses.shape[1]), mixtures]) @ poses.T, axis=1)

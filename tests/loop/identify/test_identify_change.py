@@ -8,6 +8,8 @@ from worn_arm import poses, worn
 
 from armsight.geometry.pose import exp_se3, inverse
 from armsight.loop.identify.identify import identify
+from armsight.loop.identify.measured import Measured
+from armsight.loop.identify.misread import placed_change
 from armsight.loop.identify.selection import change_text
 from armsight.loop.identify.validate import with_change_allowed
 
@@ -41,6 +43,17 @@ def test_a_displacement_is_named_and_the_sigmas_allow_for_it(displaced):
     assert "was displaced by" in change_text(found.model, found.change)
     assert (np.diag(found.cov) >= np.diag(alone.cov)).all()
     assert np.sqrt(np.diag(found.cov - alone.cov)[found.change.columns]).max() > 0.4e-3
+
+
+def test_of_several_points_the_largest_shift_is_named():
+    w, rng = worn(73), np.random.default_rng(73)
+    q, _ = poses(w.nominal, 40, rng)
+    T, at = w.nominal.forward(q), np.tile([[0, 0, 0.05], [0.05, 0, 0], [0, 0.05, 0]], (40, 1, 1))
+    at[20:, 1:] += 0.01
+    p = T[:, None, :3, 3] + at @ T[:, :3, :3].swapaxes(1, 2) + 1e-4 * rng.standard_normal(at.shape)
+    model, change = placed_change(w.nominal, Measured(q, p))
+    assert (change.way, change.row) == ("tool", 20)
+    assert "was displaced by 17.3 mm" in change_text(model, change)
 
 
 def test_nothing_is_named_where_nothing_was_displaced():

@@ -474,7 +474,7 @@ def _change(found: HandEye, poses: Poses) -> StateChange | None:
     e, J = robust(*found.whitened(replace(poses, B=B)))
     by_pose = log_se3(inverse(mean_pose(poses.A)) @ poses.A)
     change = changed(-e, J, dict(zip(("still", "held"), ways, strict=True)), by_pose)
-    return change if change is not None and matters(change.off, found.cov, 6) else None
+    return change if change is not None and matters(change, found.cov) else None
 
 
 def evenly(rows: NDArray[np.int64], most: int) -> NDArray[np.int64]:

@@ -278,7 +278,8 @@ def change_at(
         p = model.parameters[k]
         if p.kind in (*PLACEMENT, "offset"):
             ways.setdefault(p.kind if p.kind in PLACEMENT else p.name, []).append(int(column[k]))
-    found = changed(-e, J, {name: np.array(columns) for name, columns in ways.items()}, measured.q, known=linear.known)
+    named = {name: np.array(columns) for name, columns in ways.items()}
+    found = changed(-e, J, named, measured.q, known=linear.known, at=linear.at)
     return None if found is None else found.over_all(free)
 
 
@@ -290,6 +291,7 @@ def change_text(model: Model, change: StateChange) -> str:
         said = f"the zero of joint {joint} changed by {np.degrees(step[0]):+.2f} deg (it slipped, or lost steps)"
         return said + (", or the base was rotated" if joint == "1" else "")
     whose = "the base, or the instrument," if change.way == "base" else "the tool, or what is seen of it,"
-    size = f"{1e3 * np.linalg.norm(step[:3]):.1f} mm"
+    points = step[:3] if model.full or change.way == "base" else step  # of several points the largest shift
+    size = f"{1e3 * np.linalg.norm(points.reshape(-1, 3), axis=1).max():.1f} mm"
     size += f" and {np.degrees(np.linalg.norm(step[3:])):.2f} deg" if model.full or change.way == "base" else ""
     return f"{whose} was displaced by {size}"

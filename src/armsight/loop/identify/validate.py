@@ -168,8 +168,7 @@ def with_change_allowed(found: Identified, measured: Measured) -> Identified:
     free = np.diag(found.cov_everything) > 0
     weighted = with_joint_noise(found.model, found.solution.x, measured, found.joint_sigma_rad)
     change = change_at(found.model, found.solution.x, weighted, free, found.prior, found.solution.noise)
-    fitted = found.solution.free
-    if change is None or not matters(change.off[:, fitted], found.cov[np.ix_(fitted, fitted)], len(change.columns)):
+    if change is None or not matters(change, found.cov):
         return found
     note = f"from pose {change.row} on {change_text(found.model, change)}: the sigmas allow for it"
     return replace(found, cov=found.cov + change.off.T @ change.off, change=change, notes=(*found.notes, note))

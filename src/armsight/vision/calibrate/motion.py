@@ -154,9 +154,9 @@ def change_of(
     off_axis = np.linalg.norm(sight - sight[:pairs].mean(axis=0), axis=1)
     poses = np.column_stack([sight, np.log(middle[:, 2]), solution.state.Ts_left_body[:, :2, 2], off_axis])
     found = changed(*_condensed(model, solution, seen, free), ways, poses, count=pairs)
-    if found is None or not matters(found.off, rig.cov[np.ix_(free, free)], int(free.sum())):
+    if found is None or not matters(found := found.over_all(free), rig.cov):
         return None
-    off, p = found.over_all(free).off, named[found.way]
+    off, p = found.off, named[found.way]
     points = transform(solution.state.Ts_left_body[:pairs, None], model.body(solution.state.shape)).reshape(-1, 3)
     views = points, transform(inverse(rig.T_left_right), points)
     uv = np.stack([camera.project(p) for camera, p in zip(rig.cameras, views, strict=True)], axis=1)
