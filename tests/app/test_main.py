@@ -279,3 +279,36 @@ def test_a_file_of_the_right_kind_that_is_damaged_is_not_said_to_be_another(arms
         answer = armsight(*arguments)
         assert answer.code == 2
         assert " which " not in answer.err
+
+
+def test_a_file_that_a_command_may_take_or_of_no_known_kind_is_not_said_to_be_another(armsight, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "k.yaml").write_text("# Kalibr, two cameras\ncam0: x, y\n")
+    (tmp_path / "svc.toml").write_text('# a service, for the cell\n[mesure]\nrig = "r.json"\n')
+    (tmp_path / "wide.toml").write_text(",".join("a" * 40) + " = 1\n")  # a pattern that tries all ways would not end
+    (tmp_path / "board.toml").write_text('board = "chessboard:9x6:20mm"\n')
+    (tmp_path / "d.csv").write_text("x_m,y_m\n1,2\n")
+    (tmp_path / "rec").mkdir()
+    (tmp_path / "rec" / "run.mcap").write_bytes(b"")
+    (tmp_path / "rec" / "shots.csv").write_text("x,y\n1,2\n")
+    for arguments in (
+        ["rig", "import", "k.yaml", "-o", "rig.json"],
+        ["rig", "import", "d.csv", "-o", "rig.json"],
+        ["serve", "svc.toml"],
+        ["serve", "wide.toml"],
+        ["record", "folder:rec", "-o", "new"],
+        ["board", "config", "set", "board.toml"],
+        ["arm", "plan", "so101", "--around", "d.csv"],
+    ):
+        answer = armsight(*arguments)
+        assert answer.code == 2, answer.err
+        assert " which " not in answer.err
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no named pipes")
+def test_a_pipe_in_an_error_is_not_opened(tmp_path):
+    os.mkfifo(pipe := tmp_path / "pipe")
+    command = [sys.executable, "-m", "armsight", "board", "clear", "--board", str(pipe)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    assert done.returncode == 2
+    assert str(pipe) in done.stderr

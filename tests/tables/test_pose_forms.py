@@ -689,3 +689,15 @@ def test_a_row_without_a_pose_stays_a_row_in_every_form(tmp_path, form):
     assert [k for k, why in enumerate(table.missed) if why] == [gone]
     kept = np.delete(np.arange(len(A)), gone)
     np.testing.assert_allclose(table.Ts[kept], A[kept], atol=1e-9)
+
+
+def test_only_missed_rows_may_lack_a_name_and_their_notes_say_why(tmp_path):
+    path = tmp_path / "a.csv"
+    rows = ["x_m,y_m,z_m,qw,qx,qy,qz,image", "0.1,0.2,0.3,1,0,0,0,a", "0.1,inf,0.3,1,0,0,0,", "0.1,0.2,0.3,0,0,0,0,"]
+    path.write_text("\n".join(rows))
+    table = read_pose_table(path, keep_missed=True)
+    assert table.missed == ("", "y_m is inf", "the rotation is all zeros")
+    assert table.names == ("a", "", "")
+    path.write_text("\n".join([*rows, "0.1,0.2,0.3,1,0,0,0,"]))
+    with pytest.raises(InputError, match="line 5: image is empty"):
+        read_pose_table(path)

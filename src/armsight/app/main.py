@@ -87,8 +87,8 @@ class _Kind(NamedTuple):
 
 
 _KINDS = (
-    _Kind("a rig", r'\s*\{\s*"format": "armsight-rig"', ("--rig", "measure", "rig", "budget")),
-    _Kind("a recording", r"\x89MCAP|SQLite format 3|#ROSBAG", ("--source", "replay", "--robot", "bag", "export")),
+    _Kind("a rig", r'\s*\{\s*"format": "armsight-rig"', ("--rig", "measure", "rig", "budget", "dense")),
+    _Kind("a recording", r"\x89MCAP|SQLite format 3|#ROSBAG", ("--source", "replay", "--robot", "export", "record")),
     _Kind("an image", r"\x89PNG|\xff\xd8\xff|BM|II\*\0|MM\0\*", ("--source", "dense")),
     _Kind("an arm's model (URDF)", r"(<\?xml[^>]*>|\s|<!--.*?-->)*<robot\b", ("--arm", "--model", "arm")),
     _Kind("a file of sensors", r'(?ms).*^kind *= *"(inertial|magnetometer|range)"', ("--references", "references")),
@@ -101,13 +101,15 @@ _KINDS = (
     _Kind("a service's file", r"(?ms).*^\[measure\]", ("serve",)),
     _Kind(
         "a table",
-        r"[^\n={}\[\]<>\0]+([,;\t][^\n={}\[\]<>\0]*)+(\n|$)",
-        ("--data", "--robot", "--seen", "--joints", "--poses", "check", "identify", "body check"),
+        r"([^\n={}\[\]<>\0,;\t]*[,;\t][^\n={}\[\]<>\0]*(\n|$)){2}",
+        ("--data", "--robot", "--seen", "--joints", "--poses", "check", "body check", "--target"),
     ),
 )
-_RUN = _Kind("a run's folder", "", ("check", "replay", "export", "live", "batch", "--rig"))
+_RUN = _Kind("a run's folder", "", ("check", "replay", "export", "batch", "--rig"))
 _SHOTS = _Kind("a folder of images", "", ("--source", "record", "replay", "dense", "batch"))
-_OPTIONS = {taker for kind in (*_KINDS, _RUN, _SHOTS) for taker in kind.takers if taker[0] == "-"}
+_BOTH = _RUN._replace(takers=_RUN.takers + _SHOTS.takers)
+_TAKERS = {"--board"}.union(*(kind.takers for kind in (*_KINDS, _BOTH)))
+_OTHERS = {"rig import", "rig update", "arm calibrated", "arm report"}  # take more kinds than their group's others
 _READ = 5000  # bytes that say what a file is; half: a long comment may hide it, double: the same
 _NAMED = 3  # takers that a message names; half: the right one may lack, double: a longer line
 
@@ -216,11 +218,15 @@ def _kind_of(path: Path) -> _Kind | None:
     """Return what a file or a folder is; None where that is not known."""
     if path.is_dir():
         names = {each.name for each in path.iterdir()}
+        shots = any(name == "shots.csv" or name.endswith((".png", ".jpg", ".tif", ".tiff")) for name in names)
         if names & {"run.mcap", "reference.csv"}:
-            return _RUN
-        return _SHOTS if any(name.endswith((".png", ".jpg", ".tif", ".tiff")) for name in names) else None
+            return _BOTH if shots else _RUN
+        return _SHOTS if shots else None
+    if not path.is_file():  # a port or a pipe: whoever opens it may wait forever
+        return None
     with path.open("rb") as file:
         text = file.read(_READ).decode("latin-1").removeprefix("\xef\xbb\xbf")
+    text = re.sub(r"(?m)^[ \t]*#(?!ROSBAG).*\n?", "", text)
     return next((kind for kind in _KINDS if re.match(kind.begins, text)), None)
 
 
@@ -233,8 +239,8 @@ def _mistaken(problem: str, arguments: Sequence[str]) -> str:
         name = re.sub(r"^(bag|video|folder|feetech|ar4|serial):([^,]*,)?", "", value)
         with contextlib.suppress(OSError):
             if name and name in problem and Path(name).exists() and (kind := _kind_of(Path(name))) is not None:
-                by = {given} if given in _OPTIONS else {arguments[0], " ".join(arguments[:2])}  # behind a flag
-                if given not in ("-o", "--output") and not by & {*kind.takers}:
+                by = {given} if given not in ("", "--json") else {arguments[0], " ".join(arguments[:2])}
+                if by & _TAKERS and not by & _OTHERS.union(kind.takers):
                     *first, last = [each if each[0] == "-" else f"armsight {each}" for each in kind.takers[:_NAMED]]
                     who = f"{', '.join(first)} and {last} take" if first else f"{last} takes"
                     return f"; {name} is {kind.what}, which {who}"

@@ -315,8 +315,9 @@ class Columns:
             good &= np.asarray(numbers.any(axis=1))
         for row in np.flatnonzero(~good).tolist():
             name = names[int(np.argmin(np.isfinite(numbers[row])))]
-            cell = self.rows[row][1][self.at[name]]
-            self.missed[row] = self.missed[row] or f"{self.given[self.at[name]]} is {cell or 'empty'}"
+            why = f"{self.given[self.at[name]]} is {self.rows[row][1][self.at[name]] or 'empty'}"
+            why = "the rotation is all zeros" if np.isfinite(numbers[row]).all() else why
+            self.missed[row] = self.missed[row] or why
         if not good.any():
             raise InputError(f"{self.path}: none of {len(good)} rows has a pose; line {self.line(0)}: {self.missed[0]}")
         return np.asarray(np.where(good[:, None], numbers, numbers[np.argmax(good)]))
@@ -391,6 +392,11 @@ class Columns:
             return None
         self.used.add(key)
         found = tuple(row[self.at[key]] for _, row in self.rows)
+        for row, name in enumerate(found):
+            if not name and not (self.missed and self.missed[row]):
+                raise InputError(
+                    f"{self.path}: line {self.line(row)}: {key} is empty: name the row, or leave out {key}"
+                )
         twice = next((name for name, count in Counter(filter(None, found)).items() if count > 1), None)
         if twice is not None:
             raise InputError(f"{self.path}: {key} {twice!r} names two rows; a row belongs to one image")

@@ -174,6 +174,15 @@ def test_lines_may_have_the_units_of_recordings(fed):
     np.testing.assert_allclose(z, np.tile([np.pi, np.pi / 2, 1.0, *[9.80665] * 3], (5, 1)))
 
 
+def test_names_that_change_are_read_anew(fed):
+    sent = [json.loads(line(7.0 + k)) for k in range(3)]
+    sent[1]["t_ms"], _ = 1e3 * sent[1]["t_s"], sent[1].pop("t_s")
+    del sent[2]["gyro_x_rad_s"]
+    t_s, losses = fed([(105.0 + k, json.dumps(record).encode()) for k, record in enumerate(sent)])
+    np.testing.assert_allclose(t_s, [105.0, 106.0], atol=1e-3)
+    assert losses == ("a line was no reading",)
+
+
 @pytest.mark.parametrize(
     ("live", "sent", "said"),
     [
@@ -182,7 +191,9 @@ def test_lines_may_have_the_units_of_recordings(fed):
         ("serial:/dev/none", b"", "serial:/dev/none cannot be opened"),
         ("udp:{}", b"", "nothing came from udp:.* within 0.3 s"),
         ("udp:{}", b'{"t_s": 1}', "expected lines of JSON with t_s, gyro_x_rad_s.* gyro_x_rad_s is missing"),
+        ("udp:{}", line(1.0, np.inf) + b'\n{"t_s": 1}', "gyro_x_rad_s is missing"),
         ("udp:{}", b"1,2,3", "is no JSON object of numbers"),
+        ("udp:{}", b"[1, 2, 3]", "is no JSON object of numbers"),
     ],
 )
 def test_bad_input_is_one_line(board, monkeypatch, live, sent, said):

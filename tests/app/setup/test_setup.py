@@ -125,6 +125,18 @@ def test_it_goes_on_where_it_was(armsight, typed, person):
     assert [c.split()[0] for c in came] == ["identify", "board"]
 
 
+def test_a_poor_calibration_is_done_anew(armsight, typed, person):
+    came, codes = typed
+    codes["calibrate"] = 3
+    said = armsight("setup", "so101", "--source", "usb:3,1", "--board", "/dev/ttyUSB9")
+    assert said.code == 3
+    assert "must not be used, as said above; armsight setup so101 does it anew" in said.err
+    came.clear()
+    codes.clear()
+    assert armsight("setup", "so101").code == 0
+    assert came[0].startswith("calibrate ")
+
+
 def test_a_recording_that_ctrl_c_ends_is_done_and_the_plate_is_at_hand(armsight, typed, person, folder):
     _, codes = typed
     codes["record"] = 130

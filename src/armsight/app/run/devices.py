@@ -136,10 +136,11 @@ class LiveReadings:
     def _take(self, line: bytes) -> None:
         now = self._now()
         try:
-            record = json.loads(line)
-            self._names = self._names or columns_of(self._kind, list(record), f"{line[:40]!r}")
+            record = {**json.loads(line)}
+            if not self._names or any(name not in record for name, _ in self._names):
+                self._names = columns_of(self._kind, list(record), f"{line[:40]!r}")
             t_s, *values = (factor * float(record[name]) for name, factor in self._names)
-        except (InputError, ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
+        except (InputError, ValueError, TypeError, OverflowError, RecursionError) as error:
             expected = f"expected lines of JSON with t_s, {', '.join(COLUMNS[self._kind])}"
             missing = str(error) if isinstance(error, InputError) else f"{line[:40]!r} is no JSON object of numbers"
             self._problem = f"{expected}; {missing}"

@@ -18,6 +18,7 @@ import click
 from armsight.app.main import run
 from armsight.app.setup import finding
 from armsight.app.setup.steps import ARMS, CAMERAS, PLATE, PORT, SetupStep
+from armsight.app.show.messages import UNTRUSTED
 from armsight.errors import InputError
 from armsight.files import as_input_error, read_json, write_text
 
@@ -116,7 +117,9 @@ class SetupWalk:
                     row |= {"state": "failed", "exit_code": code}
                     if not step.needed and code != INTERRUPTED:
                         continue
-                    say(f"step {number} ended with {code}; armsight setup {self.arm} goes on here")
+                    anew = ": its result must not be used, as said above" if code == UNTRUSTED else ""
+                    goes_on = "does it anew" if anew else "goes on here"
+                    say(f"step {number} ended with {code}{anew}; armsight setup {self.arm} {goes_on}")
                     return code
                 row["state"] = "done"
             self.done[step.command] = row["state"]

@@ -74,7 +74,7 @@ def check_source(spec: str) -> None:
         if "://" in spec or spec.startswith("/dev/video"):
             hint = f" ({'url' if '://' in spec else 'usb'}:LEFT,RIGHT?)"
         elif spec.replace(",", "").isdecimal():
-            hint = f" (usb:{spec}?)"
+            hint = f" (usb:{spec if ',' in spec else f'{spec},{int(spec) + 1}'}?)"
         elif os.path.isfile(os.path.expanduser(spec)):
             from armsight.vision.sources.bag.reader import SUFFIXES
 
