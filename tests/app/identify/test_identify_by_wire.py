@@ -72,3 +72,17 @@ def test_what_does_not_fit_is_one_line(tmp_path, capsys):
     files(tmp_path, timed=False)
     with_positions(tmp_path, "x,y,z", "100,200,300")
     assert_rejected(said_of(capsys, "identify", *given), "joints.csv: positions of up to 300 m: name x_mm, y_mm, z_mm")
+
+
+def test_lost_ranges_are_left_out_and_a_wrong_unit_is_named(tmp_path, capsys):
+    given = files(tmp_path, timed=True)
+    head, *rows = (tmp_path / "wire.csv").read_text().splitlines()
+    few = [head, *rows[5:50], *rows[55:]]  # of the first row and of another
+    (tmp_path / "wire.csv").write_text("\n".join(few) + "\n")
+    found = said_of(capsys, "identify", *given, "--json").one
+    assert found["poses"] == ROWS - len(HOOKED) - 2
+    assert "line 2, 12: 2 rows without a range within 0.25 s: left out" in json.dumps(found)
+    (tmp_path / "wire.csv").write_text("\n".join([head, *rows[:100]]) + "\n")
+    assert_rejected(said_of(capsys, "identify", *given), "within 0.25 s of 20 of 80 rows", "one clock")
+    (tmp_path / "wire.csv").write_text("\n".join([head.replace("_mm", "_in"), *rows]) + "\n")
+    assert_rejected(said_of(capsys, "identify", *given), "the ranges vary by", "is their unit right")

@@ -159,15 +159,34 @@ def read_wire(data: Path, arm: Arm, references: Path, columns: Renames | None = 
             raise InputError(
                 f"{source}: {len(z)} ranges for {len(table.q)} rows of {data}; give one a row, or times t_s"
             )
-        return WireRead(table.q[rows], z[rows], p, lines, notes)
+        return _possible(WireRead(table.q[rows], z[rows], p, lines, notes), arm)
     if table.t_s is None:
         raise InputError(f"{data}: line 1: a column t_s is needed, as {source} has times")
     near = [np.abs(t_s - ranges[0].reference.delay_s - at) <= REST_S for at in table.t_s[rows]]
-    if (alone := next((k for k, each in enumerate(near) if not each.any()), None)) is not None:
-        where = f"{data}: line {lines[alone]:.0f}: at {table.t_s[rows][alone]:.3f} s"
-        raise InputError(f"{where} {source} has no range within {REST_S:g} s; do both have one clock?")
-    length_m = np.array([np.median(z[each]) for each in near])
-    return WireRead(table.q[rows], length_m, p, lines, notes)
+    there = np.array([each.any() for each in near])
+    if there.sum() < SHARE * len(rows):
+        raise InputError(
+            f"{source}: a range within {REST_S:g} s of {there.sum()} of {len(rows)} rows of {data}: have both one clock?"
+        )
+    length_m = np.array([np.median(z[each]) for each in near if each.any()])
+    if not there.all():
+        alone = ", ".join(f"{line:.0f}" for line in lines[~there][:8])
+        notes = (*notes, f"{data}: line {alone}: {(~there).sum()} rows without a range within {REST_S:g} s: left out")
+    return _possible(
+        WireRead(table.q[rows][there], length_m, None if p is None else p[there], lines[there], notes), arm
+    )
+
+
+def _possible(read: WireRead, arm: Arm) -> WireRead:
+    """Return it; InputError where most ranges vary more than the tool travels and the arm is long, as in a wrong unit."""
+    travelled = np.linalg.norm(np.ptp(arm.forward(read.q)[:, :3, 3], axis=0))
+    low, high = np.quantile(read.length_m, [0.1, 0.9])
+    if high - low > travelled + arm.size_m:
+        raise InputError(
+            f"the ranges vary by {high - low:.3g} m while the tool travels {travelled:.3g} m: is their unit right, and the "
+            "arm?"
+        )
+    return read
 
 
 def _step(values: Array) -> float:
