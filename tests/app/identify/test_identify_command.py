@@ -32,6 +32,9 @@ from armsight.robot.arm_file import open_arm
 from armsight.robot.models import MODELS
 from cli_runs import assert_rejected, run, said_of
 
+#: Lines of the file that is identified from.
+FITTED = []
+
 
 def said(capsys, *arguments):
     return said_of(capsys, "identify", *arguments)
@@ -40,10 +43,12 @@ def said(capsys, *arguments):
 def test_from_files_to_files(tmp_path, capsys):
     data, out = poses_csv(tmp_path / "poses.csv", gaps=(3,)), tmp_path / "corrected"
     other = poses_csv(tmp_path / "other.csv", seed=1)
+    other.write_text(other.read_text() + "".join(data.read_text().splitlines(True)[-7:]))
     arguments = ["--arm", arm_toml(tmp_path / "arm.toml", open_arm("six_r")), "--data", data]
     answer = said(capsys, *arguments, "--validate", other, "-o", out, "--json")
     assert answer.code == 0
     assert "line 5 (p1_x_mm)" in answer.err
+    assert "other.csv: 7 of 47 poses are among those to identify from: left out" in answer.err
     (found,) = answer.lines
     assert found["identified"]["mean_m"] < 1e-4 < 8e-4 < found["nominal"]["mean_m"]
     for key in ("mean_m", "rms_m", "max_m"):
@@ -240,10 +245,13 @@ def with_sign(line):
             lambda lines: [f"{lines[0]},p2_x_mm,p2_y_mm,p2_z_mm", *(f"{line},1,2,3" for line in lines[1:])],
             "have 2 tracked points a pose; those identified with have 1 tracked point a pose",
         ),
+        (lambda lines: FITTED, "all poses are among those to identify from"),
+        (lambda lines: [FITTED[0], *FITTED[5:20]], "all poses are among those to identify from"),
     ],
 )
 def test_a_wrong_file_to_validate_with_is_rejected_before_the_fit(tmp_path, capsys, monkeypatch, spoil, said_of_it):
     data, other = poses_csv(tmp_path / "p.csv", n=40), poses_csv(tmp_path / "o.csv", n=30, seed=1)
+    FITTED[:] = data.read_text().splitlines()
     other.write_text("\n".join(spoil(other.read_text().splitlines())))
 
     def never(*arguments, **options):
@@ -401,7 +409,7 @@ def test_what_was_found_is_printed_and_stored_though_the_report_cannot_be_drawn(
     data, out = poses_csv(tmp_path / "p.csv"), tmp_path / "out"
     monkeypatch.setattr("armsight.app.show.report.Report.write", Mock(side_effect=RuntimeError("no figure")))
     with pytest.raises(RuntimeError, match="no figure"):
-        run("identify", "--arm", "six_r", "--data", data, "--validate", data, "-o", out)
+        run("identify", "--arm", "six_r", "--data", data, "-o", out)
     assert "\nheld-out error " in capsys.readouterr().out
     assert {path.name for path in out.iterdir()} >= {"corrected.toml", "zeros.toml", "identify.json"}
 

@@ -285,11 +285,25 @@ def test_a_range_is_checked_and_calibrated_and_what_is_wrong_with_it_is_named(ca
         said = calibrate(*given)
         assert said.code == 2
         assert text in said.err
+    with (tmp_path / "coarse.toml").open("a") as file:
+        file.write("noise_m = 0.05\n")
     said = said_of(capsys, "references", "check", tmp_path / "coarse.toml", "--json", kind="range").lines[0]
     assert said["weak"] == []  # at rest a step of 10 mm repeats, and a noise of 50 mm is no drift
     assert said["references"][0]["drift_m"][0] > report.RESTS["range"][2]
     said = said_of(capsys, "references", "check", tmp_path / "mm.toml")
     assert (said.code, "as if in mm; give m" in said.err) == (2, True)
+
+
+@pytest.mark.parametrize(("rate_hz", "step_m", "ramp_m_s"), [(2.0, 0.02, 0.0), (10.0, 1e-4, 0.02)])
+def test_a_range_that_moves_all_the_time_is_not_at_rest(capsys, tmp_path, rate_hz, step_m, ramp_m_s):
+    """Jumps from pose to pose, and a slow sweep: blocks of either are as quiet as the quietest."""
+    t_s = np.arange(500) / rate_hz
+    z = 1.0 + np.random.default_rng(6).normal(0.0, step_m, 500) + ramp_m_s * np.abs((t_s % 20.0) - 10.0)
+    np.savetxt(tmp_path / "wire.csv", np.column_stack([t_s, z]), "%.9g", ",", header="t_s,range_m", comments="")
+    (tmp_path / "wire.toml").write_text('[wire]\nkind = "range"\nsource = "wire.csv"\n')
+    said = said_of(capsys, "references", "check", tmp_path / "wire.toml", "--json", kind="range").lines[0]
+    assert said["weak"][0].startswith("wire: never at rest")
+    assert said["references"][0]["rest_s"] == 0.0
 
 
 def recorded_range(folder, rate_hz, anchor, sense, seconds=30.0):

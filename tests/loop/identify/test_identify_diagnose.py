@@ -10,6 +10,7 @@ from worn_arm import poses, worn
 
 from armsight.errors import InputError
 from armsight.geometry.pose import exp_se3, inverse
+from armsight.loop.identify.identify import identify
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.misread import check_plausible, placed_change, points_off, without_tool
 from armsight.loop.identify.read import read_poses
@@ -55,6 +56,17 @@ def test_right_data_pass(name, seed):
     w, measured = made(name, seed)
     check_plausible(without_tool(w.nominal), measured)
     check_plausible(without_tool(w.nominal), points(measured))
+
+
+@pytest.mark.parametrize("zero", ["p", "q"])
+def test_a_few_gross_rows_do_not_make_the_data_of_another_arm(zero):
+    w, measured = made("ur5", 2, 60)
+    p, q = seen_at(measured).copy(), measured.q.copy()
+    {"p": p, "q": q}[zero][[7, 30, 31]] = 0.0
+    spoilt = points(measured, p, q)
+    check_plausible(without_tool(w.nominal), spoilt)
+    assert {7, 30, 31} <= set(identify(w.nominal, spoilt).left_out.tolist())
+    assert "are they in mm, not m?" in said(w, points(measured, p=1e3 * spoilt.p_rig, q=spoilt.q))
 
 
 @pytest.mark.parametrize("name", ARMS)

@@ -51,19 +51,20 @@ def run_identify(
     what an error calls these: their file. ``priors``: as in :func:`identify`. CalibrationError: no pose can be left out.
     """
     if other is not None:
-        check_other(arm, measured, other, other_name)
+        other, said = check_other(arm, measured, other, other_name)
+        notes = (*notes, *said)
     with noted(notes):
         found = identify_held_out(arm, measured, other=other, priors=priors, progress=progress)
     if (held_out := found.held_out) is None:
         raise CalibrationError(f"too few poses to leave a fifth of them out: {len(measured)}; take 10 and more")
-    said = _notes(arm, found, measured, lines)
+    shown = _notes(arm, found, measured, lines)
     if held_out.scale > 1:
-        said.insert(
+        shown.insert(
             0,
             f"residuals of poses left out are {held_out.scale:.2f} times as large as predicted: the arm does something "
             f"that the model does not know; all sigmas are made {held_out.scale:.2f} times as large",
         )
-    return Identification(arm, measured, found, *held_out[:3], lines, (*said, *notes))
+    return Identification(arm, measured, found, *held_out[:3], lines, (*shown, *notes))
 
 
 def _notes(arm: Arm, found: Identified, measured: Measured, lines: Array) -> list[str]:

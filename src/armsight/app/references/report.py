@@ -175,13 +175,19 @@ def _check(entry: Entry) -> tuple[dict[str, Any], list[str], list[str]]:
     rest = z[stream.rest]
     values["rest_s"] = len(rest) / stream.rate_hz
     if not len(rest):
-        weak.append(f"{name}: no rest of a second shows its noise, which is unknown")
+        weak.append(f"{name}: never at rest for a second: its noise is not determined")
         return values, lines, weak
     if not isinstance(entry.reference, Inertial):
         _, variance, _ = allan(rest, 1.0 / stream.rate_hz)  # of single readings: without what drifts
         drifts = np.abs(rest[-len(rest) // 4 :].mean(axis=0) - rest[: len(rest) // 4].mean(axis=0))
         noise, (channel,) = np.sqrt(variance[0]), entry.reference.channels
         (unit, scale, most, why), key = RESTS[channel], CHANNELS[channel][0].lower()
+        if channel == "range" and (ratio := float(noise[0]) / entry.noise_m) > NOISY:
+            weak.append(
+                f"{name}: never at rest: its noise is not determined; or it is {ratio:.2g} times noise_m, "
+                f"{1e3 * entry.noise_m:.2g} mm: give that as it is, and the right unit"
+            )
+            return values | {"rest_s": 0.0}, lines, weak
         values |= {f"noise_{key}": noise, f"drift_{key}": drifts}
         drifted = f"{scale * drifts.max():.2g} {unit} at rest"
         lines.append(f"{name}: noise {scale * noise.max():.2g} {unit}, drift {drifted} for {values['rest_s']:.1f} s")

@@ -477,6 +477,8 @@ SCALE_OFF = 0.2  # a scale off by more than this is a unit
 BAD_RAD = 2 * np.sqrt(6) * np.hypot(SIGMA["offset"], SIGMA["alpha"])
 #: Poses looked at, those that every order and sign is tried on, and the fewest that shifted rows do not fit by chance.
 POSES, FEW, FEWEST = 80, 24, 12
+#: Rows so many times as far off as the median are gross, up to this share of all; half: ordinary rows, double: some stay.
+GROSS, GROSS_SHARE = 5.0, 0.2
 LEAST_M = 2e-4  # RMS, m, from which a change makes poses useless; half: of a fine tracker, too, double: 0.3 mm do not
 MAX_JOINT_ORDERS = 40  # orders whose signs are tried, best first
 _SCALES = {1e-3: "m, not mm", 1e3: "mm, not m", 1e-1: "dm or cm", 10.0: "cm", 1 / 25.4: "inches", 25.4: "inches"}
@@ -542,6 +544,7 @@ def check_plausible(arm: Arm, measured: Measured) -> None:
             "the angles in degrees? name the columns q1_deg .. q6_deg"
         )
     rows = np.linspace(0, len(measured) - 1, min(POSES, len(measured))).astype(int)
+    rows = rows[_agreeing(arm, measured.q[rows], measured.p_rig[rows])]
     q, p = measured.q[rows], measured.p_rig[rows]
     at, limit = points_off(arm, q, p), max(BAD_SHARE * _span(p), BAD_M)
     T = arm.forward(q) @ np.linalg.inv(arm.T_flange_tool)
@@ -581,6 +584,20 @@ def check_plausible(arm: Arm, measured: Measured) -> None:
 def without_tool(arm: Arm) -> Arm:
     """Return the arm with its tool at the flange: the tool's pose on the flange is estimated from the data."""
     return replace(arm, T_flange_tool=np.eye(4))
+
+
+def _agreeing(arm: Arm, q: Array, p_rig: Array) -> Rows:
+    """Return the rows of points (N, K, 3) without gross ones, the worst first: a few pull least squares off all; or all."""
+    T, rows = arm.forward(q) @ np.linalg.inv(arm.T_flange_tool), np.arange(len(q))
+    while True:
+        M, c, t = linear_placement(T[rows, :3, :3], T[rows, :3, 3], p_rig[rows])
+        off = np.linalg.norm(p_rig[rows] @ M.T + c - _points(T[rows], t), axis=2).max(axis=1)
+        worst = int(np.argmax(off))
+        if off[worst] <= GROSS * max(float(np.median(off)), ALIKE_M):
+            return rows
+        if len(rows) <= max(FEWEST, (1 - GROSS_SHARE) * len(q)):
+            return np.arange(len(q))
+        rows = np.delete(rows, worst)
 
 
 def points_off(arm: Arm, q: Array, p_rig: Array) -> Off:

@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 from scipy.special import chdtri
 
 from armsight.data import Array
@@ -28,6 +29,7 @@ from armsight.robot.kinematics.arm import Arm
 
 OTHER = 5.0  # another set-up: the error is this many times that with base and tool fitted again,
 OTHER_M = 0.02  # and this far, m: no arm moves so far by itself between two recordings of one set-up
+SAME = 2e-6  # of joints, rad, and points, m: the same measurement; half: rounded copies pass, double: nothing
 MIN_POSES = 10  # poses needed to fit base and tool again
 #: Parts of the poses that are left out one after the other without others to validate with; with more than MANY, one.
 FOLDS, MANY = 5, 500
@@ -141,8 +143,8 @@ def identify_held_out(
     require(call, "arm", arm, isinstance(arm, Arm), 'open_arm("ur10")')
     notes, measured = measured.notes if isinstance(measured, Read) else (), measured_of(call, measured)
     if other is not None:
-        other = measured_of(call, other, "other")
-        check_other(arm, measured, other, "other")
+        other, said = check_other(arm, measured, measured_of(call, other, "other"), "other")
+        notes = (*notes, *said)
     with noted(notes):
         found = identify(arm, measured, priors=priors, progress=progress)
     if other is None:
@@ -155,6 +157,7 @@ def identify_held_out(
             )
         apart = f", {len(found.left_out)} taken for mistakes apart" if len(found.left_out) else ""
     else:
+        found = replace(found, notes=(*found.notes, *said))
         held_out = LeftOut(validate(found, other), other.q, f"{len(other)} poses of another file")
         apart = ", base and tool fitted anew" if held_out.validation.placement_refitted else ""
     over, numbers = held_out.validation.residual_over_predicted, len(held_out.q) * measured.size
@@ -174,15 +177,28 @@ def with_change_allowed(found: Identified, measured: Measured) -> Identified:
     return replace(found, cov=found.cov + change.off.T @ change.off, change=change, notes=(*found.notes, note))
 
 
-def check_other(arm: Arm, measured: Measured, other: Measured, name: str) -> None:
-    """Reject poses to validate with that cannot be of the arm, before anything is fitted; ``name`` is for the error."""
-    arm, where = without_tool(arm), f"{name}: "
+def check_other(arm: Arm, measured: Measured, other: Measured, name: str) -> tuple[Measured, tuple[str, ...]]:
+    """Return poses to validate with, without those of ``measured``, and a note of these; ``name`` is their file.
+
+    InputError: none is left, or they cannot be of the arm.
+    """
+    arm, where, given, notes = without_tool(arm), f"{name}: ", len(other), tuple[str, ...]()
     try:
         require_alike(other, measured.points, measured.R_rig_body is not None)
+        if other.q.shape == (given, measured.q.shape[1]):
+            of = [m.p_rig if m.length_m is None else m.length_m for m in (measured, other)]
+            fitted, at = (
+                np.column_stack([m.q, p.reshape(len(p), -1)]) for m, p in zip((measured, other), of, strict=True)
+            )
+            other = other.rows(np.flatnonzero(cKDTree(fitted).query(at)[0] > SAME))
+        if not len(other):
+            raise InputError("all poses are among those to identify from: give others, or leave out --validate")
+        if len(other) < given:
+            notes = (f"{where}{given - len(other)} of {given} poses are among those to identify from: left out",)
         if len(other) >= MIN_POSES:
             where += "the poses to validate with: "
             check_plausible(arm, other)
-            return
+            return other, notes
         check_plausible(arm, measured)  # or its placement means nothing
     except InputError as error:
         raise InputError(f"{where}{error}") from None
@@ -193,6 +209,7 @@ def check_other(arm: Arm, measured: Measured, other: Measured, name: str) -> Non
             f"{name}: the {len(other)} poses to validate with are {1e3 * off:.0f} mm from where the arm reaches at their "
             f"angles: other joints, or another set-up, for which {MIN_POSES} poses are needed"
         )
+    return other, notes
 
 
 def _left_out(

@@ -31,6 +31,9 @@ REPEATS, STEPS = 0.05, 1.5
 BLOCK_S, QUIET, REST_S = 0.25, 2.0, 1.0
 #: Means of neighbouring blocks of a rest differ by at most so many sigmas of chance.
 STEADY = 6.0
+#: One number rests where its changes from reading to reading are so large a share of its noise, 1 where that is white;
+#: half: slow motion is a rest, double: nothing is.
+WHITE = 0.65
 #: A stop is looked for so long before a rest, s, in such steps, s; half: slow vibration is missed, double: slower.
 STOP_S, STEP_S = 1.5, 0.005
 #: The last of these steps is gone through in so many; half: times are 1 ms worse, double: slower.
@@ -170,7 +173,12 @@ def _rests(z: Array, period: float) -> tuple[slice, ...]:
         if begin is not None:
             runs.append((begin, k))
         begin = k if k < count and quiet[k] else None
-    return tuple(slice(a * size, b * size) for a, b in runs if (b - a) * size * period >= REST_S)
+    runs = [(a, b) for a, b in runs if (b - a) * size * period >= REST_S]
+    if z.shape[1] == 1 and runs:  # no other column shows motion
+        still = np.concatenate([blocks[a:b] for a, b in runs])
+        if np.mean(np.diff(still, axis=1) ** 2) / 2 < WHITE * np.mean(still.var(axis=1, ddof=1)):
+            return ()
+    return tuple(slice(a * size, b * size) for a, b in runs)
 
 
 def settling(t_s: Array, force: Array, rests: Sequence[slice]) -> Settling | None:
