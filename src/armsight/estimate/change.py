@@ -9,6 +9,7 @@ lacks.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,6 +50,10 @@ class StateChange(Record):
     def step(self) -> Array:
         """(P,) by how much the unknowns changed."""
         return np.asarray(self.off[1] - self.off[0])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the row, what changed and by how much, m and rad, as JSON has it."""
+        return {"row": self.row, "way": self.way, "step_m_rad": self.step[self.columns].tolist(), "sure": self.sure}
 
     def over_all(self, free: NDArray[np.bool_]) -> StateChange:
         """Return the same by more unknowns, of which those free (Q,) are these."""

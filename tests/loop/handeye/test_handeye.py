@@ -118,6 +118,10 @@ def test_what_was_displaced_midway_is_named_and_the_covariance_holds_both_states
     assert h.change.way == way
     assert abs(h.change.row - 18) <= 1
     assert "stands elsewhere" in repr(h)
+    said, of = h.to_dict()["change"], {"still": h.T_base_still, "held": h.T_flange_held}[way]
+    assert said["row"] == h.change.row
+    assert h.to_dict()[said["way"]] == of.tolist()
+    assert np.allclose(said["step_m_rad"], [0, 0, 3e-3, 0.004, 0, 0], atol=1e-3)
     for state in ((Z, X), there):
         e = error(h, *state)
         assert e @ np.linalg.solve(h.cov, e) < chi2.isf(1e-3, 12)

@@ -41,6 +41,7 @@ def test_a_displacement_is_named_and_the_sigmas_allow_for_it(displaced):
     assert found.change.way == displaced
     assert abs(found.change.row - FROM) <= 2
     assert "was displaced by" in change_text(found.model, found.change)
+    assert f"from pose {found.change.row} on the poses are of another state" in found.notes[-1]
     assert (np.diag(found.cov) >= np.diag(alone.cov)).all()
     assert np.sqrt(np.diag(found.cov - alone.cov)[found.change.columns]).max() > 0.4e-3
 

@@ -296,6 +296,7 @@ def _values(run: Identification) -> dict[str, Any]:
         "identified": run.held_out.identified.summary(),
         "residual_over_predicted": run.held_out.residual_over_predicted,
         **dict(zip(MOVED, found.moved_all_over(), strict=True)),
+        "change": None if found.change is None else found.change.to_dict() | {"line": int(run.lines[found.change.row])},
         "noise_m": noise[0],
         "noise_rad": noise[1] if found.model.full else None,
         "parameters": parameter_rows(run),

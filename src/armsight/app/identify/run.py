@@ -11,7 +11,7 @@ from armsight.data import Array, Record
 from armsight.errors import CalibrationError, noted
 from armsight.loop.identify.identify import ALIKE, Identified, Validation
 from armsight.loop.identify.measured import Measured
-from armsight.loop.identify.selection import change_text
+from armsight.loop.identify.selection import changed_from
 from armsight.loop.identify.validate import check_other, identify_held_out
 from armsight.robot.kinematics.arm import Arm
 
@@ -83,12 +83,9 @@ def _notes(arm: Arm, found: Identified, measured: Measured, lines: Array) -> lis
         poses = f"{len(found.left_out)} pose{'s' if len(found.left_out) > 1 else ''}"
         notes.append(f"{poses} taken for mistakes and left out: line {shown}")
     if (change := found.change) is not None:
-        what = change_text(found.model, change) + (
-            "" if change.sure else ", or the model lacks what depends on the pose"
-        )
         notes.append(
-            f"from line {lines[change.row]:.0f} on the poses are of another state: {what}; the arm is of neither, "
-            "and its sigmas allow for that: identify from one of both parts, and give the other by --validate"
+            f"{changed_from(found.model, change, f'line {lines[change.row]:.0f}')}: identify from one of both parts, and "
+            "give the other by --validate"
         )
     numbers, parameters = len(measured) * measured.size, len(found.model.nominal())
     if numbers < 3 * parameters:

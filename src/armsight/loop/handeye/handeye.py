@@ -208,11 +208,14 @@ class HandEye(Record):
         held, still = ("T_flange_rig", "T_base_body") if self.eye == "in_hand" else ("T_flange_body", "T_base_rig")
         found: dict[str, Any] = {
             "eye": self.eye,
+            "change": None,
             held: self.T_flange_held.tolist(),
             still: self.T_base_still.tolist(),
             "cov_m_rad": self.cov.tolist(),
             "cov_order": [f"{still}: right tangent, translation then rotation", f"{held}: the same"],
         }
+        if self.change is not None:
+            found["change"] = self.change.to_dict() | {"way": {"still": still, "held": held}[self.change.way]}
         for name in ("held_out", "held_out_nominal", "held_out_geometry"):
             errors: HeldOut | None = getattr(self, name)
             found[f"{name}_rms_m"] = None if errors is None else errors.rms()[0]

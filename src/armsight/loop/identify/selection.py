@@ -295,3 +295,12 @@ def change_text(model: Model, change: StateChange) -> str:
     size = f"{1e3 * np.linalg.norm(points.reshape(-1, 3), axis=1).max():.1f} mm"
     size += f" and {np.degrees(np.linalg.norm(step[3:])):.2f} deg" if model.full or change.way == "base" else ""
     return f"{whose} was displaced by {size}"
+
+
+def changed_from(model: Model, change: StateChange, first: str) -> str:
+    """Return a note of a change from a pose on, by its name or number."""
+    unsure = "" if change.sure else ", or the model lacks what depends on the pose"
+    return (
+        f"from {first} on the poses are of another state: {change_text(model, change)}{unsure}; the arm is of neither, "
+        "and its sigmas allow for that"
+    )

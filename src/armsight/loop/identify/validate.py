@@ -24,7 +24,7 @@ from armsight.loop.identify.measured import Measured, Read, measured_of, visits
 from armsight.loop.identify.misread import check_plausible, without_tool
 from armsight.loop.identify.model import Model
 from armsight.loop.identify.placement import with_placement
-from armsight.loop.identify.selection import PLACEMENT, change_at, change_text
+from armsight.loop.identify.selection import PLACEMENT, change_at, changed_from
 from armsight.robot.kinematics.arm import Arm
 
 OTHER = 5.0  # another set-up: the error is this many times that with base and tool fitted again,
@@ -173,7 +173,7 @@ def with_change_allowed(found: Identified, measured: Measured) -> Identified:
     change = change_at(found.model, found.solution.x, weighted, free, found.prior, found.solution.noise)
     if change is None or not matters(change, found.cov):
         return found
-    note = f"from pose {change.row} on {change_text(found.model, change)}: the sigmas allow for it"
+    note = changed_from(found.model, change, f"pose {change.row}")
     return replace(found, cov=found.cov + change.off.T @ change.off, change=change, notes=(*found.notes, note))
 
 
