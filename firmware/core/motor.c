@@ -963,35 +963,35 @@ bool motor_disobeys(const motor_state *motor, const motor_config *config, float 
 #define SWINGS 8u /* so many changes are no answer to anything; half: pushes look like swings, double: a joint swings
                      for longer */
 #define SWING_STAYS 0.6f  /* of the first half of them: a second half that is smaller decays; half: ringing stops joints, double: noise hides a swing */
-#define SWING_RAD_S 0.4f /* rad/s from the reference's speed at least; half: noise swings, double: slow joints swing
-                            unseen */
+#define SWING_RAD_S 0.4f /* rad/s from the reference's speed at least; half: noise swings, double: slow joints swing unseen */
+#define SWING_NOISES 1.75f /* of the noise; looks in a row on a side are beyond that by more in sum: white noise as large alarms once in 5000 h; half: each minute, double: joints swing unseen */
 
 bool motor_swings_far(motor_state *motor, float off_rad_s, bool known)
 {
-    const int32_t side = off_rad_s > 0.0f ? 1 : -1;
     const float size_rad_s = number_size(off_rad_s);
     if (size_rad_s <= SWING_RAD_S) {
         return false;
     }
-    if (side != motor->swing_side) { /* what is shown by noise, of a current beside an uncertain resistance or of a reading, */
+    const bool goes_on = motor->driven_ticks - motor->swing_seen <= WATCH_TICKS && motor->swing_shows_rad_s * off_rad_s > 0.0f;
+    const float beyond_rad_s = off_rad_s > 0.0f ? off_rad_s - SWING_RAD_S : off_rad_s + SWING_RAD_S;
+    motor->swing_shows_rad_s = goes_on ? motor->swing_shows_rad_s + beyond_rad_s : beyond_rad_s;
+    motor->swing_seen = motor->driven_ticks;
+    if (off_rad_s * motor->swing_rad_s <= 0.0f) { /* the other side, or noise: of a current beside an uncertain resistance or of a reading */
         const float noise_rad_s = known ? motor->unsure_per_a * number_size(motor->last_a) : SWING_RAD_S;
-        const bool stays = motor->driven_ticks - motor->swing_other <= WATCH_TICKS; /* is gone when it is looked at next */
-        motor->swing_other = motor->driven_ticks;
-        if (!stays && size_rad_s <= SWING_RAD_S + noise_rad_s) {
+        if (number_size(motor->swing_shows_rad_s) <= SWING_NOISES * noise_rad_s) {
             return false;
         }
         motor->swings = motor->driven_ticks - motor->swing_since <= SWING_TICKS ? motor->swings + 1u : 0u;
-        const float goes = motor->swings > SWINGS / 2u ? motor->swing_rad_s : -SWING_STAYS * motor->swing_rad_s;
+        const float goes = number_size(motor->swing_rad_s) * (motor->swings > SWINGS / 2u ? 1.0f : -SWING_STAYS);
         motor->swing_stays_rad_s = motor->swings != 0u ? motor->swing_stays_rad_s + goes : 0.0f;
         if (motor->swings >= SWINGS && motor->swing_stays_rad_s < 0.0f) {
             motor->swings = 0u; /* it decays by itself */
             motor->swing_stays_rad_s = 0.0f;
         }
-        motor->swing_rad_s = 0.0f;
-        motor->swing_side = side;
+        motor->swing_rad_s = off_rad_s;
         motor->swing_since = motor->driven_ticks;
     }
-    motor->swing_rad_s = size_rad_s > motor->swing_rad_s ? size_rad_s : motor->swing_rad_s;
+    motor->swing_rad_s = size_rad_s > number_size(motor->swing_rad_s) ? off_rad_s : motor->swing_rad_s;
     return motor->swings >= SWINGS;
 }
 

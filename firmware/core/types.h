@@ -453,11 +453,11 @@ typedef struct motor_state {
     float way_unsure_rad;    /* how far that may be off by its resistance */
     float way_mark_rad;      /* the reading's when it last got on */
     uint32_t way_ticks;      /* since then */
-    int32_t swing_side;      /* which side of the reference's speed the motor's was on last */
-    uint32_t swing_since;    /* driven_ticks when it changed, */
-    uint32_t swing_other;    /* and when it was last seen on the other side */
+    uint32_t swing_since;    /* driven_ticks when the motor changed to the other side of the reference's speed, */
+    uint32_t swing_seen;     /* and when it was last looked at far off it */
+    float swing_shows_rad_s; /* sum of how far beyond the threshold it was in the looks in a row on a side, signed */
     uint32_t swings;         /* changes in quick succession */
-    float swing_rad_s;       /* how far from it it went since the last, */
+    float swing_rad_s;       /* how far off it was at most since the last, signed, */
     float swing_stays_rad_s; /* sum of that over the second half of the changes that count, less a share of the first half's */
     uint32_t swing_ticks;    /* half a period of the joint on its spring: so long that gives back what it took */
     uint32_t fast_ticks;     /* faster than the limit, in a row */

@@ -293,21 +293,24 @@ def test_gains_that_make_a_joint_swing_are_noticed(arms, library, seed):
 
 @pytest.mark.parametrize("name", ["a reading", "a current beside an uncertain resistance"])
 def test_noise_is_no_swing_and_a_swing_is_one(library, name):
-    """Noise of a speed beyond the threshold is on either side by chance; a swing of 20 Hz stays there for some looks."""
-    noise = np.random.default_rng(8).normal(0, 0.3, 1000)
-    found = []
-    for speeds in (noise, noise + 0.7 * np.sin(2 * np.pi * 20 * 3e-3 * np.arange(1000))):
+    """White noise as large as its term, here 0.4 rad/s, and blips on either side are none; swings of 20 and 40 Hz are."""
+
+    def alarms(speeds):
         motor = c.motor_state()
         library.motor_start(ctypes.byref(motor), ctypes.c_float(0.0), ctypes.c_float(2.0), 0)
         motor.last_a, motor.unsure_per_a = 0.5, 0.8
         for speed in speeds:
             motor.driven_ticks += 3
             if library.motor_swings_far(ctypes.byref(motor), ctypes.c_float(speed), name != "a reading"):
-                found.append(True)
-                break
-        else:
-            found.append(False)
-    assert found == [False, True]
+                return True
+        return False
+
+    draw = np.random.default_rng(8).normal
+    assert not alarms(0.5 * (-1) ** np.arange(200))
+    assert not any(alarms(draw(0, 0.4, 1000)) for _ in range(40))
+    for size, hz in ((0.7, 20), (0.8, 40)):
+        swing = size * np.sin(2 * np.pi * hz * 3e-3 * np.arange(1000))
+        assert sum(alarms(swing + draw(0, 0.3, 1000)) for _ in range(10)) >= 9, hz
 
 
 def test_backlash_teaches_no_resistance(arms, library):
