@@ -670,10 +670,13 @@ def test_arrays_of_both_sides_are_enough_alone(tmp_path):
     assert not has_both(one)
 
 
-@pytest.mark.parametrize("form", ["json", "records", "sixteen", "columns of sixteen", "units", "four lines"])
+@pytest.mark.parametrize(
+    "form",
+    ["json", "records", "sixteen", "columns of sixteen", "units", "four lines", "zeros", "zeros, four lines"],
+)
 def test_a_row_without_a_pose_stays_a_row_in_every_form(tmp_path, form):
     path, gone = tmp_path / "a.txt", 1
-    nan = [math.nan] * 16
+    nan = [0.0 if "zeros" in form else math.nan] * 16
     if form in ("json", "records"):
         path = tmp_path / "a.json"
         each = [None if k == gone else T.tolist() for k, T in enumerate(A)]
@@ -684,7 +687,7 @@ def test_a_row_without_a_pose_stays_a_row_in_every_form(tmp_path, form):
         path.write_text("\n".join(["x,y,z,qw,qx,qy,qz", *lines]))
     else:
         Ts = [nan if k == gone else (T.T if "columns" in form else T).ravel() for k, T in enumerate(A)]
-        np.savetxt(path, np.reshape(Ts, (-1, 4) if form == "four lines" else (-1, 16)), fmt="%.12f")
+        np.savetxt(path, np.reshape(Ts, (-1, 4) if "four lines" in form else (-1, 16)), fmt="%.12f")
     table = read_pose_table(path, keep_missed=True)
     assert [k for k, why in enumerate(table.missed) if why] == [gone]
     kept = np.delete(np.arange(len(A)), gone)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -220,13 +221,12 @@ def _is_head(head: list[str], rows: Rows) -> bool:
 def _with_content(cells: list[list[str]]) -> list[tuple[int, list[str]]]:
     """Return the rows that are neither blank nor comments, with their lines; without an empty cell behind the last.
 
-    A row of separators alone is one without a pose; above the first row with content, and beneath the last, it is none.
+    A row of separators alone is one without a pose; above the first row with content it is none.
     """
     rows = [(line, [cell.strip() for cell in row]) for line, row in enumerate(cells, 1)]
     rows = [(line, row) for line, row in rows if len(row) > 1 or any(row)]
     rows = [(line, row) for line, row in rows if not row[0].startswith("#")]
-    filled = [k for k, (_, row) in enumerate(rows) if any(row)]
-    rows = rows[filled[0] : filled[-1] + 1] if filled else []
+    rows = list(itertools.dropwhile(lambda each: not any(each[1]), rows))
     count = len(rows[0][1]) - (rows[0][1][-1] == "") if rows else 0
     rows = [(line, row if any(row) else [""] * count) for line, row in rows]
     return [(line, row[:-1] if len(row) == count + 1 and row[-1] == "" else row) for line, row in rows]
@@ -301,16 +301,18 @@ def _echoed(rows: Rows) -> list[str]:
     return [*fields, *(f"_{k}" for k in range(len(fields), len(first)))]
 
 
-def _is_last(cells: list[str]) -> bool | None:
-    """Return whether cells are the last row of a matrix, 0 0 0 1; None where one is no finite number."""
+def _is_last(cells: list[str], matrix: Iterable[str]) -> bool | None:
+    """Return whether cells are the last row of a matrix, 0 0 0 1; None where one is no finite number, or all of it is 0."""
     numbers = np.array([number(cell) for cell in cells], float)
+    if not any(number(cell) for cell in matrix):
+        return None
     return bool(np.allclose(numbers, [0, 0, 0, 1], atol=1e-6)) if np.isfinite(numbers).all() else None
 
 
 def _row_major(path: Path, cells: Cells) -> Cells:
     """Return matrices of 16 numbers row by row; those of Franka's O_T_EE, Eigen's and MATLAB's are column by column."""
-    rowwise = [_is_last(row[12:]) for _, row in cells.rows]
-    if False in rowwise and False not in [_is_last(row[3::4]) for _, row in cells.rows]:
+    rowwise = [_is_last(row[12:], row) for _, row in cells.rows]
+    if False in rowwise and False not in [_is_last(row[3::4], row) for _, row in cells.rows]:
         order = np.arange(16).reshape(4, 4).T.ravel()
         note = f"{path}: its matrices are column by column (0 0 0 1 is the last of every four numbers), and read so"
         return cells._replace(rows=[(line, [row[k] for k in order]) for line, row in cells.rows], notes=(note,))
@@ -325,12 +327,12 @@ def _row_major(path: Path, cells: Cells) -> Cells:
 
 def _matrices(path: Path, rows: Rows) -> Rows:
     """Return matrices of four lines each, or of three without the last one, as a row each."""
-    columnwise = len(rows) % 4 == 0 and all(
-        _is_last([row[3] for _, row in rows[k : k + 4]]) for k in range(0, len(rows), 4)
-    )
-    count = 4 if columnwise or any(_is_last(row) for _, row in rows) else 3  # three of [R p] never end so
-    for line, row in rows[3::4] if count == 4 and not columnwise else ():
-        if _is_last(row) is False:
+    fours = [[cell for _, row in rows[k : k + 4] for cell in row] for k in range(0, len(rows), 4)]
+    lasts = {_is_last(four[3::4], four) for four in fours} - {None}
+    columnwise = len(rows) % 4 == 0 and lasts == {True}
+    count = 4 if columnwise or any(_is_last(row, row) for _, row in rows) else 3  # three of [R p] never end so
+    for (line, row), four in zip(rows[3::4], fours, strict=False) if count == 4 and not columnwise else ():
+        if _is_last(row, four) is False:
             raise InputError(
                 f"{path}: line {line}: expected 0 0 0 1, the last of a matrix's four lines, found {' '.join(row)[:40]!r}"
             )

@@ -299,7 +299,9 @@ class Columns:
             cells = [row[k] if k < len(row) else "" for k in columns]
             values = [math.nan if value is None else value for value in map(number, cells)]
             if not all(map(math.isfinite, values)):
-                if not text:
+                # A word instead of all numbers says that there are none.
+                lost = self.missed is not None and len(names) > 1 and all(number(cell) is None for cell in cells)
+                if not text and not lost:
                     lax = gaps or self.missed is not None
                     self._check(line, dict(zip(names, cells, strict=True)), gaps=lax, empty=empty or lax)
                 values = [value if math.isfinite(value) else math.nan for value in values]
@@ -418,7 +420,8 @@ class Columns:
             written = found
         else:
             found, convention, written = self._angles(rotation, prefix)
-        return self._checked(rotations_by(found, convention, self.path)), found, convention, written
+        lines = [line for line, _ in self.rows]
+        return self._checked(rotations_by(found, convention, self.path, lines)), found, convention, written
 
     def _quaternions(self, rotation: str | None, prefix: str) -> tuple[Array, str]:
         """Return four numbers (N, 4) without names, and their convention; reject those that stand before the position."""

@@ -4,8 +4,8 @@ In: a file of any form that ``cells.py`` reads. Out: :class:`PoseTable`. The col
 order: ``x_m y_m z_m`` (or ``x_mm``, or ``x`` with ``unit``); ``qw qx qy qz``; or ``rx_deg ry_deg rz_deg`` (or ``rx_rad``,
 or ``rx``); or ``r11 .. r33``; or joints ``q1_deg ..`` (``q1_rad``) of an arm, also by their names. ``t_s`` is a time,
 ``image`` the image that belongs to a row, ``name`` (``shot`` in what ``armsight measure`` writes) a name that both tables
-share. A row whose pose is empty, not finite or a rotation of zeros, or whose ``status`` is not ok, was missed: it counts
-where rows of two tables belong together by their order, and is left out. Without names: 16 (or 12) numbers a row, a
+share. A row whose pose is empty, not finite, a word or a rotation of zeros, or whose ``status`` is not ok, was missed: it
+counts where rows of two tables belong together by their order, and is left out. Without names: 16 (or 12) numbers a row, a
 matrix; 7: x, y, z and a quaternion; 6: x, y, z and three numbers of a rotation, whose convention ``rotation`` names.
 """
 
@@ -131,6 +131,7 @@ def read_pose_table(
         InputError: the file, the line and what was expected.
     """
     path = Path(path)
+    rotation_given = rotation
     table, rotation, notes = _table(path, rotation, unit, columns, arm, side)
     names = table.joint_names(*((len(arm.joint_names), arm.name) if arm is not None else (None, "")))
     q = table.joints(names) if names else None
@@ -160,6 +161,9 @@ def read_pose_table(
     unused = tuple(table.given[k] for name, k in table.at.items() if name not in passed)
     if arm is not None and q is None:
         notes = (*notes, f"{path}: has no joint angles: --model {arm.name} is not used")
+    if rotation_given not in (None, convention) and not only_joints:
+        option = f"--columns {PREFIX[side]}rotation={rotation_given}"
+        notes = (*notes, f"{path}: {option} is not used: its columns say what its rotations are")
     if unused and not only_joints and not set(table.at) >= _MEASURED:
         notes = (*notes, f"{path}: {columns_unused(unused)}")
     missed = tuple(table.missed or ())

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 from armsight.errors import InputError
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from armsight.data import Array
 
 #: Conventions of three angles: a rotation vector; or rotations about x, y, z in the order given, about fixed axes (lower
@@ -17,7 +19,7 @@ QUATERNION_OFF = 1e-2  # how far the length of a quaternion may be from 1: what 
 CONVENTIONS = ("wxyz", "xyzw", *ROTATIONS)  # what three or four numbers of a rotation may mean
 
 
-def rotations_by(numbers: Array, convention: str, path: Path) -> Array:
+def rotations_by(numbers: Array, convention: str, path: Path, lines: Sequence[int] = ()) -> Array:
     """Return rotations (N, 3, 3) of quaternions (N, 4), or of angles (N, 3) in degrees, in a convention.
 
     Raises:
@@ -30,7 +32,8 @@ def rotations_by(numbers: Array, convention: str, path: Path) -> Array:
         lengths = np.linalg.norm(numbers, axis=1)
         worst = int(np.argmax(np.abs(lengths - 1))) if len(lengths) else 0
         if (np.abs(lengths - 1) > QUATERNION_OFF).any():
-            raise InputError(f"{path}: pose {worst + 1}: a quaternion has length {lengths[worst]:.4g}, not 1")
+            where = f"line {lines[worst]}" if lines else f"pose {worst + 1}"
+            raise InputError(f"{path}: {where}: a quaternion has length {lengths[worst]:.4g}, not 1")
         return np.asarray(Rotation.from_quat(numbers[:, [1, 2, 3, 0]] if convention == "wxyz" else numbers).as_matrix())
     if convention == "rotvec":
         return np.asarray(Rotation.from_rotvec(np.radians(numbers)).as_matrix())

@@ -122,6 +122,9 @@ def test_the_best_of_a_class_with_what_to_build(armsight, tmp_path, monkeypatch)
     rig = StereoRig.load(tmp_path / "out" / "rig.json")
     assert rig.baseline_m == pytest.approx(0.15)
     assert rig.left.intrinsics[0] == pytest.approx(found["focal_px"])
+    again = armsight("budget", "--rig", tmp_path / "out" / "rig.json", "--volume", "0.1x0.1x0.1m", "distance=0.7m")
+    assert "rig.json: {}x{} px, 150 mm apart, volume 0.1x0.1x0.1m at 0.7m".format(*rig.left.image_size_px) in again.out
+    assert "those of webcam-720p are taken: give --camera" in again.err
     body = read_layout(tmp_path / "out" / "body.toml").body
     np.testing.assert_allclose(body.points, body_target(only["body_scale"]).discs.body.points, atol=1e-9)
     assert (tmp_path / "out" / "body.pdf").read_bytes().startswith(b"%PDF")

@@ -622,12 +622,14 @@ def test_what_measure_wrote_is_joined_by_the_names_of_its_shots(tmp_path):
     assert table.missed == tuple("no body" if k == 4 else "" for k in range(14))
     assert table.notes == ()
     images = replace(table, names=tuple(f"img/{name}.png" for name in table.names[::-1]))
-    of_robot, of_seen = matched_rows(images, table.names)
+    of_robot, of_seen = matched_rows(images, table.names, table.missed)
     assert [table.names[k] for k in of_seen] == [Path(images.names[k]).stem for k in of_robot]
     assert of_seen[0] == 13
 
 
-@pytest.mark.parametrize("gap", [",,,,,,", "nan,nan,nan,nan,nan,nan,nan", "0.1,0.2,0.3,0,0,0,0", "1,2,3,NULL,,-,N/A"])
+@pytest.mark.parametrize(
+    "gap", [",,,,,,", "nan,nan,nan,nan,nan,nan,nan", "0.1,0.2,0.3,0,0,0,0", "1,2,3,NULL,,-,N/A", "lost,,,,,,"]
+)
 def test_rows_without_a_pose_on_either_side_are_left_out_and_the_others_stay_paired(tmp_path, gap):
     """By order: a tracker that lost the body, a robot that was not asked."""
     A, B = motion()[1:]
@@ -647,6 +649,38 @@ def test_rows_without_a_pose_on_either_side_are_left_out_and_the_others_stay_pai
     assert f"{robot.path}: no pose in line 4 (" in said
     assert "no target in line 6 (" in said
     assert len(read_pose_table(robot.path).Ts) == 12
+
+
+def test_rows_without_a_pose_beneath_the_last_one_count_and_a_quaternion_is_named_by_its_line(tmp_path):
+    A, B = motion()[1:]
+    sides = [[",".join(map(repr, row)) for row in np.hstack([Ts[:, :3, 3], quaternions(Ts)]).tolist()] for Ts in (A, B)]
+    head, paths = "x_m,y_m,z_m,qw,qx,qy,qz", [tmp_path / "robot.csv", tmp_path / "seen.csv"]
+
+    def read(*rows):
+        for path, each in zip(paths, rows, strict=True):
+            path.write_text("\n".join([head, *each]))
+        robot, seen = (read_pose_table(path, keep_missed=True) for path in paths)
+        return paired(robot, seen_in_table(seen), True, None)
+
+    empty = [",,,,,,"] * 11
+    np.testing.assert_array_equal(read(sides[0], [*sides[1][:-3], *empty[:3]]).rows, np.arange(11))
+    np.testing.assert_array_equal(read(sides[0], [*sides[1], *empty]).rows, np.arange(14))
+    with pytest.raises(InputError, match="3 of 14 poses have both sides"):
+        read(sides[0], [*sides[1][:3], *empty])
+    with pytest.raises(InputError, match=r"14 rows, but 13 images or target poses \(of which 12 hold a target\)"):
+        read(sides[0], [*sides[1][:5], empty[0], *sides[1][:7]])
+    with pytest.raises(InputError, match=r"none of 11 rows has a pose; line 2: x_m is empty"):
+        read(sides[0], empty)
+    with pytest.raises(InputError, match=r"line 4: a quaternion has length 2, not 1"):
+        read(sides[0], [*sides[1][:2], "0.1,0.2,0.3,-1,-1,-1,-1", *sides[1][3:]])
+
+
+def test_a_convention_that_the_columns_contradict_is_not_used_with_a_note(tmp_path):
+    path = tmp_path / "seen.csv"
+    path.write_text("x_m,y_m,z_m,qw,qx,qy,qz\n0.1,0.2,0.3,1,0,0,0\n")
+    (note,) = read_pose_table(path, rotation="rotvec", side="seen").notes
+    assert "--columns seen:rotation=rotvec is not used" in note
+    assert not read_pose_table(path, rotation="wxyz").notes
 
 
 def test_a_mounting_that_is_hardly_known_is_answered_and_not_to_be_trusted(armsight, tmp_path):

@@ -15,12 +15,13 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from armsight.app.measure.run import MeasureRun
-from armsight.app.measure.shots import _detected, reversed_notes
+from armsight.app.measure.shots import _detected, board_notes, reversed_notes
 from armsight.files import read_table
 from armsight.geometry.pose import exp_se3, inverse, log_se3, pose, transform
 from armsight.sim.render.render import render
 from armsight.sim.render.scene import PosedBody, chessboard
 from armsight.vision.markers.body_file import save_body_csv
+from armsight.vision.markers.calibrated_board import save_board_file
 from armsight.vision.markers.targets import open_body, open_target
 from armsight.vision.pose.shot_pose import CSV_COLUMNS
 from armsight.vision.rig import StereoRig
@@ -431,6 +432,24 @@ def test_a_bowed_board_is_measured_as_its_calibration_found_it(data_dir, armsigh
     # Where the shape is known, what is left is the noise: a misfit by chance, and the recording's one bad pair.
     assert sum(misfit > 1 for misfit in misfits[0]) == 13
     assert sum(misfit > 1 for misfit in misfits[1]) <= 3
+
+
+def test_a_board_of_another_calibration_and_exchanged_counts_are_noted(rendered, tmp_path):
+    spec, files = "chessboard:9x6:25mm", [tmp_path / "rig.board.toml", tmp_path / "other.board.toml"]
+    points = open_body(spec).points
+    for k, file in enumerate(files):
+        save_board_file(file, spec, points + 1e-4 * k)
+    rig = replace(StereoRig.load(rendered.rig), provenance={"target": spec, "board": files[0].name})
+
+    def notes(target):
+        options = SimpleNamespace(rig=tmp_path / "rig.json", target=str(target))
+        return board_notes(options, rig, open_target(target))
+
+    assert not notes(spec)
+    assert not notes(files[0])
+    assert not notes("chessboard:8x6:25mm")
+    assert "has its counts exchanged" in notes("chessboard:6x9:25mm")[0]
+    assert "is of another calibration" in notes(files[1])[0]
 
 
 def test_a_rig_whose_camera_moved_is_named_and_the_exit_code_says_so(rendered, tmp_path, armsight):

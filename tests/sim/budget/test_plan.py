@@ -28,6 +28,11 @@ def test_a_file_says_the_same_as_options(tmp_path):
         RigPlan.read(str(path))
 
 
+@pytest.mark.parametrize("want", ["600 \u00b5m, 0.2\N{DEGREE SIGN}", "600\u03bcm,12 arcmin", "0.6mm,0.003490658504rad"])
+def test_units_of_what_is_requested(want):
+    np.testing.assert_allclose(RigPlan(want=want).requested, [6e-4, np.radians(0.2)], rtol=1e-9)
+
+
 def test_amounts_in_any_order_and_with_blanks():
     plan = RigPlan(volume="400 mm x 0.4 X 0.3 m", want="0.2 deg, 600um", speed="20deg/s,0.3m/s")
     np.testing.assert_allclose(plan.size_m, (0.4, 0.4, 0.3))
@@ -75,8 +80,10 @@ def test_between_a_chart_that_is_found_and_one_that_is_not_it_is_that_of_the_siz
         ({"speed": "300m/s"}, "is it in mm/s"),
         ({"want": "0.1"}, "expected 0.1mm or 0.1mm,0.05deg"),
         ({"want": "0.1mm,0.2mm"}, "expected 0.1mm or 0.1mm,0.05deg"),
-        ({"want": "0.2deg"}, "expected 0.1mm or 0.1mm,0.05deg"),
+        ({"want": "12arcmin"}, "expected 0.1mm or 0.1mm,0.05deg; an angle alone"),
+        ({"want": "0,6mm"}, "expected 0.1mm or 0.1mm,0.05deg; decimals have a point"),
         ({"want": "0mm"}, "no rig measures without error"),
+        ({"want": "1mm,0deg"}, "no rig measures without error"),
         ({"speed": "nanm/s"}, "speed 'nanm/s': expected 0.3m/s"),
         ({"volume": "0.1x0.1x0.1m", "handeye": "1"}, "expected 0.1mm,0.02deg"),
         ({"volume": "0.1x0.1x0.1m", "board_bent": "1m"}, "no print is off by more than 10 mm"),

@@ -69,9 +69,16 @@ def budget_report(found: RigBudget, alternatives: Sequence[Alternative] = (), ru
         "missing": ("Not in the budget", [Fact(f"not in the budget: {why}") for why in NOT_MODELLED]),
     }
     notes = [Note("note", f"chosen: {_chosen(plan)}")]
-    if run and "camera" not in plan.named:
-        notes.insert(0, Note("note", "the run's cameras are not known: give --camera"))
-    headline = f"{plan.cameras.text}; {plan.baseline} apart, volume {plan.volume} at {plan.distance}"
+    cameras = f"{plan.cameras.text}; {plan.baseline} apart"
+    if plan.rig:
+        cameras = f"{plan.rig}: {{}}x{{}} px, {1e3 * plan.baseline_m:.4g} mm apart".format(*plan.image_size_px)
+        if "camera" not in plan.named:
+            text = f"noise and exposure of the rig's cameras are not known, those of {plan.camera} are taken: give --camera"
+            notes.insert(0, Note("note", text))
+        if chosen := [f"{key} {getattr(plan, key)}" for key in ("volume", "distance") if key not in plan.named]:
+            text = f"{', '.join(chosen)}: chosen, as the rig file does not say where it measures: give --volume, --distance"
+            notes.insert(0, Note("note", text))
+    headline = f"{cameras}, volume {plan.volume} at {plan.distance}"
     return Report("budget", "Before you buy", plan.volume, headline, sections, notes, values, "budget", _answer(found))
 
 

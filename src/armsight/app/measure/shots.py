@@ -23,7 +23,7 @@ from armsight.vision.detections import NAMED, SeenShot, read_detections
 from armsight.vision.follow.follower import Follower, follows
 from armsight.vision.image import grey, one_image
 from armsight.vision.markers.board import BOARDS, board_in_view
-from armsight.vision.markers.calibrated_board import is_print
+from armsight.vision.markers.calibrated_board import EstimatedBoard, is_print, load_board_file
 from armsight.vision.markers.circles import unseen_row
 from armsight.vision.markers.marker import Target
 from armsight.vision.markers.targets import open_body, open_target
@@ -100,6 +100,7 @@ class ImageShots:
             raise InputError(
                 "--save-rig writes skew, readout and the noise of discs: give --skew find, or a body of discs"
             )
+        say(board_notes(options, rig, self._target))
         self.skewed: list[HealthFinding] = []  #: filled at the end: that the cameras do not expose at one time
         self._missed: list[Shot] = []  # the first with both images
         self._again: Source | None = None
@@ -216,6 +217,21 @@ class ImageShots:
         seen = Counter(_board(body) for body in shown if _board(body)[0] != kind or len(body.points) > points)
         (said, of), count = next(iter(seen.most_common(1)), (("", ""), 0))
         return f"the board has {of} ({said}), not {counts}" if 2 * count > max(len(shown), 2) else ""
+
+
+def board_notes(options: MeasureOptions, rig: StereoRig, target: Target | Body) -> list[str]:
+    """Say where a target is the board of the rig's calibration, its counts exchanged or from another calibration."""
+    given, board = (rig.provenance.get(key) for key in ("target", "board"))
+    kind, counts, rest = (*str(given).split(":", 2), "", "")[:3]
+    if isinstance(given, str) and given != options.target == f"{kind}:{'x'.join(counts.split('x')[::-1])}:{rest}":
+        return [
+            f"the rig was calibrated with {given}: {options.target} has its counts exchanged: another origin, other axes"
+        ]
+    if isinstance(target, EstimatedBoard) and isinstance(board, str) and (own := options.rig.parent / board).is_file():
+        found = load_board_file(own)
+        if found.drawing.body.name == target.drawing.body.name and not np.array_equal(found.points, target.points):
+            return [f"{options.target} is of another calibration than {options.rig}, whose board is in {own}"]
+    return []
 
 
 def _board(body: Body) -> tuple[str, str]:

@@ -177,7 +177,7 @@ def paired(robot: PoseTable, seen: Seen, in_hand: bool, arm: Arm | None) -> Pair
     Raises:
         InputError: rows and images do not pair up, or hardly one shows the target.
     """
-    rows, matched = matched_rows(robot, seen.names)
+    rows, matched = matched_rows(robot, seen.names, seen.missed)
     notes = [*robot.notes, *seen.notes, *_alone(robot, seen, rows, matched)]
     rows, matched = _once(robot, seen, rows, matched, notes)
     shown = np.array([not seen.missed[k] for k in matched])
@@ -190,7 +190,8 @@ def paired(robot: PoseTable, seen: Seen, in_hand: bool, arm: Arm | None) -> Pair
             notes.append(f"{what} {', '.join(where[:3])}{more}: left out")
     rows, matched = rows[shown & known], matched[shown & known]
     if len(rows) < MIN_POSES:
-        raise InputError(f"{len(rows)} poses have both sides; {MIN_POSES} and more are needed, 15 are advised")
+        of = f" of {len(known)}" if len(rows) < len(known) else ""
+        raise InputError(f"{len(rows)}{of} poses have both sides; {MIN_POSES} and more are needed, 15 are advised")
     A, B, covs = robot.Ts[rows], seen.Ts[matched], seen.covs[matched]
     common = None if seen.common is None else seen.common[matched]
     if seen.symmetries:
@@ -267,10 +268,11 @@ def _alike(Ts: Array) -> Rows:
     return np.asarray(np.unique(Ts.reshape(-1, 16), axis=0, return_inverse=True)[1].ravel())
 
 
-def matched_rows(robot: PoseTable, seen: Sequence[str]) -> tuple[Rows, Rows]:
+def matched_rows(robot: PoseTable, seen: Sequence[str], missed: Sequence[str]) -> tuple[Rows, Rows]:
     """Return the rows of both sides that belong together: by name where the robot's table has names, else by order.
 
-    ``robot``: the robot's table. ``seen``: names of what was seen, one a row.
+    ``robot``: the robot's table. ``seen``: names of what was seen, one a row. ``missed``: why each has no pose, or "". Rows
+    without a pose beneath the last one of the longer side are no mistake: spreadsheets leave such.
 
     Raises:
         InputError: no name is among those seen, or other numbers of rows.
@@ -289,12 +291,14 @@ def matched_rows(robot: PoseTable, seen: Sequence[str]) -> tuple[Rows, Rows]:
             )
         rows, matched = np.array(found).T
         return rows, matched
-    if len(robot.Ts) != len(seen):
+    count = min(len(robot.Ts), len(seen))
+    if not all((*robot.missed[count:], *missed[count:])):
+        shown = f" (of which {missed.count('')} hold a target)" if any(missed) else ""
         raise InputError(
-            f"{robot.path}: {len(robot.Ts)} rows, but {len(seen)} images or target poses: which belong "
+            f"{robot.path}: {len(robot.Ts)} rows, but {len(seen)} images or target poses{shown}: which belong "
             "together? give it a column image (or name), or t_s on both sides (handeye: with --streams)"
         )
-    return np.arange(len(robot.Ts)), np.arange(len(seen))
+    return np.arange(count), np.arange(count)
 
 
 def _alone(robot: PoseTable, seen: Seen, rows: Rows, matched: Rows) -> list[str]:

@@ -126,7 +126,8 @@ def _angles(
             f"{', '.join(head)}"
         )
     names = [f"line {line}" if key is None else row[head.index(key)] for line, row in rows]
-    pairs = {rows[i][0]: row for row, i in zip(*matched_rows(table, names), strict=True)}
+    missed = ["" if line in shown else "no pose" for line, _ in rows]
+    pairs = {rows[i][0]: row for row, i in zip(*matched_rows(table, names, missed), strict=True)}
     angles = {line: table.q[row] for line, row in pairs.items() if line in shown and not table.missed[row]}
     alone = len(shown) - len(angles)
     return angles, [f"{alone} of {len(rows)} poses have no row in {table.path}, and are left out"] if alone else []

@@ -63,7 +63,8 @@ _MOST_OFF_M = 0.01  # m; what a print may be off; half: sagging boards are rejec
 #: Shortest focal length that is chosen where none is given, image widths: 80 degrees; half: lenses that bend the image more
 #: than the model of five coefficients, double: ordinary volumes are rejected.
 _WIDEST = 0.6
-_UNITS = {"um": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0, "deg": math.pi / 180}
+_UNITS = {"um": 1e-6, "\u00b5m": 1e-6, "\u03bcm": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0}
+_ANGLES = {"deg": math.pi / 180, "\N{DEGREE SIGN}": math.pi / 180, "arcmin": math.pi / 10800, "rad": 1.0}
 _NUMBER = r"((?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:e-?[0-9]+)?)"
 #: What a rig that there is says itself; and, where it says when its rows are exposed.
 _OF_RIG = ("image", "baseline", "verging_deg", "focal_widths", "board", "pairs", "board_bent")
@@ -116,12 +117,22 @@ def length_m(text: str, what: str) -> float:
     return _amounts(what, text, "a length with its unit, such as 0.8m or 300mm", most=1)[0]
 
 
-def _amounts(what: str, text: str, form: str, per: str = "", most: int = 2) -> tuple[float, float]:
-    """Read a length, m, and an angle, rad, in either order, each ``per`` that unit; an angle that is left out is 0."""
-    found = [re.fullmatch(rf"{_NUMBER}\s*(um|mm|cm|m|deg){per}", part.strip()) for part in text.split(",")]
-    values = {each[2] == "deg": float(each[1]) * _UNITS[each[2]] for each in found if each}
+def _amounts(
+    what: str, text: str, form: str, per: str = "", most: int = 2, *, errors: bool = False
+) -> tuple[float, float]:
+    """Read a length, m, and an angle, rad, in either order, each ``per`` that unit; an angle that is left out is 0.
+
+    ``errors``: those that are to be reached, none of which is 0.
+    """
+    parts, units = [part.strip() for part in text.split(",")], _UNITS | _ANGLES
+    found = [re.fullmatch(rf"{_NUMBER}\s*({'|'.join(units)}){per}", part) for part in parts]
+    values = {each[2] in _ANGLES: float(each[1]) * units[each[2]] for each in found if each}
     if not len(values) == len(found) <= most or False not in values:
-        raise InputError(f"{what} {text!r}: expected {form}")
+        comma = "; decimals have a point, not a comma" if any(map(str.isdecimal, parts)) and len(parts) > 1 else ""
+        alone = "; an angle alone has no length: give one, too" if set(values) == {True} == {*map(bool, found)} else ""
+        raise InputError(f"{what} {text!r}: expected {form}{comma}{alone}")
+    if errors and not all(values.values()):
+        raise InputError(f"{what} {text!r}: no rig measures without error: expected {form}")
     return values[False], values.get(True, 0.0)
 
 
@@ -305,11 +316,7 @@ class RigPlan:
     @cached_property
     def requested(self) -> tuple[float, float] | None:
         """Metres and rad, 0 where it is not asked; None where nothing is."""
-        form = "0.1mm or 0.1mm,0.05deg"
-        found = _amounts("want", self.want, form) if self.want else None
-        if found and not found[0]:
-            raise InputError(f"want {self.want!r}: no rig measures without error: expected {form}")
-        return found
+        return _amounts("want", self.want, "0.1mm or 0.1mm,0.05deg", errors=True) if self.want else None
 
     @cached_property
     def cameras(self) -> CameraClass:

@@ -216,11 +216,13 @@ class RigBudget(Record):
 
     def to_dict(self) -> dict[str, Any]:
         """Return what ``armsight budget --json`` prints, in m and rad."""
-        found, whole = self.found, self.found.cov()
+        found, whole, plan = self.found, self.found.cov(), self.plan
+        rig = {"file": plan.rig, "image_size_px": plan.image_size_px, "baseline_m": plan.baseline_m}
         shares = {f"{share}_rms_m": found.rms(found.cov(of=share))[0] for share in ("precision", "trueness")}
         return {
-            "plan": {each.name: getattr(self.plan, each.name) for each in self.plan.settings()},
-            "focal_px": self.plan.focal_px,
+            "plan": {one.name: getattr(plan, one.name) for one in plan.settings() if one.name not in plan.of_rig},
+            **({"rig": rig} if plan.rig else {}),
+            "focal_px": plan.focal_px,
             "results": {name: state._asdict() for name, state in self.states.items()},
             "lost_share_in_motion": float(found.lost.mean()),
             **shares,
