@@ -60,14 +60,7 @@ def capture_rows(path: Path, text: str, side: str, whose: str | None) -> Program
     if (export := _export(path, text)) is None:
         return None
     program, said = export.program, f"{path}: an export of {export.program}"
-    bodies = {name: at for name, at in export.bodies.items() if {*_POSITION} <= set(at)}
-    if not bodies:
-        raise InputError(f"{said} without the poses of a rigid body: {_ADVICE[program]}")
-    first = next(iter(bodies))
-    if (name := whose or (first if len(bodies) == 1 else "")) not in bodies:
-        option = f"--columns {PREFIX[side]}pose={first}"
-        raise InputError(f"{said} with the poses of {', '.join(bodies)}: say which, {option}")
-    at = bodies[name]
+    at = _body(said, export, side, whose)
     rotation = next((names for names in (_QUATERNION, _MATRIX) if set(names) <= set(at)), None)
     if rotation is None:
         raise InputError(f"{said} whose rotations are three numbers: {_ADVICE[program]}")
@@ -83,6 +76,18 @@ def capture_rows(path: Path, text: str, side: str, whose: str | None) -> Program
         more = f" and {len(damaged) - _LISTED} more" if len(damaged) > _LISTED else ""
         note += f"; damaged: line {', '.join(damaged[:_LISTED])}{more}"
     return ProgramPoints(["t_s", *_POSITION, *rotation], rows, None, (note,))
+
+
+def _body(said: str, export: _Export, side: str, whose: str | None) -> dict[str, int]:
+    """Return the columns of the body ``whose``, or of the only one; InputError as :func:`capture_rows`."""
+    bodies = {name: at for name, at in export.bodies.items() if {*_POSITION} <= set(at)}
+    if not bodies:
+        raise InputError(f"{said} without the poses of a rigid body: {_ADVICE[export.program]}")
+    first = next(iter(bodies))
+    if (name := whose or (first if len(bodies) == 1 else "")) not in bodies:
+        option = f"--columns {PREFIX[side]}pose={first}"
+        raise InputError(f"{said} with the poses of {', '.join(bodies)}: say which, {option}")
+    return bodies[name]
 
 
 def _pose(row: list[str], columns: list[int], unit_m: float, rate_hz: float | None) -> list[str] | None:

@@ -299,9 +299,7 @@ class Columns:
             cells = [row[k] if k < len(row) else "" for k in columns]
             values = [math.nan if value is None else value for value in map(number, cells)]
             if not all(map(math.isfinite, values)):
-                # A word instead of all numbers says that there are none.
-                lost = self.missed is not None and len(names) > 1 and all(number(cell) is None for cell in cells)
-                if not text and not lost:
+                if not text:
                     lax = gaps or self.missed is not None
                     self._check(line, dict(zip(names, cells, strict=True)), gaps=lax, empty=empty or lax)
                 values = [value if math.isfinite(value) else math.nan for value in values]
@@ -326,6 +324,8 @@ class Columns:
 
     def _check(self, line: int, cells: Mapping[str, str], *, gaps: bool, empty: bool) -> None:
         """Reject a row's cell that is no number, or with no ``gaps`` not finite; ``empty``: it may be empty."""
+        if self.missed is not None and len(cells) > 1 and all(number(cell) is None for cell in cells.values()):
+            return  # a word instead of all numbers says that there are none
         for name, cell in cells.items():
             value = number(cell)
             blank = cell.lower() in NO_NUMBER if gaps else empty and not cell

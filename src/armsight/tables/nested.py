@@ -98,29 +98,32 @@ def _records(path: Path, document: Any, side: str, whose: str | None) -> list[Re
         raise InputError(f"{path}: holds {_content(document)}, more than {_MOST_RECORDS} poses: split it")
     records, items = list[Record](), _items(document)
     for k, (item, name) in enumerate(items, 1):
-        groups = dict(_poses(item))
+        groups, named = dict(_poses(item)), {} if name is None else {"name": name}
         if not groups and (item is None or (isinstance(item, Mapping) and None in item.values())):
-            records.append({**({} if name is None else {"name": name}), **_beside(item)})
-            continue
-        if not groups and records:
+            records.append({**named, **_beside(item)})
+        elif not groups and records:
             raise InputError(
                 f"{path}: record {k} of {len(items)} holds {_content(item)}, and no pose, as those before it do"
             )
-        if groups:
-            poses = [key for key, one in groups.items() if not _is_joints(one)]
-            chosen = _chosen(path, poses or list(groups), side, whose)
+        elif groups:
+            chosen, record = _record(path, groups, side, whose)
             if len(items) == 1 and _CAMERAS.search(str(item)) and not any(_score(chosen, each) for each in SIDES):
                 raise InputError(f"{path}: is a calibration of cameras ({chosen}), no table of poses")
-            record = dict(groups[chosen])
-            joints = (one for one in groups.values() if poses and _is_joints(one, r"q\d_(deg|rad)"))
-            record |= next(joints, {})
-            records.append({**record, **({} if name is None else {"name": name}), **_beside(item)})
+            records.append({**record, **named, **_beside(item)})
     if not any(records):
         raise InputError(
             f"{path}: holds {_content(document)}, and no poses: expected a list of matrices, of 6 or 7 numbers, or of "
             "positions beside rotations (translation, rotation), or a table such as x_mm,y_mm,z_mm,qw,qx,qy,qz"
         )
     return records
+
+
+def _record(path: Path, groups: dict[str, Record], side: str, whose: str | None) -> tuple[str, Record]:
+    """Return which pose of a record is meant, and it with the joints beside."""
+    poses = [key for key, one in groups.items() if not _is_joints(one)]
+    chosen = _chosen(path, poses or list(groups), side, whose)
+    joints = (one for one in groups.values() if poses and _is_joints(one, r"q\d_(deg|rad)"))
+    return chosen, {**groups[chosen], **next(joints, {})}
 
 
 def _parsed(path: Path) -> Any:  # noqa: ANN401 - whatever a document holds

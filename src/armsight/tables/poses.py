@@ -148,28 +148,38 @@ def read_pose_table(
         R, numbers, convention, written = table.rotations(rotation, PREFIX[side])
         written = np.hstack([p / unit_m, written]) if written.shape[1] else written
         Ts = pose(R, p)
-    elif arm is None:
-        raise InputError(f"{path}: joint angles need the arm: give --model, a name (armsight arm list) or a .urdf file")
-    elif side == "seen":
-        raise InputError(
-            f"{path}: holds joint angles alone, no poses that cameras saw: x_m y_m z_m or x_mm y_mm z_mm are needed"
-        )
     else:
-        Ts, of_joints = np.asarray(arm.forward(q)), True
+        Ts, of_joints = _of_joints(path, q, arm, side), True
     t_s, row_names, lines = table.times(), table.names(), np.array([line for line, _ in table.rows])
     passed = table.used | {"_0", "_1", "_2", "_3"}
     unused = tuple(table.given[k] for name, k in table.at.items() if name not in passed)
     if arm is not None and q is None:
         notes = (*notes, f"{path}: has no joint angles: --model {arm.name} is not used")
-    if rotation_given not in (None, convention) and not only_joints:
-        option = f"--columns {PREFIX[side]}rotation={rotation_given}"
-        notes = (*notes, f"{path}: {option} is not used: its columns say what its rotations are")
-    if unused and not only_joints and not set(table.at) >= _MEASURED:
-        notes = (*notes, f"{path}: {columns_unused(unused)}")
+    if not only_joints:
+        useless = rotation_given if rotation_given != convention else None
+        notes = (*notes, *_not_used(path, side, useless, () if set(table.at) >= _MEASURED else unused))
     missed = tuple(table.missed or ())
     rows, how = (lines, Ts, numbers, written), (of_joints, unused, located)
     found = PoseTable(path, *rows, convention, q, t_s, row_names, unit_m, notes, missed, *how)
     return found if keep_missed else found.without_missed()
+
+
+def _of_joints(path: Path, q: Array, arm: ArmJoints | None, side: str) -> Array:
+    """Return the arm's poses (N, 4, 4) at joints (N, n), rad; InputError without an arm, or where cameras' are needed."""
+    if arm is None:
+        raise InputError(f"{path}: joint angles need the arm: give --model, a name (armsight arm list) or a .urdf file")
+    if side == "seen":
+        raise InputError(
+            f"{path}: holds joint angles alone, no poses that cameras saw: x_m y_m z_m or x_mm y_mm z_mm are needed"
+        )
+    return np.asarray(arm.forward(q))
+
+
+def _not_used(path: Path, side: str, rotation: str | None, columns: tuple[str, ...]) -> list[str]:
+    """Return notes of an option and of columns that are not used."""
+    option = f"--columns {PREFIX[side]}rotation={rotation}"
+    notes = [f"{path}: {option} is not used: its columns say what its rotations are"] if rotation is not None else []
+    return [*notes, f"{path}: {columns_unused(columns)}"] if columns else notes
 
 
 def _table(

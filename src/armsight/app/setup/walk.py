@@ -97,10 +97,8 @@ class SetupWalk:
                 continue
             say(f"\n{number} of {len(steps)}: {step.say}")
             possible = self.find(step, say)
-            if PLATE in self.typed(step) and not Path(PLATE).exists():  # outside of a checkout
-                Path(PLATE).parent.mkdir(exist_ok=True)
-                write_text(PLATE, (resources.files("armsight.app.setup") / "arm_plate.toml").read_text("utf-8"))
-                say(f"written: {PLATE}")
+            if PLATE in self.typed(step):
+                _write_plate(say)
             row["command"] = f"armsight {self.typed(step)}"
             self.keep()
             say(f"$ {row['command']}" if possible else "left out: there is no such file")
@@ -124,9 +122,7 @@ class SetupWalk:
                 row["state"] = "done"
             self.done[step.command] = row["state"]
             self.keep()
-        failed = sum(row["state"] == "failed" for row in result["steps"])
-        well = f"all {len(steps)} steps are done" if not failed else f"{failed} of {len(steps)} steps failed"
-        say(f"\n{well}; --from N does them again from the N-th")
+        say(f"\n{_summary([row['state'] for row in result['steps']])}; --from N does them again from the N-th")
         return 0
 
     def keep(self) -> None:
@@ -141,6 +137,20 @@ def words_of(cameras: str | None, board: str | None) -> dict[str, str]:
     kind = next((kind for kind in finding.KINDS if (board or "").startswith(kind)), "")
     given = {CAMERAS: cameras, PORT: board and board.removeprefix(kind)}
     return {word: shlex.quote(here) for word, here in given.items() if here is not None}
+
+
+def _summary(states: list[str]) -> str:
+    """Return how many steps are done, or failed."""
+    failed = states.count("failed")
+    return f"{failed} of {len(states)} steps failed" if failed else f"all {len(states)} steps are done"
+
+
+def _write_plate(say: Callable[[str], None]) -> None:
+    """Write the body file of the plate where there is none, as outside of a checkout."""
+    if not Path(PLATE).exists():
+        Path(PLATE).parent.mkdir(exist_ok=True)
+        write_text(PLATE, (resources.files("armsight.app.setup") / "arm_plate.toml").read_text("utf-8"))
+        say(f"written: {PLATE}")
 
 
 def _set_aside(folder: Path, say: Callable[[str], None]) -> None:

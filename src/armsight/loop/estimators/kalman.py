@@ -303,9 +303,7 @@ class KalmanEstimator:
         """Use a measurement after those before it in time, and use those after it again."""
         self._newest = self._here = None
         oldest, newest = self.span_s
-        row = len(self._states)
-        while row > 1 and self._after(self._states[row - 1], measurement):
-            row -= 1
+        row = self._row(measurement)
         before = self._states[row - 1]
         seen_s = self._seen_s(measurement, before)
         if seen_s > newest:
@@ -332,6 +330,13 @@ class KalmanEstimator:
         while len(self._states) > 2 and self._states[1].t_s < self._states[-1].t_s - HISTORY_S:
             del self._states[0]
         return outcome
+
+    def _row(self, measurement: PoseMeasurement | Taken | Until) -> int:
+        """Return the row, at least 1, that the state after a measurement has among those stored."""
+        row = len(self._states)
+        while row > 1 and self._after(self._states[row - 1], measurement):
+            row -= 1
+        return row
 
     def _contradicted(self, kind: type, outcome: Outcome) -> bool:
         """Count outcomes of a kind, images or windows; return whether so many are against the unit that it was dropped."""

@@ -182,12 +182,8 @@ def paired(robot: PoseTable, seen: Seen, in_hand: bool, arm: Arm | None) -> Pair
     rows, matched = _once(robot, seen, rows, matched, notes)
     shown = np.array([not seen.missed[k] for k in matched])
     known = np.array([not robot.missed[r] for r in rows])
-    lost = [f"{seen.names[k]} ({seen.missed[k]})" for k in matched[~shown]]
-    gone = [f"line {robot.lines[r]} ({robot.missed[r]})" for r in rows[~known]]
-    for what, where in (("no target in", lost), (f"{robot.path}: no pose in", gone)):
-        if where:
-            more = f" and {len(where) - 3} more" if len(where) > 3 else ""
-            notes.append(f"{what} {', '.join(where[:3])}{more}: left out")
+    notes += _named("no target in", [f"{seen.names[k]} ({seen.missed[k]})" for k in matched[~shown]])
+    notes += _named(f"{robot.path}: no pose in", [f"line {robot.lines[r]} ({robot.missed[r]})" for r in rows[~known]])
     rows, matched = rows[shown & known], matched[shown & known]
     if len(rows) < MIN_POSES:
         of = f" of {len(known)}" if len(rows) < len(known) else ""
@@ -211,6 +207,12 @@ def paired(robot: PoseTable, seen: Seen, in_hand: bool, arm: Arm | None) -> Pair
     notes += _tcp(robot, arm)
     poses = Poses(A, B, covs, in_hand, seen.centre, common)
     return PairedPoses(poses, rows, names, t_s, robot, seen, matched, tuple(notes))
+
+
+def _named(what: str, left_out: Sequence[str]) -> list[str]:
+    """Return a note that names the first rows that are left out, if there are any."""
+    more = f" and {len(left_out) - 3} more" if len(left_out) > 3 else ""
+    return [f"{what} {', '.join(left_out[:3])}{more}: left out"] if left_out else []
 
 
 def upright(A: Array, B: Array, symmetries: Sequence[Array]) -> tuple[Array, Rows]:

@@ -162,19 +162,24 @@ def read_wire(data: Path, arm: Arm, references: Path, columns: Renames | None = 
         return _possible(WireRead(table.q[rows], z[rows], p, lines, notes), arm)
     if table.t_s is None:
         raise InputError(f"{data}: line 1: a column t_s is needed, as {source} has times")
-    near = [np.abs(t_s - ranges[0].reference.delay_s - at) <= REST_S for at in table.t_s[rows]]
-    there = np.array([each.any() for each in near])
+    found_m = _at_rests(t_s, z, table.t_s[rows] + ranges[0].reference.delay_s)
+    there = np.isfinite(found_m)
     if there.sum() < SHARE * len(rows):
         raise InputError(
             f"{source}: a range within {REST_S:g} s of {there.sum()} of {len(rows)} rows of {data}: have both one clock?"
         )
-    length_m = np.array([np.median(z[each]) for each in near if each.any()])
     if not there.all():
         alone = ", ".join(f"{line:.0f}" for line in lines[~there][:8])
         notes = (*notes, f"{data}: line {alone}: {(~there).sum()} rows without a range within {REST_S:g} s: left out")
     return _possible(
-        WireRead(table.q[rows][there], length_m, None if p is None else p[there], lines[there], notes), arm
+        WireRead(table.q[rows][there], found_m[there], None if p is None else p[there], lines[there], notes), arm
     )
+
+
+def _at_rests(t_s: Array, z: Array, at_s: Array) -> Array:
+    """Return the median range within ``REST_S`` of each time; NaN where there is none."""
+    near = (np.abs(t_s - at) <= REST_S for at in at_s)
+    return np.array([np.median(z[each]) if each.any() else np.nan for each in near])
 
 
 def _possible(read: WireRead, arm: Arm) -> WireRead:

@@ -119,6 +119,14 @@ def _angles(
     if table.names is None and len(table.q) != len(rows) and table.t_s is not None and timed:
         at = [(line, row[timed[0]]) for line, row in rows if line in shown]
         return _at_rest(data, at, table.without_missed())
+    return _by_rows(data, head, rows, shown, table)
+
+
+def _by_rows(
+    data: Path, head: list[str], rows: Rows, shown: Collection[int], table: PoseTable
+) -> tuple[dict[int, Array], list[str]]:
+    """Return what :func:`_angles` does, paired by name or order."""
+    assert table.q is not None
     key = next((name for name in NAMES if name in head), None)
     if table.names is not None and key is None:
         raise InputError(

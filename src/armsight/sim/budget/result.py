@@ -220,7 +220,9 @@ class RigBudget(Record):
         rig = {"file": plan.rig, "image_size_px": plan.image_size_px, "baseline_m": plan.baseline_m}
         shares = {f"{share}_rms_m": found.rms(found.cov(of=share))[0] for share in ("precision", "trueness")}
         return {
-            "plan": {one.name: getattr(plan, one.name) for one in plan.settings() if one.name not in plan.of_rig},
+            "plan": {
+                n: None if n in plan.of_rig else getattr(plan, n) for n in (each.name for each in plan.settings())
+            },
             **({"rig": rig} if plan.rig else {}),
             "focal_px": plan.focal_px,
             "results": {name: state._asdict() for name, state in self.states.items()},
