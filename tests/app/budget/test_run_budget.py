@@ -71,7 +71,7 @@ def test_causes_that_are_not_there_are_named_and_unknown_cameras_are_said(armsig
     # Neither alone: the other predicts more than ten times what was measured.
     assert {"skew", "start of exposures"} <= motion["factors"].keys()
     assert all(motion["factors"][cause] <= 0.5 for cause in ("skew", "start of exposures"))
-    assert "the run's cameras are not known: give --camera" in said.err
+    assert "noise and exposure of the rig's cameras are not known" in said.err
     given = armsight("budget", run / "plan.toml", "--rig", run, "--camera", "global-shutter-1mp")
     assert "not known" not in given.err
 
