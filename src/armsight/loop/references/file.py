@@ -216,11 +216,7 @@ def _kept(path: str | Path, rows: Array, what: str, number: Callable[[int], int]
 
 
 def columns_of(kind: type[Sensor], head: Sequence[str], where: str) -> list[tuple[str, float]]:
-    """Return the names in ``head`` of a reference's time and columns, whatever their units, and the factors to SI.
-
-    Raises:
-        InputError: ``where`` a column is missing, and which is like it.
-    """
+    """Return names in ``head`` of a reference's time and columns, and factors to SI; InputError: one is missing."""
     return [_column(head, name, where) for name in ("t_s", *COLUMNS[kind])]
 
 
@@ -258,10 +254,7 @@ def read_ranges(path: Path) -> tuple[tuple[str, ...], Array, NDArray[np.int64], 
     """Return what ``sensor_msgs/Range`` of a bag of ROS measured: topics, a sensor each, in order of their names.
 
     Then times (N,), s, rising; the topic's number (N,); ranges (N,), m. Those outside of what their message says that the
-    sensor measures, infinite ones among them (REP 117), are left out.
-
-    Raises:
-        InputError: the bag has none.
+    sensor measures, infinite ones among them (REP 117), are left out. InputError: the bag has none.
     """
     bag = Bag(path)
     topics = tuple(topic.name for topic in bag.of_kind(RANGE))
@@ -281,11 +274,7 @@ def _time_s(message: BagMessage) -> float:
 
 
 def reading_of(message: BagMessage) -> tuple[float, Array]:
-    """Return the time, s, and the reading of a message: (6,), rad/s and m/s2, of a field (3,), T, or a range (1,), m.
-
-    Raises:
-        InputError: it is too short.
-    """
+    """Return a message's time, s, and reading: (6,), rad/s, m/s2, a field (3,), T, a range (1,), m; InputError: short."""
     if message.kind == RANGE:
         return _time_s(message), np.array([message.decode().range], float)
     size, rows = _NUMBERS[message.kind]
