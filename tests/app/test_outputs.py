@@ -9,6 +9,7 @@ import click
 import pytest
 
 from armsight.app.main import COMMANDS, group
+from armsight.app.options import kept
 from cli_runs import assert_rejected
 from strategies import ordinary_rig
 
@@ -258,6 +259,15 @@ def test_a_file_of_another_kind_is_left_alone(here, armsight, name):
         said = call(armsight, name, FILE_WRITERS[name], output)
         assert_rejected(said, f"{output}: holds something else, which would be written over")
     assert (here / output).read_text() == "[other]\nx = 1\n"
+
+
+def test_a_file_beside_a_new_folder_is_none_of_its(here):
+    context = click.Context(click.Command("budget"))
+    (here / "out.txt").write_text("of the shell\n")
+    kept(context, click.Option(["-o"]), "out", report=True)
+    assert context.meta["before"] == {}
+    kept(context, click.Option(["-o"]), "out.json")
+    assert list(context.meta["before"]) == ["out.txt"]
 
 
 def test_files_of_the_same_kind_are_replaced_and_named(here, armsight):

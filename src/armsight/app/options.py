@@ -130,7 +130,8 @@ def kept(context: click.Context, _: click.Parameter, given: Any, kind: str = "",
             if "before" not in context.meta:
                 context.meta["before"] = {}
                 context.call_on_close(partial(_say_replaced, context.meta["before"]))
-            context.meta["before"] |= _state(os.path.expanduser(path))
+            if os.path.isdir(file) or not report:  # beside a folder that is not there yet lies nothing of it
+                context.meta["before"] |= _state(os.path.expanduser(path))
     return given
 
 
