@@ -81,8 +81,18 @@ def test_lost_ranges_are_left_out_and_a_wrong_unit_is_named(tmp_path, capsys):
     (tmp_path / "wire.csv").write_text("\n".join(few) + "\n")
     found = said_of(capsys, "identify", *given, "--json").one
     assert found["poses"] == ROWS - len(HOOKED) - 2
-    assert "line 2, 12: 2 rows without a range within 0.25 s: left out" in json.dumps(found)
+    assert "line 2, 12: 2 rows without a range at rest within 0.25 s: left out" in json.dumps(found)
     (tmp_path / "wire.csv").write_text("\n".join([head, *rows[:100]]) + "\n")
     assert_rejected(said_of(capsys, "identify", *given), "within 0.25 s of 20 of 80 rows", "one clock")
+    between = [
+        f"{float(row.split(',')[0]) + 1.1},{row.split(',')[1]}" for row in rows
+    ]  # half a pose late: of both beside
+    apart = [f"{float(row.split(',')[0]) * 0.2},{row.split(',')[1]}" for row in between]
+    joints = (tmp_path / "joints.csv").read_text().splitlines()
+    closer = [joints[0], *(f"{float(row.split(',')[0]) * 0.2},{row.split(',', 1)[1]}" for row in joints[1:])]
+    (tmp_path / "joints.csv").write_text("\n".join(closer) + "\n")
+    (tmp_path / "wire.csv").write_text("\n".join([head, *apart]) + "\n")
+    assert_rejected(said_of(capsys, "identify", *given), "a range at rest within 0.25 s of", "one clock")
+    (tmp_path / "joints.csv").write_text("\n".join(joints) + "\n")
     (tmp_path / "wire.csv").write_text("\n".join([head.replace("_mm", "_in"), *rows]) + "\n")
     assert_rejected(said_of(capsys, "identify", *given), "the ranges vary by", "is their unit right")

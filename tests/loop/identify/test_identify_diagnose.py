@@ -69,6 +69,15 @@ def test_a_few_gross_rows_do_not_make_the_data_of_another_arm(zero):
     assert "are they in mm, not m?" in said(w, points(measured, p=1e3 * spoilt.p_rig, q=spoilt.q))
 
 
+@pytest.mark.parametrize(("name", "seed"), [("ur5", 5), ("six_r", 6)])
+def test_a_few_poses_of_zeros_do_not_make_the_data_of_another_arm(name, seed):
+    w, measured = made(name, seed, 60)
+    p, R = measured.p_rig.copy(), measured.R_rig_body.copy()
+    p[[7, 30, 31]], R[[7, 30, 31]] = 0.0, np.eye(3)
+    found = identify(w.nominal, replace(measured, p_rig=p, R_rig_body=R))
+    assert found.left_out.tolist() == [7, 30, 31]
+
+
 @pytest.mark.parametrize("name", ARMS)
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("mirror", [np.eye(3)[[1, 0, 2]], np.eye(3)[[0, 2, 1]], np.diag([1.0, 1, -1])])

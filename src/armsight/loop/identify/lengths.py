@@ -49,6 +49,9 @@ BEGIN_M = 1e-3  # m; noise of a wire to begin at; half, double: nothing
 CHANCE = 1e-4  # of a good row beyond the limit; half, double: one row in ten thousand
 AGREE = 1e-6  # chance of a joint's sign that is found by mistake; half, double: nothing
 REST_S = 0.25  # s; so long about a row's time the arm rests; half: noise, double: arms that go on early pull
+MOVES = (
+    3.0  # of a range's noise; at a rest half of the ranges are nearer to their median; half: noise, double: slow motion
+)
 #: What rounding hides at least, rad and m, as positions are computed in single precision; half, double: nothing.
 LEAST_ROUNDED = 1e-7
 MOST_ROUNDED = 5.1e-3  # rad; sigma of whole degrees; half: these are taken for another arm's, double: nothing
@@ -162,24 +165,31 @@ def read_wire(data: Path, arm: Arm, references: Path, columns: Renames | None = 
         return _possible(WireRead(table.q[rows], z[rows], p, lines, notes), arm)
     if table.t_s is None:
         raise InputError(f"{data}: line 1: a column t_s is needed, as {source} has times")
-    found_m = _at_rests(t_s, z, table.t_s[rows] + ranges[0].reference.delay_s)
+    found_m = _at_rests(t_s, z, table.t_s[rows] + ranges[0].reference.delay_s, ranges[0].noise_m)
     there = np.isfinite(found_m)
     if there.sum() < SHARE * len(rows):
         raise InputError(
-            f"{source}: a range within {REST_S:g} s of {there.sum()} of {len(rows)} rows of {data}: have both one clock?"
+            f"{source}: a range at rest within {REST_S:g} s of {there.sum()} of {len(rows)} rows of {data}: have both one "
+            "clock?"
         )
     if not there.all():
         alone = ", ".join(f"{line:.0f}" for line in lines[~there][:8])
-        notes = (*notes, f"{data}: line {alone}: {(~there).sum()} rows without a range within {REST_S:g} s: left out")
+        notes = (
+            *notes,
+            f"{data}: line {alone}: {(~there).sum()} rows without a range at rest within {REST_S:g} s: left out",
+        )
     return _possible(
         WireRead(table.q[rows][there], found_m[there], None if p is None else p[there], lines[there], notes), arm
     )
 
 
-def _at_rests(t_s: Array, z: Array, at_s: Array) -> Array:
-    """Return the median range within ``REST_S`` of each time; NaN where there is none."""
-    near = (np.abs(t_s - at) <= REST_S for at in at_s)
-    return np.array([np.median(z[each]) if each.any() else np.nan for each in near])
+def _at_rests(t_s: Array, z: Array, at_s: Array, noise_m: float) -> Array:
+    """Return the median range within ``REST_S`` of each time; NaN where there is none, or most are of different lengths."""
+    near = (z[np.abs(t_s - at) <= REST_S] for at in at_s)
+    middles = [
+        (np.median(each), np.median(np.abs(each - np.median(each)))) if len(each) else (0.0, np.inf) for each in near
+    ]
+    return np.array([middle if off < MOVES * noise_m else np.nan for middle, off in middles])
 
 
 def _possible(read: WireRead, arm: Arm) -> WireRead:

@@ -479,6 +479,7 @@ BAD_RAD = 2 * np.sqrt(6) * np.hypot(SIGMA["offset"], SIGMA["alpha"])
 POSES, FEW, FEWEST = 80, 24, 12
 #: Rows so many times as far off as the median are gross, up to this share of all; half: ordinary rows, double: some stay.
 GROSS, GROSS_SHARE = 5.0, 0.2
+TRIMS = 30  # concentration steps at most; half: nothing, double: nothing
 LEAST_M = 2e-4  # RMS, m, from which a change makes poses useless; half: of a fine tracker, too, double: 0.3 mm do not
 MAX_JOINT_ORDERS = 40  # orders whose signs are tried, best first
 _SCALES = {1e-3: "m, not mm", 1e3: "mm, not m", 1e-1: "dm or cm", 10.0: "cm", 1 / 25.4: "inches", 25.4: "inches"}
@@ -587,17 +588,21 @@ def without_tool(arm: Arm) -> Arm:
 
 
 def _agreeing(arm: Arm, q: Array, p_rig: Array) -> Rows:
-    """Return the rows of points (N, K, 3) without gross ones, the worst first: a few pull least squares off all; or all."""
-    T, rows = arm.forward(q) @ np.linalg.inv(arm.T_flange_tool), np.arange(len(q))
-    while True:
+    """Return the rows of points (N, K, 3) without gross ones, by the least trimmed squares of the others; or all.
+
+    Least squares of all would be pulled off by a few: the fit is to the share that fits best, until it stays the same.
+    """
+    T = arm.forward(q) @ np.linalg.inv(arm.T_flange_tool)
+    least = max(FEWEST, int(np.ceil((1 - GROSS_SHARE) * len(q))))
+    rows = np.arange(len(q))
+    for _ in range(TRIMS):
         M, c, t = linear_placement(T[rows, :3, :3], T[rows, :3, 3], p_rig[rows])
-        off = np.linalg.norm(p_rig[rows] @ M.T + c - _points(T[rows], t), axis=2).max(axis=1)
-        worst = int(np.argmax(off))
-        if off[worst] <= GROSS * max(float(np.median(off)), ALIKE_M):
-            return rows
-        if len(rows) <= max(FEWEST, (1 - GROSS_SHARE) * len(q)):
-            return np.arange(len(q))
-        rows = np.delete(rows, worst)
+        off = np.linalg.norm(p_rig @ M.T + c - _points(T, t), axis=2).max(axis=1)
+        before, rows = rows, np.sort(np.argsort(off)[:least])
+        if np.array_equal(before, rows):
+            break
+    good = np.flatnonzero(off <= GROSS * max(float(np.median(off[rows])), ALIKE_M))
+    return good if len(good) >= least else np.arange(len(q))
 
 
 def points_off(arm: Arm, q: Array, p_rig: Array) -> Off:
