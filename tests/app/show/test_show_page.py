@@ -2,7 +2,7 @@
 
 import pytest
 
-from armsight.app.show.page import table
+from armsight.app.show.page import bullets, table
 
 
 def test_every_cell_of_a_table_is_shown_or_the_row_is_an_error():
@@ -10,3 +10,8 @@ def test_every_cell_of_a_table_is_shown_or_the_row_is_an_error():
     for cells in (("row", "1"), ("row", "1", "2", "3")):
         with pytest.raises(ValueError, match="zip"):
             table(("", "a", "b"), [cells])
+
+
+def test_what_is_to_be_typed_is_code_on_a_page():
+    listed = bullets(["type `armsight check <RUN>`, or a ` alone"])
+    assert "type <code>armsight check &lt;RUN&gt;</code>, or a ` alone" in listed

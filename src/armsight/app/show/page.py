@@ -76,6 +76,11 @@ def text(value: object) -> str:
     return html.escape(plain(str(value), most=2000))
 
 
+def sentence(value: object) -> str:
+    """Return the same of a sentence, what it has between backticks, to be typed, as code."""
+    return re.sub(r"`([^`]+)`", r"<code>\1</code>", text(value))
+
+
 def _cell(column: str, content: str) -> str:
     """Return a cell of a column; a number, with its sigma perhaps, stays in one line where there is room."""
     kind = ' class="number"' if _NUMBER.fullmatch(content) else ""
@@ -94,7 +99,7 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "") ->
 
 def bullets(lines: Iterable[str]) -> str:
     """Return a list of plain lines, escaped; nothing where there are none."""
-    items = "".join(f"<li>{text(line)}</li>\n" for line in lines)
+    items = "".join(f"<li>{sentence(line)}</li>\n" for line in lines)
     return f"<ul>{items}</ul>\n" if items else ""
 
 

@@ -227,8 +227,8 @@ def _printed(block: Lines) -> list[str]:
 
 def assessment(headlines: Sequence[str], meaning: str = "", grade: str = "") -> str:
     """Return the box at the top of a page, HTML; ``grade`` is its colour: good, fair or poor."""
-    said = "".join(f'<p class="headline">{page.text(line)}</p>' for line in headlines if line)
-    more = f"<p>{page.text(meaning)}</p>" if meaning else ""
+    said = "".join(f'<p class="headline">{page.sentence(line)}</p>' for line in headlines if line)
+    more = f"<p>{page.sentence(meaning)}</p>" if meaning else ""
     return f'<div class="assessment {grade}">{said}{more}</div>\n' if said else ""
 
 

@@ -29,7 +29,7 @@ from armsight.files import columns_unused
 from armsight.loop.identify.fit import Mask, fit, prior_sigma
 from armsight.loop.identify.identify import Identified, identify
 from armsight.loop.identify.measured import Measured
-from armsight.loop.identify.misread import without_tool
+from armsight.loop.identify.misread import TRIMS, without_tool
 from armsight.loop.identify.model import Model
 from armsight.loop.identify.observable import observed
 from armsight.loop.identify.placement import with_placement
@@ -44,7 +44,6 @@ from armsight.tables.poses import read_pose_table
 SHARE = 0.75  # of the rows; the least trimmed squares fit these; half: fewer than are needed, double: blunders pull
 #: Blocks of rows, and random halves of them that the search begins at: blunders come in runs; half: some are missed.
 BLOCKS, STARTS = 12, 16
-TRIMS = 30  # concentration steps at most; half: nothing
 BEGIN_M = 1e-3  # m; noise of a wire to begin at; half, double: nothing
 CHANCE = 1e-4  # of a good row beyond the limit; half, double: one row in ten thousand
 AGREE = 1e-6  # chance of a joint's sign that is found by mistake; half, double: nothing
