@@ -41,6 +41,15 @@ def test_a_camera_that_rotated_is_named_with_its_size(room, side):
     assert 0 <= found.since_s - BEGINS / RATE_HZ < 1.0
 
 
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_camera_that_moved_is_named_with_its_size(room, axis):
+    (found,) = watched(room, right=2e-3 * np.eye(6)[axis], looks=10).findings()
+    assert found.what.startswith("the right camera moved by")
+    assert found.unit == "mm"
+    assert abs(found.size - 2.0) < 3 * found.sigma
+    assert found.sigma < 0.6
+
+
 def test_a_camera_that_rotated_sideways_costs_more_than_one_that_nods(room):
     (nods,), (rotates,) = (
         watched(room, right=np.array([0.0, 0, 0, *(0.03 * DEG * axis)])).findings() for axis in np.eye(3)[:2]

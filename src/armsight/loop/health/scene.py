@@ -5,7 +5,7 @@ corners (Shi and Tomasi, CVPR 1994), weighted by the spectral residual of the im
 spectral residual approach", CVPR 2007), without what changes meanwhile. Each later image says by how much each spot is
 displaced from where it was first (Lucas and Kanade, with brightness and contrast of its own: a lamp is no motion), and a
 robust fit to all spots of one camera by how much that rotated. What an arm or people hide does not look like its spot any
-more; what else moves is outvoted. A shift is not distinguished from a rotation.
+more; what else moves is outvoted. A spot's depth, from the other camera, distinguishes a shift from a rotation.
 """
 
 from __future__ import annotations
@@ -52,6 +52,10 @@ _AGREES, _ROUNDS = 4.0, 8
 #: A smaller rotation is not said, standard deviation, rad: mounts breathe; half: compression is said, double: 0.5 mm
 #: not.
 _FLOOR_RAD = np.radians(0.001)
+#: Depths from this, m, on are tried for a spot, and patches of both cameras that correlate less are different ones.
+_NEAREST_M, _ALIKE = 0.25, 0.8
+#: A shift and a rotation are distinguished where their chi-squares differ by this.
+_DISTINCT = 9.0
 #: Looks in a row that must agree, and those without a motion after which the camera is back where it was.
 _AGAIN, _BACK = 2, 10
 _LIMIT = alarm_limit(3, _LOOKS_HZ, 2)
@@ -61,13 +65,27 @@ _SPOT = np.stack(np.meshgrid(*2 * [np.arange(-_HALF, _HALF + 1.0)]), axis=-1).re
 class CameraMotion(NamedTuple):
     """How a camera moved since its spots were learned."""
 
-    rotation: tuple[Array, Array]  #: (3,) of the camera about its own axes, rad; covariance (3, 3)
-    seen: int  #: spots that agree
+    #: (3,) of the camera about its own axes, rad, if it rotated alone; covariance (3, 3)
+    rotation: tuple[Array, Array]
+    #: (3,) of the camera, m, if it moved alone; covariance (3, 3); None where too few depths are known
+    shift: tuple[Array, Array] | None
+    favours: float  #: by how much the chi-square of a shift is larger than that of a rotation; 0 without a shift
+    seen: int
 
     @property
     def chi_square(self) -> float:
         """Of no rotation, a mount's own breathing included."""
         return float(squares_of(*self.rotation))
+
+    def sized(self) -> tuple[tuple[float, float], str, str]:
+        """Return size and sigma (SI), unit and words of a shift where it explains it clearly, else of a rotation."""
+        how = f"rotated by {np.degrees(sized(*self.rotation)[0]):.3f} deg"
+        if self.shift is not None and self.favours <= _DISTINCT:
+            shifted = f"moved by {1e3 * sized(*self.shift)[0]:.2f} mm"
+            if self.favours < -_DISTINCT:
+                return sized(*self.shift), "mm", shifted
+            how += f", or {shifted}: the two cannot be distinguished"
+        return sized(*self.rotation), "deg", how
 
 
 class _Spots:
@@ -75,12 +93,13 @@ class _Spots:
 
     Attributes:
         uv: (K, 2) where they are, raw pixels.
+        depth_m: (K,) along the optical axis; NaN where it is not known.
     """
 
     def __init__(self, camera: Camera) -> None:
         self._camera, self._looks, self._tried = camera, 0, list[tuple[Array, Array, NDArray[np.bool_]]]()
         self._sum = self._squares = np.zeros(camera.image_size_px[::-1], np.float32)
-        self.uv = np.zeros((0, 2))
+        self.uv, self.depth_m = np.zeros((0, 2)), np.zeros(0)
         self._cov: Array = np.zeros((0, 2, 2))  # of a displacement, by noise of one grey level
 
     def learned(self, image: Grey) -> bool:
@@ -127,6 +146,7 @@ class _Spots:
                 if cell[row, column] > 0:
                     chosen.append((u[0] + column, v[0] + row))
         self.uv = np.array(chosen, float).reshape(-1, 2)
+        self.depth_m = np.full(len(chosen), np.nan)
         if not self.followed:
             return
         self._template = self._patches(mean, self.uv)
@@ -177,8 +197,21 @@ class _Spots:
         found = _fitted(rotating, d, cov)
         if found is None:
             return None
-        x, C, agree = found
-        return CameraMotion((x[:3], C[:3, :3] + _FLOOR_RAD**2 * np.eye(3)), agree)
+        x, C, _, good = found
+        rotation = x[:3], C[:3, :3] + _FLOOR_RAD**2 * np.eye(3)
+        depth = self.depth_m[seen] / rays[:, 2]
+        known = np.isfinite(depth) & good
+        if known.sum() < _LEAST:
+            return CameraMotion(rotation, None, 0.0, int(good.sum()))
+        shifting = np.concatenate([-J / depth[:, None, None], focal[..., None]], axis=2)
+        rows = np.flatnonzero(known)
+        moved, rotated = (_fitted(A[rows], d[rows], cov[rows], robust=False) for A in (shifting, rotating))
+        if moved is None or rotated is None:
+            return CameraMotion(rotation, None, 0.0, int(good.sum()))
+        floor = (_FLOOR_RAD * float(np.median(self.depth_m[seen][rows]))) ** 2 * np.eye(3)
+        scale = max(min(moved[2].mean(), rotated[2].mean()) / 2, 1.0)
+        favours = float(moved[2].sum() - rotated[2].sum()) / scale
+        return CameraMotion(rotation, (moved[0][:3], moved[1][:3, :3] + floor), favours, int(good.sum()))
 
 
 def _saliency(image: Grey) -> Array:
@@ -191,25 +224,29 @@ def _saliency(image: Grey) -> Array:
     return np.asarray(cv2.resize(map_ / map_.mean(), image.shape[::-1]))
 
 
-def _fitted(A: Array, d: Array, cov: Array) -> tuple[Array, Array, int] | None:
-    """Fit displacements d (K, 2) by A (K, 2, P), robustly: fit, covariance, how many agree; None without a majority."""
+def _fitted(
+    A: Array, d: Array, cov: Array, *, robust: bool = True
+) -> tuple[Array, Array, Array, NDArray[np.bool_]] | None:
+    """Fit displacements d (K, 2) by A (K, 2, P): fit, covariance, squares (K,), which agree; None without a majority."""
     half = np.linalg.inv(np.linalg.cholesky(cov))
     white, e = half @ A, (half @ d[..., None])[..., 0]
-    good, weights = np.ones(len(d), np.bool_), np.ones(len(d))
-    for _ in range(_ROUNDS):
+    good = np.ones(len(d), np.bool_)
+    weights, x = np.ones(len(d)), np.zeros(A.shape[2])
+    for _ in range(_ROUNDS if robust else 1):
         H = np.einsum("kip,k,kiq->pq", white, weights, white)
         x = np.linalg.lstsq(H, np.einsum("kip,k,ki->p", white, weights, e), rcond=1e-12)[0]
         squares = ((e - white @ x) ** 2).sum(axis=1)
         scale = max(float(np.median(squares)) / 1.3863, 1.0)
-        weights = 1.0 / (1.0 + squares / scale)
+        weights = 1.0 / (1.0 + squares / scale) if robust else weights
         good = squares < _AGREES**2 * scale
     if good.sum() < max(_LEAST, _MAJORITY * len(d)):
         return None
     rows = np.flatnonzero(good)
     H = np.einsum("kip,kiq->pq", white[rows], white[rows])
     x = np.linalg.lstsq(H, np.einsum("kip,ki->p", white[rows], e[rows]), rcond=1e-12)[0]
-    left = float(((e - white @ x)[rows] ** 2).sum())
-    return x, max(left / max(2 * len(rows) - len(x), 1), 1.0) * np.linalg.pinv(H), len(rows)
+    squares = ((e - white @ x) ** 2).sum(axis=1)
+    excess = max(float(squares[rows].sum()) / max(2 * len(rows) - len(x), 1), 1.0)
+    return x, excess * np.linalg.pinv(H), squares, good
 
 
 class SceneWatch:
@@ -238,6 +275,8 @@ class SceneWatch:
         if self._learning:
             ready = [spots.learned(image) for spots, image in zip(self._spots, images, strict=True)]
             self._learning = not all(ready)
+            if not self._learning:
+                self._find_depths(images)
             return
         motions = [spots.moved(image) for spots, image in zip(self._spots, images, strict=True)]
         self._count(motions, t_s)
@@ -262,6 +301,29 @@ class SceneWatch:
         """Return what was found so far; nothing while all is well."""
         return self._found
 
+    def _find_depths(self, images: Sequence[Grey]) -> None:
+        """Find the depth of each spot: the distance along its ray at which the other camera sees the same patch."""
+        for side, spots in enumerate(self._spots):
+            if not spots.followed:
+                continue
+            other = self._rig.cameras[1 - side]
+            T = inverse(self._rig.T_left_right) if side == 0 else self._rig.T_left_right
+            pixels = float(other.intrinsics[0]) * self._rig.baseline_m / _NEAREST_M  # of the nearest depth's disparity
+            near = np.linspace(0.0, 1.0 / _NEAREST_M, max(int(pixels / 1.5), 2))[1:]
+            rays = self._rig.cameras[side].unproject(spots.uv)
+            p = transform(T, (rays[:, None] / rays[:, None, 2:] / near[:, None]).reshape(-1, 3))
+            uv = other.project(p).reshape(len(rays), len(near), 2)
+            mine = spots._patches(images[side], spots.uv)
+            mine = _unit(mine)
+            for k, row in enumerate(uv):
+                inside = np.isfinite(row).all(axis=1)
+                alike = np.full(len(row), -1.0)
+                alike[inside] = _unit(spots._patches(images[1 - side], row[inside])) @ mine[k]
+                best = int(alike.argmax())
+                apart = np.abs(np.arange(len(row)) - best) > 4
+                if alike[best] > _ALIKE and (alike[apart] < alike[best] - 0.1).all():
+                    spots.depth_m[k] = 1.0 / near[best]
+
     def _said(
         self, motions: Sequence[CameraMotion | None], certain: Sequence[bool], p_left: Array
     ) -> tuple[HealthFinding, ...]:
@@ -270,8 +332,8 @@ class SceneWatch:
             return self._found
         side = max(moved, key=lambda each: moved[each].chi_square)
         together = len(moved) == 2 and self._alike(moved[0], moved[1])
-        evidence = sized(*moved[side].rotation)
-        who = f"the {SIDES[side]} camera rotated by {np.degrees(evidence[0]):.3f} deg"
+        evidence, unit, how = moved[side].sized()
+        who = f"the {SIDES[side]} camera {how}"
         if len(moved) == 2:
             who = f"both cameras moved{'' if together else ', not'} together: {who}"
         elif motions[1 - side] is not None:
@@ -282,6 +344,7 @@ class SceneWatch:
                 evidence,
                 min((since for each in moved if (since := self._since[each]) is not None), default=None),
                 cost_m=self._cost_m(moved, p_left, together=together),
+                unit=unit,
                 words={"who": who, "count": moved[side].seen},
             ),
         )
@@ -309,3 +372,9 @@ class SceneWatch:
 def _float(image: Image) -> Grey:
     """Return an image in grey, smoothed as much as a patch is interpolated."""
     return np.asarray(cv2.GaussianBlur(grey(image), (0, 0), 0.7).astype(np.float32))
+
+
+def _unit(patches: Grey) -> Grey:
+    """Return patches (K, P) of mean zero and length one."""
+    centred = patches - patches.mean(axis=1, keepdims=True)
+    return np.asarray(centred / np.maximum(np.linalg.norm(centred, axis=1, keepdims=True), 1e-9))

@@ -89,7 +89,10 @@ _ARGUMENTS: dict[str, tuple[Callable[[object], bool], str]] = {
     "rig": (lambda value: isinstance(value, StereoRig), 'StereoRig.load("rig.json")'),
     "target": (lambda value: hasattr(value, "detect"), 'open_target("chessboard:9x6:25mm")'),
     "board": (lambda value: hasattr(value, "codes"), 'open_board("chessboard:9x6:25mm")'),
-    "shot": (lambda value: isinstance(value, Shot), 'open_source("recording").read()'),
+    "shot": (
+        lambda value: isinstance(value, Shot),
+        'Shot("name", left, right) of two images, or open_source("recording").read()',
+    ),
     "source": (lambda value: hasattr(value, "read") and hasattr(value, "count"), 'open_source("recording")'),
 }
 
