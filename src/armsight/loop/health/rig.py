@@ -248,7 +248,7 @@ class RigWatch:
             self._sum(found, estimate)
         cov = self._swung if self.passing.swings else self._unrest.cov  # of what moves to and fro
         self.noise = self._nodding(found.response, estimate.T_left_body, cov if cov.any() else self._unrest.suspected)
-        added = self._added(found) + self.noise
+        added = self._added(found, estimate.T_left_body) + self.noise
         if added.any():  # of a body that is far off more than what is linear
             off = log_se3(inverse(estimate.T_left_body) @ self.reader.linear_about(estimate)[1])
             added += np.outer(off, off)
@@ -305,25 +305,25 @@ class RigWatch:
             parts.append((weigh(rows), weigh(rows, moved), 1.0 / count))
         return parts
 
-    def _added(self, found: ShotResiduals) -> Array:
-        """Return what the suspected errors add to the covariance (6, 6) of a pose."""
+    def _added(self, found: ShotResiduals, T: Array) -> Array:
+        """Return what the suspected errors add to the covariance (6, 6) of a pose (4, 4)."""
         by_parameter, by_lens = found.response[:, : self._size], found.response[:, self._size :]
-        added, shape, known = self._shape.added(by_parameter), self._shape.found, 0
+        added, shape = self._shape.added(by_parameter), self._shape.found
         if self.passing.now:
             added = added + self.passing.added(found.exposed[0], by_parameter @ self._shape.by_wide[:, 0])
-        if self.suspected is not None and (shape is None or shape.seven_needed):
-            known = len(_WIDE)
+        known = len(_WIDE) if self.suspected is not None and (shape is None or shape.seven_needed) else 0
         if self.lens is not None:
             known = known if self.lens.needed else 0
-            shift = by_lens @ self.lens.beta
-            added += np.outer(shift, shift) + by_lens @ self.lens.cov @ by_lens.T
+            added += by_lens @ (np.outer(self.lens.beta, self.lens.beta) + self.lens.cov) @ by_lens.T
         elif (doubt := self._shape.doubt) is not None:
             effect = by_parameter @ self._scaled[:, self._size + known :]
             added += effect @ doubt[known:, known:] @ effect.T
         if known and self.suspected is not None:
-            by_fault = by_parameter @ self._by_fault
-            shift = by_fault @ self.suspected.f
-            added += np.outer(shift, shift) + by_fault @ self.suspected.cov @ by_fault.T
+            both = self.suspected.cov + np.outer(self.suspected.f, self.suspected.f)
+            by_right = by_parameter @ self._by_fault
+            by_left = by_right.copy()  # then what poses refer to moved
+            by_left[:, :5] -= adjoint(inverse(T) @ self.rig.T_left_right) @ free_directions(self.rig)[-6:]
+            added += 0.5 * (by_right @ both @ by_right.T + by_left @ both @ by_left.T)
         return added
 
     def information(self, estimates: Sequence[PoseEstimate]) -> tuple[ResidualSums, int]:
