@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from armsight.errors import CalibrationError
 from armsight.geometry.pose import exp_se3
 from armsight.vision.calibrate.boards import Pair, calibrate_boards
 from armsight.vision.calibrate.bodies import calibrate_bodies
@@ -59,6 +60,24 @@ def test_cameras_that_changed_are_named_and_their_covariance_holds_both_states(c
     for rig in rigs:
         error = rig_error(found.rig, rig)
         assert error @ np.linalg.solve(found.rig.cov, error) < 4 * len(error)
+
+
+@pytest.mark.parametrize(("factor", "first"), [(1.05, 6), (1.2, 10), (0.8, 14), (2.0, 6)])
+def test_a_board_of_another_size_midway_is_an_error(factor, first):
+    true, board, Ts = rig_and_board("brown4", count=COUNT, seed=816)
+    one, other = (board_pairs(true, size * board.body.points, Ts, seed=816) for size in (1.0, factor))
+    with pytest.raises(CalibrationError, match=f"from p{first:02d} on the board is {factor:.3g} times as large"):
+        calibrate_boards(board, one[:first] + other[first:], SIZES, models=("brown4",), folds=2)
+
+
+@pytest.mark.parametrize("seed", [817, 818])
+def test_a_print_of_another_scale_midway_is_named_and_the_covariance_holds_both(seed):
+    true, board, Ts = rig_and_board("brown4", count=COUNT, seed=seed)
+    one, other = (board_pairs(true, size * board.body.points, Ts, seed=seed) for size in (1.0, 1.003))
+    found = calibrate_boards(board, one[:FROM] + other[FROM:], SIZES, models=("brown4",), folds=2)
+    assert any("changed about between" in weak and "another board or print" in weak for weak in found.weaknesses)
+    error = rig_error(found.rig, true)
+    assert error @ np.linalg.solve(found.rig.cov, error) < 4 * len(error)
 
 
 @pytest.mark.parametrize("seed", [821, 822, 823])

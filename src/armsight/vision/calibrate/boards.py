@@ -42,7 +42,7 @@ from armsight.vision.calibrate.heldout import (
     rig_of,
     summary,
 )
-from armsight.vision.calibrate.motion import ExposureMotion
+from armsight.vision.calibrate.motion import ExposureMotion, other_size
 from armsight.vision.calibrate.result import Calibration, HeldOutErrors, RejectedPair
 from armsight.vision.calibrate.screen import (
     LEAST_CORNERS,
@@ -340,6 +340,13 @@ def calibrate_boards(
     progress("estimating poses of cameras and boards")
     first, usable, notes = _start(board, usable, sizes, models)
     observations = Observations.from_shots([join(pair.left, pair.right) for pair in usable])
+    if (other := other_size(rigid_board(points), first, observations, pair_count)) is not None:
+        row, factor = other
+        raise CalibrationError(
+            f"from {usable[row].name} on the board is {factor:.3g} times as large as in the pairs before: another board or "
+            f"print, or cameras that were moved? Images do not show which one is {board.body.name}: calibrate from the "
+            "pairs of that one alone"
+        )
     progress("looking for gross errors")
     model = rigid_board(points) if flat else printed_board(points)
     radius_m, first = _disc_radius(board, usable, first, observations)

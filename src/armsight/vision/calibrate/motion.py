@@ -20,7 +20,7 @@ from armsight.data import Array, Record
 from armsight.estimate.change import changed, matters
 from armsight.geometry.pose import inverse, transform
 from armsight.geometry.rotation import skew
-from armsight.vision.pose.bundle import CAUCHY_SCALE, BundleSolution, whiteners
+from armsight.vision.pose.bundle import CAUCHY_SCALE, BundleSolution, minimise, whiteners
 from armsight.vision.pose.projection import BundleModel, Observations, predict
 from armsight.vision.rig import StereoRig
 from armsight.vision.triangulate import optimal_points
@@ -28,6 +28,9 @@ from armsight.vision.triangulate import optimal_points
 #: Degrees of freedom of the motions' distribution: four leave the variance finite, and let one pair move five times as
 #: far as the rest.
 TAIL = 4.0
+#: What changes if a board of another size is shown, and the share of a cost that is left if that explains it. Half: an
+#: error of twice the corners' noise is not named; double: other changes may be.
+SIZE, _OTHER_COST = "the size of the board", 0.25
 #: A motion of one standard deviation at first, as a share of the board's diagonal, and the least it may be.
 START_SHARE, _LEAST = 1e-3, 1e-8
 
@@ -136,6 +139,38 @@ def _condensed(
     return rows[:, :, -1], rows[:, :, :-1]
 
 
+def _baseline_axes(T_left_right: Array) -> Array:
+    """Return orthonormal columns (3, 3), the first along the baseline, in the axes of the relative pose's tangent."""
+    along = (T_left_right[:3, :3].T @ T_left_right[:3, 3])[:, None]
+    axes = np.linalg.qr(np.column_stack([along, np.eye(3)]))[0]
+    return np.asarray(axes * np.sign(axes[:, :1].T @ along))
+
+
+def other_size(model: BundleModel, start: BundleSolution, seen: Observations, pairs: int) -> tuple[int, float] | None:
+    """Return from which of the first ``pairs`` shots on the board is so many times as large; None where one size fits.
+
+    Each pair shows its board's size beside the distance of the cameras alone. That the start leaves less than half of its
+    error if the later boards may be of another size shows it.
+    """
+    free, state = np.ones(sum(camera.parameters.size for camera in start.state.cameras) + 6, bool), start.state
+    e, J = _condensed(model, start, seen, free)
+    along = J[:, :, -6:-3] @ _baseline_axes(state.T_left_right)[:, :1]
+    poses = state.Ts_left_body[:pairs, :3, 3]
+    J = np.concatenate([J[:, :, :-6], along, J[:, :, -3:]], axis=2)
+    found = changed(e, J, {SIZE: np.array([J.shape[2] - 4])}, poses, count=pairs)
+    if found is None:
+        return None
+    none = np.zeros_like(model.points)
+    points, modes = np.vstack([model.points] * 2), np.vstack([none, model.points])[None]
+    both = replace(model, points=points, modes=modes, shape_sigma_m=1.0)
+    seen = replace(seen, point=seen.point + len(none) * (seen.shot >= found.row))
+    state = replace(state, shape=np.zeros(1))
+    for sigma_px in (5.0, start.sigma_px):
+        fitted = minimise(both, state, seen, sigma_px, covariance=False)
+        state = fitted.state
+    return (found.row, float(1 + state.shape[0])) if fitted.cost < _OTHER_COST * start.cost else None
+
+
 def change_of(
     model: BundleModel, solution: BundleSolution, seen: Observations, rig: StereoRig, pairs: int
 ) -> CameraChange | None:
@@ -146,6 +181,7 @@ def change_of(
     names = "the left image's position", "the right image's position", "the positions of both images"
     named = focal | dict(zip(names, (left + 2, right + 2, both + 2), strict=True))
     named["the relative pose of the cameras"] = np.arange(len(rig.cov) - 6, len(rig.cov))
+    named[SIZE] = named["the relative pose of the cameras"][:1]  # in axes of which the first is the baseline's
     free = np.diag(rig.cov) > 0
     column_of, named = np.cumsum(free) - 1, {name: p for name, p in named.items() if free[p].all()}
     ways = {name: column_of[p] for name, p in named.items()}
@@ -153,8 +189,13 @@ def change_of(
     sight = middle[:, :2] / middle[:, 2:]
     off_axis = np.linalg.norm(sight - sight[:pairs].mean(axis=0), axis=1)
     poses = np.column_stack([sight, np.log(middle[:, 2]), solution.state.Ts_left_body[:, :2, 2], off_axis])
-    found = changed(*_condensed(model, solution, seen, free), ways, poses, count=pairs)
-    if found is None or not matters(found := found.over_all(free), rig.cov):
+    e, J = _condensed(model, solution, seen, free)
+    J[:, :, -6:-3] = J[:, :, -6:-3] @ (axes := _baseline_axes(rig.T_left_right))
+    found = changed(e, J, ways, poses, count=pairs)
+    if found is None:
+        return None
+    off = np.concatenate([found.off[:, :-6], found.off[:, -6:-3] @ axes.T, found.off[:, -3:]], axis=1)
+    if not matters(found := replace(found, off=off).over_all(free), rig.cov):
         return None
     off, p = found.off, named[found.way]
     points = transform(solution.state.Ts_left_body[:pairs, None], model.body(solution.state.shape)).reshape(-1, 3)
@@ -162,12 +203,15 @@ def change_of(
     uv = np.stack([camera.project(p) for camera, p in zip(rig.cameras, views, strict=True)], axis=1)
     by_rig = optimal_points(rig, uv, np.broadcast_to(np.eye(2), (len(uv), 2, 2, 2)))[2]
     shift_m = float(np.nanmedian(np.linalg.norm(by_rig @ (off[1] - off[0]), axis=1)))
-    what = f"{found.way} by {_amount(rig, p, (off[1] - off[0])[p])}" if found.sure else ""
+    step = (off[1] - off[0])[p] if found.way != SIZE else -axes.T[:1] @ (off[1] - off[0])[-6:-3] / rig.baseline_m
+    what = f"{found.way} by {_amount(rig, p, step)}" if found.sure else ""
     return CameraChange(found.row, what, off, shift_m)
 
 
 def _amount(rig: StereoRig, p: NDArray[np.intp], step: Array) -> str:
-    """Write a step of the rig's parameters ``p``: focal lengths, principal points, or the relative pose."""
+    """Write a step of the rig's parameters ``p``: focal lengths, principal points, the relative pose, or a share."""
+    if len(p) == 1:
+        return f"{100 * step[0]:+.2g} %"
     if len(p) == 6:
         return f"{1e3 * np.linalg.norm(step[:3]):.2g} mm and {np.degrees(np.linalg.norm(step[3:])):.2g} degrees"
     if p[0] in (0, rig.left.parameters.size):

@@ -9,7 +9,7 @@ from armsight.data import Array
 from armsight.errors import CalibrationError
 from armsight.estimate.chance import chi_square_limit
 from armsight.files import natural_key
-from armsight.vision.calibrate.motion import ExposureMotion
+from armsight.vision.calibrate.motion import SIZE, ExposureMotion
 from armsight.vision.calibrate.result import Calibration, corner_variance_px2
 
 _LEAST_TILT_DEG = 15.0
@@ -87,11 +87,17 @@ def _changed(calibration: Calibration) -> str | None:
             f"the pairs up to {before} and those from {after} on fit other cameras, and their boards stand elsewhere: the "
             "cameras changed, or the lens model does not fit. Try another --lens-model, and mix near, far, left and right"
         )
+    if change.what.startswith(SIZE):
+        return (
+            f"{change.what} changed about between {before} and {after}, which displaces points by "
+            f"{1e3 * change.shift_m:.2g} mm: another board or print, or cameras that were moved; the rig is of neither "
+            "state, and its sigmas allow for that. Calibrate from the pairs of the board that --target describes"
+        )
     return (
         f"the cameras changed about between {before} and {after}: {change.what}, which displaces points by "
         f"{1e3 * change.shift_m:.2g} mm; the rig is of neither state, and its sigmas allow for that. Did a lens "
-        "refocus, was a camera knocked, are images cropped or resized? It may also look like a board that moved between "
-        "two exposures. Lock the lenses, and calibrate from the pairs of one state"
+        "refocus, was a camera knocked, are images cropped or resized? It may also be another board or print, or one that "
+        "moved between two exposures. Lock the lenses, and calibrate from the pairs of one state"
     )
 
 
