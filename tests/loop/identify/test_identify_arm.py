@@ -72,6 +72,19 @@ def test_what_few_poses_leave_open_elsewhere_is_in_the_sigma_and_is_said(scene, 
     assert "corrected.toml: no better than the nominal arm" in caplog.text
 
 
+@pytest.mark.parametrize(("name", "seed"), [("ur10", 34), ("so101", 35), ("irb120", 36)])
+def test_poses_beyond_the_readings_fitted_are_within_their_sigma(name, seed):
+    w, rng = worn(seed, open_arm(name)), np.random.default_rng(seed)
+    found = identify(w.nominal, w.seen(*poses(w.nominal, 100, rng), rng))
+    q = rng.uniform(np.maximum(w.nominal.q_min, -np.pi), np.minimum(w.nominal.q_max, np.pi), (200, w.nominal.joints))
+    sides = rng.choice([-1.0, 1.0], q.shape)
+    T = w.T_rig_body(q, sides)
+    unseen = Measured(q, T[:, None, :3, 3], T[:, :3, :3], None, sides)
+    e, C = found.model.residuals(found.solution.x, unseen), found.pose_cov(unseen)
+    assert 0.1 < np.einsum("ni,nij,nj->n", e, np.linalg.inv(C), e).mean() / 6 < 2.0
+    assert np.trace(C[:, :3, :3].mean(axis=0)) < 16 * np.mean((e[:, :3] ** 2).sum(axis=1))
+
+
 def test_what_is_observable_alone_is_within_its_sigma(scene):
     w, _, found, _ = scene
     seen = {name: true for name, true in truth_of(w).items() if name not in found.reasons and found.value(name)[1] > 0}
@@ -82,13 +95,13 @@ def test_what_is_observable_alone_is_within_its_sigma(scene):
 
 
 def test_predicted_poses_and_a_tied_sum_are_within_their_sigma(scene):
-    """J cov J^T is the covariance of poses not fitted: neither the fit's alone, nor one that forgets what is correlated."""
+    """The covariance of poses not fitted is neither the fit's alone, nor one that forgets what is correlated."""
     w, _, found, _ = scene
     q, approach = poses(w.nominal, 100, np.random.default_rng(5))
     T = w.T_rig_body(q, approach)
     unseen = Measured(q, T[:, None, :3, 3], T[:, :3, :3], None, approach)
-    e, J = found.model.linearised(found.solution.x, unseen)
-    squares = np.einsum("ni,nij,nj->n", e, np.linalg.inv(J @ found.cov @ J.swapaxes(1, 2)), e) / 6
+    e = found.model.residuals(found.solution.x, unseen)
+    squares = np.einsum("ni,nij,nj->n", e, np.linalg.inv(found.pose_cov(unseen)), e) / 6
     assert 0.4 < squares.mean() < 2.5
     value, sigma = found.value("d2")  # axes 2, 3 and 4 are parallel: it holds the offsets along all of them
     assert abs(value - w.nominal.d[1] - (w.true.d - w.nominal.d)[1:4].sum()) < 3 * sigma

@@ -19,7 +19,16 @@ from armsight.errors import CalibrationError, InputError, nearest
 from armsight.estimate.change import StateChange
 from armsight.geometry.pose import left_jacobian
 from armsight.loop.handeye.poses import HeldOut
-from armsight.loop.identify.fit import Mask, Solution, covariance, fit, joint_noise, prior_sigma, with_joint_noise
+from armsight.loop.identify.fit import (
+    Mask,
+    Solution,
+    by_joints,
+    covariance,
+    fit,
+    joint_noise,
+    prior_sigma,
+    with_joint_noise,
+)
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.misread import check_plausible, without_tool
 from armsight.loop.identify.model import PLENTY, SENSOR, Model, Parameter
@@ -84,7 +93,7 @@ class Identified(Record):
         prior: (P,) prior sigmas, those of the error sources as large as the data show them to be.
         cov: (P, P) covariance of all that may be off, fitted or not: a fitted number's sigma includes what the error
             sources that were not selected, or hardly show, could still be, and how far leaving them out has moved it.
-            Of a predicted pose it is J cov J^T, J (6, P) by all of them: where the poses are, most of that cancels.
+            That of predicted poses is :meth:`pose_cov`; where the poses are, most of it cancels.
             ``solution.cov`` is that of the fitted ones, the rest taken for nominal.
         cov_everything: (P, P) covariance of all that may be off in the fit of all of it, ``solution.x - moved``.
         moved: (P,) fitted numbers less those of the fit of everything that can be observed: what the selection has
@@ -154,6 +163,16 @@ class Identified(Record):
                 variance = by @ self.cov[first : first + 3, first : first + 3] @ by
         return float(value), float(np.sqrt(variance)) if self.solution.free[k] else np.nan
 
+    def pose_cov(self, measured: Measured) -> Array:
+        """Return the covariance (N, M, M) of predicted poses, in the axes of :class:`Measured`.
+
+        It is J cov J^T, J by all parameters. Beyond the readings fitted a sensor's curve is as unknown as before any were.
+        """
+        arm, J = self.model.arm, self.model.linearised(self.solution.x, measured)[1]
+        B = by_joints(self.model, J) @ (arm.direction[:, None] * arm.coupling)
+        beyond = self.model.beyond(measured.q, self.prior)[:, None]
+        return np.asarray(J @ self.cov @ J.swapaxes(1, 2) + (B * beyond) @ B.swapaxes(1, 2))
+
     def moved_all_over(self) -> tuple[float, float]:
         """Return how far the tool is from the nominal arm's, m, RMS all over the joint limits, and its sigma."""
         arm, full = self.model.arm, self.model.full
@@ -163,8 +182,7 @@ class Identified(Record):
             self.model.T_rig_base(x) @ self.model.tool_in_base(x, q, None) for x in (self.solution.x, self.nominal)
         )
         at = Measured(q, np.repeat(T[:, None, :3, 3], self.model.points, axis=1), T[:, :3, :3] if full else None)
-        J = self.model.linearised(self.solution.x, at)[1][:, :3]
-        square = np.einsum("nki,ij,nkj->", J, self.cov, J) / POSES
+        square = np.trace(self.pose_cov(at)[:, :3, :3].mean(axis=0))
         return float(np.sqrt(np.sum((T - T_nominal)[:, :3, 3] ** 2) / POSES)), float(np.sqrt(square))
 
     def columns(self) -> dict[str, Array | list[str]]:

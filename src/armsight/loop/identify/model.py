@@ -341,6 +341,13 @@ class Model(Record):
         """Return what one unit of every error source adds to its joint's angle, (N, F), rad per unit."""
         return values(self.arm, self.features, q, approach, self.up_base, self.q_seen, self.fade_rad)
 
+    def beyond(self, q: Array, prior: Array) -> Array:
+        """Return the variance (N, n), rad^2, of sensors' curves beyond the readings fitted, of prior sigmas (P,)."""
+        fades = replace(self, q_seen=None).feature_values(q, None) - self.feature_values(q, None)
+        squares = (fades * prior[self.sources_at :]) ** 2
+        joint = np.array([f.joint for f in self.features], dtype=np.int64)
+        return np.stack([squares[:, joint == i].sum(axis=1) for i in range(self.arm.joints)], axis=1)
+
     def theta(self, x: Array, q: Array, phi: Array) -> Array:
         """Return the joints' rotations without their offsets (N, n), rad; ``phi`` is :meth:`feature_values`."""
         out = self.arm.direction * (q @ self.arm.coupling.T)

@@ -105,7 +105,7 @@ def _over(model: Model, found: Identified, x: Array, measured: Measured) -> floa
     """Return the RMS of residuals over their predicted sigma: noise and the parameters' covariance."""
     weighted = with_joint_noise(model, x, measured, found.joint_sigma_rad)
     linear = linear_of(model, x, weighted, np.ones(len(x), bool), found.prior)
-    by_fit = linear.J @ found.cov @ linear.J.swapaxes(1, 2)
+    by_fit = replace(found, model=model, solution=replace(found.solution, x=x)).pose_cov(measured)
     C = covariances(linear, variances_of(linear, found.solution.noise)) + by_fit
     squares = np.einsum("ni,nij,nj->", linear.e, np.linalg.inv(C), linear.e)
     return float(np.sqrt(squares / linear.e.size))
