@@ -82,11 +82,11 @@ def test_the_host_rejects_what_the_board_would(is_valid, path, joint, item, valu
     assert is_good(config) == is_valid(config), path
 
 
-@pytest.mark.parametrize("path", FIELDS, ids=".".join)
-def test_every_range_is_held_on_both_sides(is_valid, path):
-    for value in EDGES:
-        config = changed(path, 1, 1, value)
-        assert is_good(config) == is_valid(config), value
+def test_every_range_is_held_on_both_sides(is_valid):
+    for path in FIELDS:
+        for value in EDGES:
+            config = changed(path, 1, 1, value)
+            assert is_good(config) == is_valid(config), (path, value)
 
 
 @pytest.mark.parametrize("sensor", [1, 2])
