@@ -31,7 +31,7 @@ def wires(rng):
     ], said
 
 
-def world(seed, seconds=3.5, blind_s=3.0):
+def world(seed, seconds=2.0, blind_s=1.5):
     """A sampled arm: its shaft, noisy readings, true poses, pose measurements of vision until it is blind, and wires'."""
     rng = np.random.default_rng(seed)
     shaft, (true, mounting), (hung, said) = legs(rng, seconds), mounts(rng), wires(rng)
@@ -77,7 +77,8 @@ def test_wires_bound_the_error_while_the_cameras_are_covered_and_the_covariance_
         e = off(now.T_base_tool, Ts[-1])
         errors.append(e)
         squares.append(e @ np.linalg.solve(now.cov, e))
-        alone.append(off(go(q, looks, []).estimate().T_base_tool, Ts[-1]))
+        if seed < 6:  # enough for a mean
+            alone.append(off(go(q, looks, []).estimate().T_base_tool, Ts[-1]))
     with_wires, without = (np.sqrt(np.mean(np.square(np.array(x)[..., :3]))) for x in (errors, alone))
     assert with_wires < 0.6 * without
     low, high = chi2.ppf([CHANCE / 2, 1 - CHANCE / 2], 6 * len(squares))
@@ -85,7 +86,7 @@ def test_wires_bound_the_error_while_the_cameras_are_covered_and_the_covariance_
 
 
 def test_an_image_that_waits_is_not_dropped_for_a_fast_sensor():
-    _, q, _, looks, lengths = world(3)
+    _, q, _, looks, lengths = world(3, seconds=2.6, blind_s=2.1)
     count = 1500
     estimator = fed(q[:count])
     image = next(m for m in looks if m.t_s > count * TICK_S + 0.01)

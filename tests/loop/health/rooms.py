@@ -16,7 +16,7 @@ from armsight.sim.example_rig import example_rig
 from armsight.sim.render.background import cluttered, textured
 
 RATE_HZ = 5.0
-FINE = 3  # rays a pixel along each side
+FINE = 2  # rays a pixel along each side
 STILL = np.zeros(6)
 
 
