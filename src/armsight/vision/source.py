@@ -72,6 +72,11 @@ class Source(Protocol):
         self.close()
 
 
+#: Bytes. Once a block of so many was freed, glibc gives none of its size or less back to the system at once, and new images
+#: take old ones' memory: new pages take longer than to read them. Half, double: the same up to 4 Mpx in colour.
+_REUSED = 16_000_000
+
+
 class PlayedSource(Source):
     """A recording of ``count`` shots; ``shots`` reads every so many of them. Its 16-bit images have one depth."""
 
@@ -85,6 +90,7 @@ class PlayedSource(Source):
         notes: tuple[str, ...] = (),
         depth: BitDepth | None = None,
     ) -> None:
+        bytes(_REUSED)
         self.count, self._notes, self._shots, self._done = count, notes, shots, 0
         self._left, self._reading, self._closed = self._rest(), threading.Lock(), False
         every = max(1, -(-2 * count // DEPTH_IMAGES))  # from its whole length: it may begin in the dark

@@ -22,7 +22,7 @@ import numpy as np
 
 from armsight.data import Image
 from armsight.kernels import kernel, kernel_types
-from armsight.vision.dense.cost import Bytes
+from armsight.vision.dense.cost import CENSUS_REACH, Bytes, census
 from armsight.vision.dense.method import Disparity, Search
 from armsight.vision.dense.postprocess import SigmaModel, finished
 from armsight.vision.dense.winner import NOWHERE, Counts, Winners, for_each_strip, make_winners
@@ -30,8 +30,6 @@ from armsight.vision.dense.winner import NOWHERE, Counts, Winners, for_each_stri
 ONE, TWO, THREE, SIX = (np.uintp(n) for n in (1, 2, 3, 6))
 #: Rows are filled to whole vectors of the processor, so that no pixel is left to be done alone.
 _VECTOR = 32
-#: Distance of the neighbours in a census word from the middle, px, along rows, columns and diagonals.
-_CENSUS_REACH = 2
 #: Beyond this many grey levels the difference is cut off; cost of a match beyond the right image's edge: about that of
 #: an ambiguous pixel.
 _CUT, _OUTSIDE = np.uint8(20), np.uint8(10)
@@ -52,21 +50,6 @@ class PairPlanes(NamedTuple):
     right_stride: np.uintp
 
 
-@kernel("u1[:, ::1], u1[:, ::1]", nogil=True)
-def _census(padded: Bytes, out: Bytes) -> None:
-    """Write the census words (H, W) of an image that is padded by the window's reach on every side."""
-    height, width = out.shape
-    for y in range(height):
-        row, middle = out[y], padded[y + _CENSUS_REACH]
-        for j in range(0, 5, 2):
-            other = padded[y + j]
-            for i in range(0, 5, 2):
-                if i == _CENSUS_REACH and j == _CENSUS_REACH:
-                    continue
-                for x in range(width):
-                    row[x] = (row[x] << np.uint8(1)) | np.uint8(other[x + i] < middle[x + _CENSUS_REACH])
-
-
 def prepare_planes(left: Image, right: Image, further: int) -> PairPlanes:
     """Compute the planes of both images (H, W) of a pair; matches lie less than ``further`` to the left in the right."""
 
@@ -75,13 +58,12 @@ def prepare_planes(left: Image, right: Image, further: int) -> PairPlanes:
             cv2.copyMakeBorder(image, REACH, REACH, before + REACH, REACH + 2 * _VECTOR, cv2.BORDER_REPLICATE)
         )
 
-    def census(image: Image) -> Bytes:
-        out = np.zeros(image.shape, np.uint8)
-        around = (_CENSUS_REACH,) * 4
-        _census(np.asarray(cv2.copyMakeBorder(image, *around, cv2.BORDER_REPLICATE), np.uint8), out)
-        return out
+    def words(image: Image) -> Bytes:
+        out = np.zeros((1, *image.shape), np.uint8)
+        census(np.pad(image, CENSUS_REACH, mode="edge"), 2, out)
+        return np.asarray(out[0])
 
-    planes = (widened(left, 0), widened(census(left), 0), widened(right, further), widened(census(right), further))
+    planes = (widened(left, 0), widened(words(left), 0), widened(right, further), widened(words(right), further))
     a, b, c, d = (plane.reshape(-1) for plane in planes)
     return PairPlanes(a, b, c, d, np.uintp(planes[0].shape[1]), np.uintp(planes[2].shape[1]))
 

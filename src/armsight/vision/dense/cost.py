@@ -10,7 +10,7 @@ Tomasi, "A pixel dissimilarity measure that is insensitive to image sampling", P
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,12 +19,11 @@ from armsight.data import Image
 from armsight.kernels import kernel, kernel_types
 
 Bytes = NDArray[np.uint8]
-Words32 = NDArray[np.uint32]
 ONE, TWO = np.uintp(1), np.uintp(2)
 #: Disparities are processed in blocks of so many, the width of a vector; a search is padded to whole blocks.
 BLOCK = np.uintp(64)
 #: The census window is 5 x 5 pixels: 24 bits, one for each neighbour that is darker than the middle.
-_CENSUS_REACH = 2
+CENSUS_REACH = 2
 #: Beyond this many grey levels the difference is cut off: a glint must not cost more than a wrong surface.
 _BT_CUT = np.uint8(20)
 #: Cost of a match beyond the right image's edge, where nothing can be compared: about that of an undecided pixel.
@@ -33,46 +32,55 @@ _OUTSIDE = np.uint8(13)
 _RAW_MAX = np.uint8(34)
 
 
-@kernel_types("u1[:, ::1], u1[:, ::1], u1[:, ::1], u4[:, ::1], u1[:, ::1], u1[:, ::1], u1[:, ::1], u4[:, ::1]")
+@kernel_types("u1[:, ::1], u1[:, ::1], u1[:, ::1], u1[:, :, ::1], u1[:, ::1], u1[:, ::1], u1[:, ::1], u1[:, :, ::1]")
 class CensusPair(NamedTuple):
     """A pair as the costs need it; the planes of the right image are mirrored and padded by the search."""
 
     left: Bytes  #: (H, W) grey
     left_low: Bytes  #: (H, W) least grey level within half a pixel to either side
     left_high: Bytes  #: (H, W) greatest
-    left_census: Words32  #: (H, W) census words
+    left_census: Bytes  #: (3, H, W) census words, byte by byte
     right: Bytes  #: (H, W + pad) grey, mirrored
     right_low: Bytes  #: (H, W + pad) mirrored
     right_high: Bytes  #: (H, W + pad) mirrored
-    right_census: Words32  #: (H, W + pad) mirrored
+    right_census: Bytes  #: (3, H, W + pad) mirrored
 
 
-_ODD, _PAIRS, _NIBBLES, _BYTES = (np.uint32(x) for x in (0x55555555, 0x33333333, 0x0F0F0F0F, 0x01010101))
+_TWO, _FOUR = np.uint8(2), np.uint8(4)
+_ODD, _PAIRS, _NIBBLE = np.uint8(0x55), np.uint8(0x33), np.uint8(0x0F)
 
 
 @kernel(inline="always")
-def popcount(x: np.uint32) -> np.uint32:
-    """Count the bits that are set: sums of neighbours (Warren, "Hacker's Delight", 5-1); LLVM makes it one instruction."""
-    x = x - ((x >> np.uint32(1)) & _ODD)
-    x = (x & _PAIRS) + ((x >> np.uint32(2)) & _PAIRS)
-    x = (x + (x >> np.uint32(4))) & _NIBBLES
-    return (x * _BYTES) >> np.uint32(24)
+def _bits_set(a: np.uint8, b: np.uint8, c: np.uint8) -> np.uint8:
+    """Count the bits set in three bytes: a full adder, then sums of neighbours (Warren, "Hacker's Delight", 5-1)."""
+    odd = np.uint8(a ^ b)
+    ones, twos = np.uint8(odd ^ c), np.uint8((a & b) | (odd & c))
+    ones = np.uint8(ones - ((ones >> np.uint8(1)) & _ODD))
+    twos = np.uint8(twos - ((twos >> np.uint8(1)) & _ODD))
+    ones = np.uint8((ones & _PAIRS) + ((ones >> _TWO) & _PAIRS))
+    twos = np.uint8((twos & _PAIRS) + ((twos >> _TWO) & _PAIRS))
+    both = np.uint8(ones + np.uint8(twos + twos))
+    return np.uint8((both & _NIBBLE) + (both >> _FOUR))
 
 
-@kernel("u1[:, ::1], u4[:, ::1]", nogil=True)
-def _census(padded: Bytes, out: Words32) -> None:
-    """Write the census words (H, W) of an image that is padded by the window's reach on every side."""
-    height, width = out.shape
+@kernel("u1[:, ::1], i8, u1[:, :, ::1]", nogil=True)
+def census(padded: Bytes, step: int, out: Bytes) -> None:
+    """Write the census words (N, H, W), by bytes, of an image that is padded by the window's reach on every side.
+
+    Of the window every pixel counts (N = 3), or with a ``step`` of 2 every other one (N = 1).
+    """
+    _, height, width = out.shape
     for y in range(height):
-        row = out[y]
-        middle = padded[y + _CENSUS_REACH]
-        for j in range(2 * _CENSUS_REACH + 1):
+        middle, bit = padded[y + CENSUS_REACH], 0
+        for j in range(0, 2 * CENSUS_REACH + 1, step):
             other = padded[y + j]
-            for i in range(2 * _CENSUS_REACH + 1):
-                if i == _CENSUS_REACH and j == _CENSUS_REACH:
+            for i in range(0, 2 * CENSUS_REACH + 1, step):
+                if i == CENSUS_REACH and j == CENSUS_REACH:
                     continue
-                for x in range(width):
-                    row[x] = (row[x] << np.uint32(1)) | np.uint32(other[x + i] < middle[x + _CENSUS_REACH])
+                row = out[bit >> 3, y]
+                for x in range(np.uintp(width)):
+                    row[x] = (row[x] << np.uint8(1)) | np.uint8(other[x + np.uintp(i)] < middle[x + TWO])
+                bit += 1
 
 
 @kernel("u1[:, ::1], u1[:, ::1], u1[:, ::1]", nogil=True)
@@ -80,7 +88,7 @@ def _half_way(padded: Bytes, low: Bytes, high: Bytes) -> None:
     """Write the extreme grey levels (H, W) within half a pixel to either side, by linear interpolation."""
     height, width = low.shape
     for y in range(height):
-        row = padded[y + _CENSUS_REACH]
+        row = padded[y + CENSUS_REACH]
         for x in range(width):
             c = np.uint16(row[x + 2])
             a = np.uint16(c + row[x + 1]) >> np.uint16(1)
@@ -89,26 +97,23 @@ def _half_way(padded: Bytes, low: Bytes, high: Bytes) -> None:
             high[y, x] = max(c, max(a, b))
 
 
-def _census_planes(image: Image) -> tuple[Bytes, Bytes, Bytes, Words32]:
+def _census_planes(image: Image) -> tuple[Bytes, Bytes, Bytes, Bytes]:
     """Return an image (H, W), its least and greatest levels half way to the neighbours, and its census words."""
-    reach = _CENSUS_REACH
+    reach = CENSUS_REACH
     padded = np.pad(image, reach, mode="edge")
-    low, high, words = (
-        np.empty(image.shape, np.uint8),
-        np.empty(image.shape, np.uint8),
-        np.zeros(image.shape, np.uint32),
-    )
+    low, high = np.empty(image.shape, np.uint8), np.empty(image.shape, np.uint8)
+    words = np.zeros((3, *image.shape), np.uint8)
     _half_way(padded, low, high)
-    _census(padded, words)
+    census(padded, 1, words)
     return np.ascontiguousarray(padded[reach:-reach, reach:-reach]), low, high, words
 
 
 def prepare(left: Image, right: Image, pad: int) -> CensusPair:
     """Compute the planes of both images (H, W) of a pair; ``pad``: first disparity of the search and how many there are."""
 
-    def mirrored(a: NDArray[Any]) -> NDArray[Any]:
-        out = np.zeros((a.shape[0], a.shape[1] + pad), a.dtype)
-        out[:, : a.shape[1]] = a[:, ::-1]
+    def mirrored(a: Bytes) -> Bytes:
+        out = np.zeros((*a.shape[:-1], a.shape[-1] + pad), np.uint8)
+        out[..., : a.shape[-1]] = a[..., ::-1]
         return out
 
     return CensusPair(*_census_planes(left), *(mirrored(a) for a in _census_planes(right)))
@@ -136,20 +141,18 @@ def raw_row(pair: CensusPair, y: int, first: int, count: int, size: np.uintp, ou
     most.
     """
     width = pair.left.shape[1]
-    words, right, low, high = pair.right_census[y], pair.right[y], pair.right_low[y], pair.right_high[y]
+    right, low, high = pair.right[y], pair.right_low[y], pair.right_high[y]
+    one, two, three = pair.right_census[0, y], pair.right_census[1, y], pair.right_census[2, y]
     for x in range(width):
-        word, g, g_low, g_high = pair.left_census[y, x], pair.left[y, x], pair.left_low[y, x], pair.left_high[y, x]
+        g, g_low, g_high = pair.left[y, x], pair.left_low[y, x], pair.left_high[y, x]
+        a, b, c = pair.left_census[0, y, x], pair.left_census[1, y, x], pair.left_census[2, y, x]
         inside = np.uintp(min(max(x - first + 1, 0), count))
         o, k = base + np.uintp(x) * size, np.uintp(width - 1 - x + first)
-        whole = inside - inside % BLOCK
-        for d in range(inside):
-            out[o + d] = np.uint8(popcount(word ^ words[k + d]))
-        for block in range(np.uintp(0), whole, BLOCK):
+        for block in range(np.uintp(0), inside, BLOCK):  # what is beyond the image is written anew
             for e in range(BLOCK):  # a fixed count: unrolled into whole vectors
                 d = block + e
-                out[o + d] += _bt(g, g_low, g_high, right[k + d], low[k + d], high[k + d])
-        for d in range(whole, inside):
-            out[o + d] += _bt(g, g_low, g_high, right[k + d], low[k + d], high[k + d])
+                bits = _bits_set(np.uint8(a ^ one[k + d]), np.uint8(b ^ two[k + d]), np.uint8(c ^ three[k + d]))
+                out[o + d] = np.uint8(bits + _bt(g, g_low, g_high, right[k + d], low[k + d], high[k + d]))
         for d in range(inside, np.uintp(count)):
             out[o + d] = _OUTSIDE
         for d in range(np.uintp(count), size):

@@ -53,20 +53,20 @@ def _doubtful(disparity: Singles, state: NDArray[np.uint8]) -> NDArray[np.uint8]
     return np.asarray(near | bridged).astype(np.uint8)
 
 
-@kernel("f4[:, ::1], const u1[:, ::1], u1[:, ::1], f4[::1], f4[::1], i8, i8, f4[:, ::1]", nogil=True)
+@kernel("f4[:, ::1], const u1[:, ::1], u1[:, ::1], f4[::1], f4[::1], f4[::1], i8, i8, f4[:, ::1]", nogil=True)
 def _weighted_medians(
     disparity: Singles,
     image: Image,
     doubtful: NDArray[np.uint8],
     alike: Singles,
     near: Singles,
+    votes: Singles,
     begin: int,
     end: int,
     out: Singles,
 ) -> None:
-    """Write weighted medians of doubtful pixels; the rest is copied."""
+    """Write weighted medians of doubtful pixels; the rest is copied. ``votes``: zeros, one for each disparity."""
     height, width = disparity.shape
-    votes = np.zeros(int(disparity.max()) + 2, np.float32)
     for y in range(begin, end):
         for x in range(width):
             out[y, x] = disparity[y, x]
@@ -122,8 +122,10 @@ def aligned_to_edges(disparity: Singles, state: NDArray[np.uint8], image: Image)
     alike = np.exp(-np.arange(256) / _EDGE_ALIKE).astype(np.float32)
     near = np.exp(-((np.arange(_EDGE_REACH + 1) / _NEAR_PX) ** 2) / 2).astype(np.float32)
 
+    most = int(disparity.max()) + 2
+
     def work(begin: int, end: int) -> None:
-        _weighted_medians(disparity, image, doubtful, alike, near, begin, end, median)
+        _weighted_medians(disparity, image, doubtful, alike, near, np.zeros(most, np.float32), begin, end, median)
 
     for_each_strip(disparity.shape[0], work)
     stays = (state == MEASURED) & (np.abs(median - disparity) <= _SAME)
@@ -195,18 +197,25 @@ _SMOOTH_REACH, _SMOOTH_ALIKE = 4, np.float32(8.0)
 _ROUNDS = (1.5, 1.0)
 
 
-@kernel(nogil=True, inline="always")
-def _add(
-    d: Singles, grey: Image, other: Singles, other_grey: Image, tolerance: np.float32, up: Singles, down: Singles
+@kernel(nogil=True)
+def _weigh(
+    d: Singles, grey: Image, other: Singles, other_grey: Image, tolerance: np.float32, gap: Singles, weight: Singles
 ) -> None:
-    """Add neighbours to sums of weighted differences and of weights, a row at a time; NaN never counts."""
-    for x in range(d.shape[0]):
-        gap = other[x] - d[x]
-        near = abs(gap) <= tolerance
-        step = abs(np.float32(other_grey[x]) - np.float32(grey[x]))
-        weight = _SMOOTH_ALIKE / (_SMOOTH_ALIKE + step) if near else np.float32(0)
-        up[x] += weight * (gap if near else np.float32(0))
-        down[x] += weight
+    """Write the differences of neighbours, a row at a time, and their weights; both zero where one is NaN."""
+    for x in range(np.uintp(d.shape[0])):
+        apart = other[x] - d[x]
+        near = abs(apart) <= tolerance
+        step = np.float32(abs(np.int32(other_grey[x]) - np.int32(grey[x])))
+        gap[x] = apart if near else np.float32(0)
+        weight[x] = _SMOOTH_ALIKE / (_SMOOTH_ALIKE + step) if near else np.float32(0)
+
+
+@kernel(nogil=True)
+def _add(gap: Singles, weight: Singles, sign: np.float32, up: Singles, down: Singles) -> None:
+    """Add to sums of weighted differences and of weights; with a sign of -1 to those of the neighbours."""
+    for x in range(np.uintp(gap.shape[0])):
+        up[x] += sign * weight[x] * gap[x]
+        down[x] += weight[x]
 
 
 @kernel("f4[:, ::1], const u1[:, ::1], f4, i8, i8, f4[:, ::1], f4[:, ::1]", nogil=True)
@@ -215,34 +224,37 @@ def _rows(
 ) -> None:
     """Smooth along rows."""
     width = source.shape[1]
+    gaps, weights = np.empty(width, np.float32), np.empty(width, np.float32)
     for y in range(begin, end):
         up, down = out[y], share[y]
         up[:], down[:] = 0, 0
         for k in range(1, _SMOOTH_REACH + 1):
-            a, b, g, h = source[y, k:], source[y, :-k], image[y, k:], image[y, :-k]
-            _add(b, h, a, g, tolerance, up[:-k], down[:-k])
-            _add(a, g, b, h, tolerance, up[k:], down[k:])
-        for x in range(width):
+            gap, weight = gaps[: width - k], weights[: width - k]
+            _weigh(source[y, :-k], image[y, :-k], source[y, k:], image[y, k:], tolerance, gap, weight)
+            _add(gap, weight, np.float32(1), up[:-k], down[:-k])
+            _add(gap, weight, np.float32(-1), up[k:], down[k:])
+        for x in range(np.uintp(width)):
             up[x] = source[y, x] + up[x] / (down[x] + np.float32(1))
             down[x] /= np.float32(2 * _SMOOTH_REACH)
 
 
-@kernel("f4[:, ::1], const u1[:, ::1], f4, i8, i8, f4[::1], f4[:, ::1], f4[:, ::1]", nogil=True)
+@kernel("f4[:, ::1], const u1[:, ::1], f4, i8, i8, f4[:, ::1], f4[:, ::1]", nogil=True)
 def _columns(
-    source: Singles, image: Image, tolerance: np.float32, begin: int, end: int, down: Singles, out: Singles,
-    share: Singles,
-) -> None:  # fmt: skip
-    """Smooth along columns; ``down`` (W,) is a buffer."""
+    source: Singles, image: Image, tolerance: np.float32, begin: int, end: int, out: Singles, share: Singles
+) -> None:
+    """Smooth along columns."""
     height, width = source.shape
+    gap, weight, down = np.empty(width, np.float32), np.empty(width, np.float32), np.empty(width, np.float32)
     for y in range(begin, end):
-        up = out[y]
+        up, part = out[y], share[y]
         up[:], down[:] = 0, 0
         for k in range(-_SMOOTH_REACH, _SMOOTH_REACH + 1):
             if k != 0 and 0 <= y + k < height:
-                _add(source[y], image[y], source[y + k], image[y + k], tolerance, up, down)
-        for x in range(width):
+                _weigh(source[y], image[y], source[y + k], image[y + k], tolerance, gap, weight)
+                _add(gap, weight, np.float32(1), up, down)
+        for x in range(np.uintp(width)):
             up[x] = source[y, x] + up[x] / (down[x] + np.float32(1))
-            share[y, x] = np.float32(0.5) * (share[y, x] + down[x] / np.float32(2 * _SMOOTH_REACH))
+            part[x] = np.float32(0.5) * (part[x] + down[x] / np.float32(2 * _SMOOTH_REACH))
 
 
 def smoothed(disparity: Singles, image: Image) -> tuple[Singles, NDArray[np.float32]]:
@@ -265,7 +277,7 @@ def smoothed(disparity: Singles, image: Image) -> tuple[Singles, NDArray[np.floa
             _rows(source, image, limit, begin, end, half, share)
 
         def columns(begin: int, end: int, out: Singles = out, limit: np.float32 = tolerance) -> None:
-            _columns(half, image, limit, begin, end, np.empty(image.shape[1], np.float32), out, share)
+            _columns(half, image, limit, begin, end, out, share)
 
         for_each_strip(height, rows)
         for_each_strip(height, columns)

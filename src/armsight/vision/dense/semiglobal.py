@@ -40,7 +40,7 @@ class PathBuffers(NamedTuple):
 
     raw: Bytes  #: (3 * W * size,) raw costs of three rows
     mixed: Bytes  #: (W * size,) scratch
-    #: slots of path costs, and a row's costs. Slots: two rows of W in three directions each, two pixels of the path
+    #: slots of path costs, and a row's costs. Slots: two rows of W in three directions each, two pixels of each path
     #: along the row, and a start before which there is nothing
     arena: Bytes
     least: Bytes  #: (6 * W,) least cost of each slot of the first two rows
@@ -52,8 +52,8 @@ class PathBuffers(NamedTuple):
 def make_work(width: int, size: int, pad: int, rows: int) -> PathBuffers:
     """Return room for a strip; ``rows`` totals are kept."""
     slot, n = size + int(_GUARD), width * size
-    arena = np.full((6 * width + 3) * slot + n, 255, np.uint8)
-    start = (6 * width + 2) * slot
+    arena = np.full((6 * width + 5) * slot + n, 255, np.uint8)
+    start = (6 * width + 4) * slot
     arena[start : start + size + 1] = 0
     return PathBuffers(
         np.empty(3 * n, np.uint8),
@@ -68,7 +68,7 @@ def make_work(width: int, size: int, pad: int, rows: int) -> PathBuffers:
 @kernel(nogil=True)
 def cost_base(width: int, size: np.uintp) -> np.uintp:
     """Where in the arena a row's costs begin."""
-    return np.uintp(6 * width + 3) * (size + _GUARD)
+    return np.uintp(6 * width + 5) * (size + _GUARD)
 
 
 @kernel(nogil=True, inline="always")
@@ -86,13 +86,15 @@ def _step(
     jump = np.uint8(least + p2)
     smallest = np.uint8(255)
     for block in range(np.uintp(0), size, BLOCK):
+        least_here = np.uint8(255)  # of this block alone: none waits for the one before
         for e in range(BLOCK):  # a fixed count: unrolled into whole vectors
             d = block + e
             slanted = np.uint8(min(arena[before + d], arena[before + d + TWO]) + p1)
             v = min(min(arena[before + d + ONE], slanted), jump)
             v = np.uint8(np.uint8(v - least) + arena[cost + d])
             arena[here + d + ONE] = v
-            smallest = min(smallest, v)
+            least_here = min(least_here, v)
+        smallest = min(smallest, least_here)
     return smallest
 
 
@@ -114,8 +116,18 @@ def _sum(arena: Bytes, slots: Starts, total: Counts, at: np.uintp, size: np.uint
             total[at + d] = np.uint16(four + total[at + d]) if add else four
 
 
+@kernel(nogil=True, inline="always")
+def _sum_one(arena: Bytes, slot: np.uintp, total: Counts, at: np.uintp, size: np.uintp, add: bool) -> None:
+    """Write a slot to a pixel's totals, or add it to what is there."""
+    for block in range(np.uintp(0), size, BLOCK):
+        for k in range(BLOCK):
+            d = block + k
+            one = np.uint16(arena[slot + ONE + d])
+            total[at + d] = np.uint16(one + total[at + d]) if add else one
+
+
 @kernel(nogil=True)
-def forward(
+def advance(
     work: PathBuffers,
     image: Bytes,
     y: int,
@@ -126,25 +138,30 @@ def forward(
     p1: np.uint8,
     p2: Bytes,
 ) -> None:
-    """Advance the paths from row from_y, < 0 for none, to row y, and the path along the row to the right.
+    """Advance the paths from row from_y, < 0 for none, to row y, and those along the row, right and left.
 
-    The paths alternate pixel by pixel: the one along the row depends on its own last step, and the others fill the
+    The paths alternate pixel by pixel: those along the row depend on their own last step, and the others fill the
     waiting time. ``keep``: RUN_UP for no totals, WRITE to go along the row too and write them from ``at`` on, ADD to
     add to them; p1: penalty of a slant, p2 (256,): of a jump at each difference of grey levels.
     """
     width = image.shape[1]
     slot, costs, now = size + _GUARD, cost_base(width, size), y & 1
-    start = np.uintp(6 * width + 2) * slot
-    least_row, jump_row = np.uint8(0), np.uint8(0)
+    start = np.uintp(6 * width + 4) * slot
+    least_row, jump_row, least_left, jump_left, left = np.uint8(0), np.uint8(0), np.uint8(0), np.uint8(0), start
     s = np.full(4, start, np.uintp)
     for x in range(width):
         o = np.uintp(x) * size
         if keep == WRITE:
+            to = width - 1 - x
             if x > 0:
                 jump_row = _penalty(image, y, x, y, x - 1, p2)
+                jump_left = _penalty(image, y, to, y, to + 1, p2)
             here = np.uintp(6 * width + (x & 1)) * slot
             least_row = _step(work.arena, s[3], here, costs + o, size, least_row, p1, jump_row)
             s[3] = here
+            here, left_o = np.uintp(6 * width + 2 + (x & 1)) * slot, np.uintp(to) * size
+            least_left = _step(work.arena, left, here, costs + left_o, size, least_left, p1, jump_left)
+            left = here
         for side in range(-1, 2):
             from_x, to = x + side, (now * 3 + side + 1) * width + x
             before, least, jump = start, np.uint8(0), np.uint8(0)
@@ -154,25 +171,10 @@ def forward(
                 jump = _penalty(image, y, x, from_y, from_x, p2)
             s[side + 1] = np.uintp(to) * slot
             work.least[to] = _step(work.arena, before, s[side + 1], costs + o, size, least, p1, jump)
-        if keep != RUN_UP:
-            _sum(work.arena, s, work.total, at + o, size, keep == ADD)
-
-
-@kernel(nogil=True)
-def leftward(work: PathBuffers, image: Bytes, y: int, size: np.uintp, at: np.uintp, p1: np.uint8, p2: Bytes) -> None:
-    """Go along row y to the left, and add to the totals; arguments as :func:`forward`."""
-    width = image.shape[1]
-    slot, costs = size + _GUARD, cost_base(width, size)
-    start = np.uintp(6 * width + 2) * slot
-    s = np.full(4, start, np.uintp)
-    least, jump = np.uint8(0), np.uint8(0)
-    for x in range(width - 1, -1, -1):
-        o, here = np.uintp(x) * size, np.uintp(6 * width + (x & 1)) * slot
-        if x < width - 1:
-            jump = _penalty(image, y, x, y, x + 1, p2)
-        least = _step(work.arena, s[0], here, costs + o, size, least, p1, jump)
-        s[0] = here
-        _sum(work.arena, s, work.total, at + o, size, True)
+        if keep != RUN_UP:  # of a pixel's two sums along the row the first writes, the second adds
+            _sum(work.arena, s, work.total, at + o, size, keep == ADD or 2 * x >= width)
+        if keep == WRITE:
+            _sum_one(work.arena, left, work.total, at + left_o, size, 2 * x >= width - 1)
 
 
 #: Where paths come from below too a strip's totals are kept: rows at most and bytes about.
@@ -223,17 +225,15 @@ def _strip(
         at = np.uintp(y - begin if both_ways and y >= begin else 0) * n
         _costs(pair, y, 1, y > top, first, count, size, work)
         keep = WRITE if y >= begin else RUN_UP
-        forward(work, pair.left, y, y - 1 if y > top else -1, keep, size, at, p1, p2)
-        if y >= begin:
-            leftward(work, pair.left, y, size, at, p1, p2)
-            if not both_ways:
-                choose_row(work.total, at, work.best_right, y, first, count, size, found)
+        advance(work, pair.left, y, y - 1 if y > top else -1, keep, size, at, p1, p2)
+        if y >= begin and not both_ways:
+            choose_row(work.total, at, work.best_right, y, first, count, size, found)
     if both_ways:
         for y in range(bottom - 1, begin - 1, -1):
             at = np.uintp(y - begin if y < end else 0) * n
             _costs(pair, y, -1, y < bottom - 1, first, count, size, work)
             keep = ADD if y < end else RUN_UP
-            forward(work, pair.left, y, y + 1 if y < bottom - 1 else -1, keep, size, at, p1, p2)
+            advance(work, pair.left, y, y + 1 if y < bottom - 1 else -1, keep, size, at, p1, p2)
             if y < end:
                 choose_row(work.total, at, work.best_right, y, first, count, size, found)
 

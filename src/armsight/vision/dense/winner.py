@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.kernels import kernel, kernel_types
-from armsight.vision.dense.cost import BLOCK
 
 
 def processors() -> int:
@@ -49,6 +48,8 @@ def for_each_strip(height: int, work: Callable[[int, int], None], rows: int = ST
 Singles = NDArray[np.float32]
 Counts = NDArray[np.uint16]
 NOWHERE = np.uint16(65535)
+#: Totals are searched in blocks of so many; a total, 1,456 at most, and its number in the block fit 16 bits.
+_SHORT, _BITS, _LAST = np.uintp(32), np.uint16(5), np.uintp(31)
 
 
 @kernel_types("f4[:, ::1], b1[:, ::1], f4[:, ::1], f4[:, ::1]")
@@ -76,26 +77,22 @@ def _tried(x: int, first: int, count: int) -> np.uintp:
 @kernel(nogil=True, inline="always")
 def _least_of(total: Counts, at: np.uintp, count: np.uintp, best_right: Counts, right: np.uintp) -> np.uint16:
     """Return the first disparity of least total, and let every right pixel, from ``right`` on, keep its own least."""
-    least, whole = NOWHERE, count - count % BLOCK
-    for block in range(np.uintp(0), whole, BLOCK):
-        for e in range(BLOCK):  # a fixed count: unrolled into whole vectors
+    least, where, whole = NOWHERE, np.uintp(0), count - count % _SHORT
+    for block in range(np.uintp(0), whole, _SHORT):
+        first = NOWHERE
+        for e in range(_SHORT):  # a fixed count: unrolled into whole vectors
             d = block + e
             t = total[at + d]
             best_right[right + d] = min(best_right[right + d], t)
-            least = min(least, t)
+            first = min(first, np.uint16((t << _BITS) | np.uint16(e)))
+        if (first >> _BITS) < least:
+            least, where = np.uint16(first >> _BITS), block + (np.uintp(first) & _LAST)
     for d in range(whole, count):
         t = total[at + d]
         best_right[right + d] = min(best_right[right + d], t)
-        least = min(least, t)
-    where = NOWHERE
-    for block in range(np.uintp(0), whole, BLOCK):
-        for e in range(BLOCK):
-            where = min(where, np.uint16(block + e) if total[at + block + e] == least else NOWHERE)
-        if where != NOWHERE:
-            return where
-    for d in range(whole, count):
-        where = min(where, np.uint16(d) if total[at + d] == least else NOWHERE)
-    return where
+        if t < least:
+            least, where = t, np.uintp(d)
+    return np.uint16(where)
 
 
 @kernel(nogil=True)
@@ -128,7 +125,6 @@ def choose_row(
         found.disparity[y, x] = np.float32(first) + np.float32(d) + offset
         found.curvature[y, x] = curvature
         found.least[y, x] = least
-    for x in range(width):
         found.agreed[y, x] = _agreed(total, at, best_right, x, found.disparity[y, x], first, count, size, width)
 
 

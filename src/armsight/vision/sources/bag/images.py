@@ -191,12 +191,13 @@ def stamps_of_topics(bag: Bag, topics: tuple[str, str]) -> tuple[Stamps, Stamps]
     """Read the stamps of two topics."""
     found: dict[str, tuple[list[int], list[int], list[int]]] = {topic: ([], [], []) for topic in topics}
     for message in bag.messages(topics):
-        header, arrival, contents = found[message.topic]
-        header.append(message.stamp_ns())
-        arrival.append(message.arrival_ns)
-        contents.append(hash(message.data[::_SAMPLED]))
+        found[message.topic][0].append(message.stamp_ns())
+        found[message.topic][1].append(message.arrival_ns)
     if any(header and max(header) <= 0 for header, _, _ in found.values()):  # both cameras by one clock
-        found = {topic: ([0] * len(arrival), arrival, contents) for topic, (_, arrival, contents) in found.items()}
+        found = {topic: ([0] * len(arrival), arrival, []) for topic, (_, arrival, _) in found.items()}
+    if any(len({*header}) < len(header) for header, _, _ in found.values()):
+        for message in bag.messages(topics):
+            found[message.topic][2].append(hash(message.data[::_SAMPLED]))
     left, right = (stamps_of(topic, *found[topic]) for topic in topics)
     for each in (left, right):
         if not each.t_ns:
