@@ -671,8 +671,7 @@ def test_arrays_of_both_sides_are_enough_alone(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "form",
-    ["json", "records", "sixteen", "columns of sixteen", "units", "four lines", "zeros", "zeros, four lines"],
+    "form", ["json", "records", "sixteen", "columns of sixteen", "units", "four lines", "zeros", "zeros, four lines"]
 )
 def test_a_row_without_a_pose_stays_a_row_in_every_form(tmp_path, form):
     path, gone = tmp_path / "a.txt", 1

@@ -93,7 +93,7 @@ def test_millimetres_and_what_is_no_rigid_motion_are_named():
         calibrate_handeye(flange, body)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize(("eye", "given"), [("to_hand", "in_hand"), ("in_hand", "to_hand")])
 def test_poses_of_the_other_mounting_are_rejected(eye, given, seed):
     A, B, cov, _, _ = recording(seed, eye)

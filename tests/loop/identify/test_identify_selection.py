@@ -62,14 +62,13 @@ def test_removals_are_scored_as_if_each_were_fitted(problem):
         np.testing.assert_allclose(now.losses(), slow_losses(now.kept, *rest), rtol=1e-9)
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-def test_few_numbers_leave_few_parameters(seed):
+def test_few_numbers_leave_few_parameters():
     """200 positions: no more than one parameter for ten numbers, though 222 may be off; and the error is that of so many.
 
     k parameters fitted to n numbers of noise sigma predict to sigma sqrt(3 k / n) in position, 0.05 mm here. What else
     there is (links' loads and harmonics too small to show) may double it.
     """
-    w, rng = worn(seed), np.random.default_rng(100 + seed)
+    w, rng = worn(0), np.random.default_rng(100)
     q, approach = poses(w.nominal, 200, rng)
     seen = w.seen(q, approach, rng)
     found = identify(w.nominal, replace(Measured(q, seen.p_rig), approach=approach))

@@ -101,10 +101,7 @@ def test_mounting_biases_scales_and_delay_are_found_from_a_sweep():
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (
-            lambda r: replace(r, z=r.z / STANDARD_GRAVITY_M_S2) if r.channel else r,
-            "accelerometer reads .* as if in g;",
-        ),
+        (lambda r: replace(r, z=r.z / STANDARD_GRAVITY_M_S2) if r.channel else r, "accelerometer reads .* as if in g;"),
         (lambda r: r if r.channel else replace(r, z=np.degrees(r.z)), "gyro reads .* as if in deg/s;"),
         (lambda r: replace(r, z=r.z * [1, 1, -1]), "axes are mirrored"),
     ],

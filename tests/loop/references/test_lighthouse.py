@@ -9,15 +9,7 @@ from armsight.data import Array
 from armsight.errors import CalibrationError
 from armsight.geometry.pose import exp_se3
 from armsight.geometry.rotation import exp_so3
-from armsight.loop.references.lighthouse import (
-    SLANT,
-    Lighthouse,
-    Sweeps,
-    beginning,
-    follow,
-    sweep_angle,
-    triangulated,
-)
+from armsight.loop.references.lighthouse import SLANT, Lighthouse, Sweeps, beginning, follow, sweep_angle, triangulated
 from armsight.loop.references.reference import ToolMotion
 
 NOISE_RAD, STEP = 40e-6, 1e-6

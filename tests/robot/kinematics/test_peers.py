@@ -18,7 +18,7 @@ def draw(seed, n):
 @pytest.mark.skipif(sys.platform == "win32", reason="pinocchio has no wheels for Windows")
 def test_pinocchio_has_the_same_pose_jacobian_and_rate(arm):
     peer = peers.Pinocchio(arm)
-    for q, qd in zip(draw(1, 100), draw(2, 100), strict=True):
+    for q, qd in zip(draw(1, 30), draw(2, 30), strict=True):
         np.testing.assert_allclose(arm.forward(q), peer.forward(q), rtol=0, atol=1e-14)
         for frame in ("base", "tool"):
             np.testing.assert_allclose(arm.jacobian(q, frame), peer.jacobian(q, frame), rtol=0, atol=1e-14)
@@ -31,19 +31,19 @@ def test_pinocchio_has_the_same_pose_jacobian_and_rate(arm):
 def test_no_solution_is_missed_that_eaik_finds(arm):
     peer = peers.Eaik(arm)
     missed = found = ours = 0
-    for q in draw(4, 500):
+    for q in draw(4, 200):
         T = arm.forward(q)
         theirs, answer = peer.inverse(T), arm.inverse(T)
         missed += len(peers.unmatched(arm, T, theirs, answer))
         found, ours = found + len(theirs), ours + len(answer)
     assert missed == 0
-    assert ours >= found > 2000
+    assert ours >= found > 800
 
 
 @models
 def test_near_singularities_what_eaik_finds_is_found_too(arm):
     peer, found, missed = peers.Eaik(arm), 0, 0
-    for q in arms.near_singular(arm, 500, np.random.default_rng(5)):
+    for q in arms.near_singular(arm, 200, np.random.default_rng(5)):
         T = arm.forward(q)
         theirs = peer.inverse(T)
         theirs = theirs[np.max(arms.off(arm.forward(theirs), T), axis=0) < 1e-9] if len(theirs) else theirs

@@ -12,10 +12,7 @@ from armsight.vision.dense.opencv import OpenCV
 from armsight.vision.dense.semiglobal import Semiglobal
 
 SEARCH = Search(0, 32)
-VARIANTS = {
-    **{name: open_method(name) for name in METHODS},
-    "semiglobal 5": Semiglobal(5),
-}
+VARIANTS = {**{name: open_method(name) for name in METHODS}, "semiglobal 5": Semiglobal(5)}
 
 
 @pytest.mark.opencv

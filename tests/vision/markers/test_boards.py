@@ -122,10 +122,9 @@ def test_boards_say_which_way_up_they_are_and_which_tags_they_have():
         "aprilgrid:4x5:88mm:0.25",
     ],
 )
-@pytest.mark.parametrize(("tilt", "rotation"), [(0.0, 0.1), (0.5, -0.5)])
-def test_a_board_of_which_nothing_is_known_is_named(spec, tilt, rotation):
+def test_a_board_of_which_nothing_is_known_is_named(spec):
     kind = spec.partition(":")[0]
-    image = expose(painted(kind, tilt, rotation, spec=spec)[1], 150, 2, np.random.default_rng(7))
+    image = expose(painted(kind, 0.5, -0.5, spec=spec)[1], 150, 2, np.random.default_rng(7))
     board = board_in_view(image)
     assert board is not None
     found = board.body.name
@@ -196,21 +195,16 @@ def test_boards_are_found_where_they_are(kind, tilt, rotation):
 
 @pytest.mark.opencv
 @pytest.mark.parametrize("kind", BOARDS)
-@pytest.mark.parametrize("image", ["black", "white", "noise", "tiny"])
-def test_nothing_found_is_a_reason_and_never_an_exception(kind, image):
-    rng = np.random.default_rng(3)
-    pixels = {
-        "black": np.zeros((120, 160), np.uint8),
-        "white": np.full((120, 160), 255, np.uint8),
-        "noise": rng.integers(0, 256, (120, 160), dtype=np.uint8),
-        "tiny": rng.integers(0, 256, (9, 7), dtype=np.uint8),
-    }[image]
-    found = open_board(SPECS[kind]).detect(pixels)
-    assert found.problem
-    assert len(found.ids) == 0
+def test_nothing_found_is_a_reason_and_never_an_exception(kind):
+    rng, shape = np.random.default_rng(3), (120, 160)
+    noise = [rng.integers(0, 256, each, dtype=np.uint8) for each in (shape, (9, 7))]
+    for pixels in (np.zeros(shape, np.uint8), np.full(shape, 255, np.uint8), *noise):
+        found = open_board(SPECS[kind]).detect(pixels)
+        assert found.problem
+        assert len(found.ids) == 0
 
 
-@pytest.mark.parametrize("rotation", [0.2, 0.2 + np.pi / 2, 0.2 + np.pi, 0.2 - np.pi / 2])
+@pytest.mark.parametrize("rotation", [0.2 + np.pi / 2, 0.2 + np.pi])
 @pytest.mark.parametrize("spec", ["chessboard:9x6:25mm", "chessboard:8x5:25mm"])
 def test_colours_decide_where_a_chessboard_begins(spec, rotation):
     target, image, truth = painted("chessboard", 0.3, rotation, samples=4, spec=spec)
@@ -219,7 +213,7 @@ def test_colours_decide_where_a_chessboard_begins(spec, rotation):
 
 
 @pytest.mark.parametrize("spec", ["chessboard:7x5:25mm", "chessboard:5x5:25mm", "chessboard:6x6:25mm"])
-@pytest.mark.parametrize("rotation", [0.1, 1.3, 2.9, -1.7])
+@pytest.mark.parametrize("rotation", [0.1, -1.7])
 def test_what_colours_leave_open_is_a_flip(spec, rotation):
     target, image, truth = painted("chessboard", 0.2, rotation, samples=4, spec=spec)
     found = target.detect(expose(image, 150, 1, np.random.default_rng(5)))

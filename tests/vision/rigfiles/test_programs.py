@@ -129,10 +129,7 @@ def test_a_fisheye_of_multical_is_known_by_the_shape_of_its_coefficients(tmp_pat
             lambda cameras: cameras[1]["extrinsics"].update(toCameraSocket=-1),
             "the extrinsics of CAM_C lead to CAM_A, not to the other camera",
         ),
-        (
-            lambda cameras: cameras[0]["extrinsics"].update(toCameraSocket=1),
-            "the extrinsics of CAM_B lead in a circle",
-        ),
+        (lambda cameras: cameras[0]["extrinsics"].update(toCameraSocket=1), "the extrinsics of CAM_B lead in a circle"),
         (lambda cameras: cameras[1].update(cameraType=2), "cameraType 2"),
         (lambda cameras: cameras[1].pop("width"), "not as depthai writes it: KeyError('width')"),
         (lambda cameras: cameras[1]["distortionCoeff"].__setitem__(9, 0.1), "thin-prism"),
