@@ -6,11 +6,13 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 
+from armsight.app.calibrate import run
 from armsight.geometry.pose import pose
 from armsight.sim.example_rig import example_rig
 from armsight.sim.render.background import plain
@@ -335,6 +337,32 @@ def test_an_interrupt_leaves_nothing(rendered, tmp_path, module, name, wait):
     assert printed == ""
     assert out.read_text() == before
     assert os.listdir(tmp_path) == ["rig.json"]
+
+
+@pytest.mark.parametrize(("read", "kept"), [(3, True), (2, False)])
+def test_an_interrupted_reading_is_calibrated_from_what_was_read(few, armsight, tmp_path, monkeypatch, read, kept):
+    real, calls = run.open_board(CHESS[1]), iter(range(100))
+
+    def detect(image):
+        if next(calls) == 2 * read + 1:  # between the two images of a pair
+            raise KeyboardInterrupt
+        return real.detect(image)
+
+    monkeypatch.setattr(
+        run,
+        "open_board",
+        lambda spec: SimpleNamespace(body=real.body, codes=real.codes, detect=detect, symmetries=real.symmetries),
+    )
+    said = armsight("calibrate", *images(few), *CHESS, *QUICK, "-o", tmp_path / "rig.json", "--json")
+    assert said.code == 130
+    assert (tmp_path / "rig.json").exists() == kept
+    if kept:
+        (found,) = said.lines
+        assert found["pairs_used"] == read
+        assert f"interrupted after {read} of 5: made from these" in found["notes"]
+        assert "Ctrl-C again ends it" in said.err
+    else:
+        assert said.err.splitlines() == ["armsight: interrupted"]
 
 
 def test_a_full_disk(few, armsight, full_disk):

@@ -91,11 +91,14 @@ def command(o: CalibrateOptions) -> int:
         started = time.perf_counter()
         calibration = opened.calibrated()
     require_order(calibration)
-    calibration = replace(calibration, rig=replace(calibration.rig, provenance=provenance(opened.named, calibration)))
+    rig = replace(calibration.rig, provenance=provenance(opened.named, calibration))
+    calibration = replace(calibration, rig=rig, notes=(*opened.notes, *calibration.notes))
     calibration.rig.save(o.output)
     opened.save(calibration)
     found = calibration_report(calibration, o.output, opened.board_file, o.report, time.perf_counter() - started)
     if o.report is not None:
         found.write(o.report)
     found.echo(as_json=o.as_json)
-    return UNTRUSTED if contradicted(calibration) or assess(calibration).grade == "poor" else 0
+    if contradicted(calibration) or assess(calibration).grade == "poor":
+        return UNTRUSTED
+    return 130 if opened.notes else 0

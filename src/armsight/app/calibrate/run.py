@@ -23,7 +23,7 @@ from armsight.data import SIDES, Detections, Shot
 from armsight.errors import CalibrationError, InputError
 from armsight.files import natural_key, unused
 from armsight.vision.calibrate import MODELS
-from armsight.vision.calibrate.boards import Pair, calibrate_boards, calibrate_recording
+from armsight.vision.calibrate.boards import LEAST_PAIRS, Pair, calibrate_boards, calibrate_recording
 from armsight.vision.calibrate.bodies import calibrate_bodies
 from armsight.vision.calibrate.result import Calibration
 from armsight.vision.calibrate.weak import contradicted
@@ -54,6 +54,7 @@ class GivenDetections:
     """Detections of a known body, to calibrate from; the body's points are estimated into a file that is named."""
 
     board_file: Path | None = None
+    notes: tuple[str, ...] = ()
 
     def __init__(self, options: CalibrateOptions) -> None:
         """Hold the files, which are read later."""
@@ -121,6 +122,8 @@ class _SimulatedBoard(Source):
 class GivenImages:
     """Images of a board, to calibrate from; the board's shape as it is found goes into ``board_file``."""
 
+    notes: tuple[str, ...] = ()  #: that Ctrl-C ended the reading
+
     def __init__(self, options: CalibrateOptions) -> None:
         """Open a source, or the images that two globs match, and find those of one camera alone."""
         self.named: dict[str, str] = {}
@@ -147,36 +150,42 @@ class GivenImages:
     def calibrated(self) -> Calibration:
         """Detect the board in all images, and calibrate; where shots have times it may move, and the skew is found."""
         source, target = self._source, self._board
-        pairs, times, singles = list[Pair](), list[float | None](), list[Pair]()
-        sizes, unseen = None, _Unseen(target)
-        with bar("detecting the target", None if source.count is None else source.count + len(self._alone)) as advance:
-            for shot, files in _shots(source):
-                if shot.left is None or shot.right is None:
-                    nothing = Detections.none(shot.problem or "no image")
-                    unread = (nothing, replace(nothing, problem=None))  # the problem names the file of one side
-                    left, right = unread[::-1] if (shot.problem or "").startswith(f"{files[1]}:") else unread
-                    pairs.append(Pair(shot.name, left, right))
-                else:
-                    images = grey(shot.left), grey(shot.right)
-                    sizes = _one_size(sizes, images, files)
-                    pairs.append(Pair(shot.name, target.detect(images[0]), target.detect(images[1])))
-                    unseen.keep(images, pairs[-1])
-                times.append(shot.t_s)
-                advance()
-            depth = BitDepth.of_files([path for _, path in self._alone])
-            for side, path in self._alone if sizes is not None else ():
-                singles.append(_single(path, depth, target, side, sizes[side] if sizes is not None else (0, 0)))
-                advance()
+        pairs, singles = list[tuple[Pair, float | None]](), list[Pair]()
+        sizes, unseen, total = None, _Unseen(target), None if source.count is None else source.count + len(self._alone)
+        try:
+            with bar("detecting the target", total) as advance:
+                for shot, files in _shots(source):
+                    if shot.left is None or shot.right is None:
+                        nothing = Detections.none(shot.problem or "no image")
+                        unread = (nothing, replace(nothing, problem=None))  # the problem names the file of one side
+                        left, right = unread[::-1] if (shot.problem or "").startswith(f"{files[1]}:") else unread
+                        pairs.append((Pair(shot.name, left, right), shot.t_s))
+                    else:
+                        images = grey(shot.left), grey(shot.right)
+                        sizes = _one_size(sizes, images, files)
+                        pairs.append((Pair(shot.name, target.detect(images[0]), target.detect(images[1])), shot.t_s))
+                        unseen.keep(images, pairs[-1][0])
+                    advance()
+                depth = BitDepth.of_files([path for _, path in self._alone])
+                for side, path in self._alone if sizes is not None else ():
+                    singles.append(_single(path, depth, target, side, sizes[side] if sizes is not None else (0, 0)))
+                    advance()
+        except KeyboardInterrupt:
+            if sum(not pair.left.problem and not pair.right.problem for pair, _ in pairs) < LEAST_PAIRS:
+                raise
+            read = f"{len(pairs) + len(singles)} of {total}" if total else f"{len(pairs)}"
+            self.notes = (f"interrupted after {read}: made from these",)
+            click.echo(f"armsight: {self.notes[0]}; Ctrl-C again ends it without a rig", err=True)
         if sizes is None:
-            why = f"none of {len(pairs)} pairs can be read; {pairs[0].name}: {pairs[0].left.problem}" if pairs else ""
-            raise InputError(why or "the recording has no shots")
+            why = [f"none of {len(pairs)} pairs can be read; {pair.name}: {pair.left.problem}" for pair, _ in pairs[:1]]
+            raise InputError(*why or ["the recording has no shots"])
         model = self._options.lens_model
         how: Any = {"models": MODELS if model is None else (model,), "flat": self._options.flat_target}
         how |= {"folds": self._options.folds, "singles": singles}
         with steps() as progress, unseen.explained(source):
-            known = [(pair, t) for pair, t in zip(pairs, times, strict=True) if t is not None]
+            known = [(pair, t) for pair, t in pairs if t is not None]
             if not known:
-                return calibrate_boards(target, pairs, sizes, progress=progress, **how)
+                return calibrate_boards(target, [pair for pair, _ in pairs], sizes, progress=progress, **how)
             timed, t_s = zip(*known, strict=True)
             found = calibrate_recording(target, timed, np.array(t_s), sizes, progress=progress, **how)
             return replace(found, notes=(*notes_of(source), *found.notes))
