@@ -143,7 +143,8 @@ class Serving:
         (folder / "serve.toml").write_text(
             f'[measure]\nrig = "rig.json"\ntarget = "plate.toml"\n'
             f'source = "url:http://127.0.0.1:{cameras.port}/left,http://127.0.0.1:{cameras.port}/right"\n'
-            f'[board]\nport = "feetech:{arm.name}"\n[serve]\nhttp = "127.0.0.1:0"\nlog = "{log}"\nstale_s = 3.0\n'
+            f'stream = ["json+tcp:0"]\n[board]\nport = "feetech:{arm.name}"\n'
+            f'[serve]\nhttp = "127.0.0.1:0"\nlog = "{log}"\nstale_s = 3.0\n'
         )
         environment = os.environ | {"LD_PRELOAD": str(library), "CLOCK_STEP": str(step)}
         arguments = [sys.executable, "-m", "armsight", "serve", str(folder / "serve.toml"), "--json"]

@@ -333,6 +333,15 @@ def test_motions_that_leave_a_direction_open_are_rejected_as_such(armsight, tmp_
         assert_rejected(asked(armsight, matrices(path, Ts), seen), said)
 
 
+def test_exchanged_tables_that_put_the_cameras_far_from_the_flange_are_named(armsight, tmp_path, seen):
+    robot = matrices(tmp_path / "robot.txt", motion()[1])
+    said = "if that is not so, --robot and --seen are exchanged"
+    right, exchanged = (found(armsight, *tables)[0] for tables in ((robot, seen), (seen, robot)))
+    np.testing.assert_allclose(log_se3(np.array(exchanged["T_flange_rig"]) @ Z), 0.0, atol=2e-3)  # as good a fit
+    assert said in str(exchanged["weak"])
+    assert said not in str(right["weak"])
+
+
 def test_many_blunders_ask_whether_the_rows_belong_together(armsight, tmp_path):
     _, A, B = motion(20)
     for k, off in zip((2, 5, 8, 11, 14, 17), np.random.default_rng(3).normal(0, 1, (6, 6)), strict=True):

@@ -60,7 +60,7 @@ def handeye_report(run: HandEyeAnswer) -> Report:
     worst = out[np.argsort(-found.distance[out])]
     blunders = [f"{names_[k]}: {np.sqrt(found.distance[k]):.0f} sigma from the others" for k in worst]
     why = _untrusted(run)
-    remarks = found.changed_at(names_), found.decided_by(names_).removeprefix("; ")
+    remarks = found.changed_at(names_), found.decided_by(names_).removeprefix("; "), _exchanged(run)
     decided = [Note("weak", each) for each in remarks if each]
     values = {
         **found.to_dict(),
@@ -103,6 +103,17 @@ def handeye_report(run: HandEyeAnswer) -> Report:
         [*(Note("untrusted", each) for each in why), *(Note("note", each) for each in run.recording.notes), *decided],
         values,
         assessed=assess(run, why),
+    )
+
+
+def _exchanged(run: HandEyeAnswer) -> str:
+    """Say that both tables may be exchanged, which fits as well: the mounting is then the inverse of what stands still."""
+    held, still = (np.linalg.norm(T[:3, 3]) for T in (run.found.T_flange_held, run.found.T_base_still))
+    if run.found.eye != "in_hand" or run.recording.seen.table is None or held < still:
+        return ""
+    return (
+        f"the cameras are {held:.2f} m from the flange, the target only {still:.2f} m from the base: if that is not so, "
+        "--robot and --seen are exchanged"
     )
 
 
