@@ -125,15 +125,6 @@ class GradedMetric:
     advice: str = ""  #: what to do where it is not good; may be empty
 
 
-@dataclass(frozen=True)
-class CalibrationAssessment:
-    """The grade of a calibration, its headline, and what that means for the user."""
-
-    grade: Grade
-    headline: str
-    meaning: str
-
-
 def target_drawing(calibration: Calibration) -> Array | None:
     """Return (M, 3) the drawing of the calibration target, m; None where the calibration is from a body of markers."""
     try:
@@ -226,8 +217,8 @@ def advice(calibration: Calibration) -> tuple[str, ...]:
     return (*calibration.weaknesses, *(f"{row.name} {row.heldout}: {row.advice}" for row in weak))
 
 
-def assess(calibration: Calibration) -> CalibrationAssessment:
-    """Return the assessment of a calibration: poor if a metric is, fair if there is advice, else good."""
+def assess(calibration: Calibration) -> tuple[tuple[Grade, str], str]:
+    """Return a calibration's grade (poor if a metric is, fair if there is advice), its headline, and what that means."""
     h, rig, points = calibration.held_out, calibration.rig, len(advice(calibration))
     along = rig.T_left_right[:3, :3].T @ rig.T_left_right[:3, 3] / rig.baseline_m
     baseline_share = float(np.sqrt(along @ rig.cov[-6:-3, -6:-3] @ along)) / rig.baseline_m
@@ -245,9 +236,8 @@ def assess(calibration: Calibration) -> CalibrationAssessment:
             "Leave mount, focus and zoom of both cameras as they are: the calibration holds for them alone.",
         ),
     }[grade]
-    return CalibrationAssessment(
-        grade,
-        headline,
+    return (
+        (grade, headline),
         f"On held-out pairs, measured points deviate by {1e3 * h.rigid_rms_m:.2g} mm (RMS) from their true shape, at a "
         f"distance of about {1e3 * distance_m(calibration):.0f} mm; lengths, compared with those of the "
         f"{target(calibration)}, are right to {100 * max(abs(h.scale_error), baseline_share):.2g}%. {then}",

@@ -66,7 +66,6 @@ def command(o: CalibrateOptions) -> int:
     if o.alone is not None and not images:
         raise InputError("--alone goes with images of a board")
 
-    from armsight.app.calibrate.assessment import assess
     from armsight.app.calibrate.report import REPORT_FILES, calibration_report
     from armsight.app.calibrate.run import GivenDetections, GivenImages, provenance
     from armsight.app.show.plotting import require_matplotlib
@@ -84,7 +83,8 @@ def command(o: CalibrateOptions) -> int:
         open_board(o.target)
         check_writable(o.output)
         check_report([o.output])
-    with contextlib.closing(GivenImages(o) if images else GivenDetections(o)) as opened:
+    given = contextlib.closing(GivenImages(o)) if images else contextlib.nullcontext(GivenDetections(o))
+    with given as opened:
         outputs = (o.output, o.refine_body, opened.board_file)
         check_outputs(outputs, opened.files)
         check_report(outputs, opened.files)
@@ -99,6 +99,5 @@ def command(o: CalibrateOptions) -> int:
     if o.report is not None:
         found.write(o.report)
     found.echo(as_json=o.as_json)
-    if contradicted(calibration) or assess(calibration).grade == "poor":
-        return UNTRUSTED
-    return 130 if opened.notes else 0
+    poor = contradicted(calibration) or found.values["grade"] == "poor"
+    return UNTRUSTED if poor else 130 if opened.notes else 0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import textwrap
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -26,7 +25,7 @@ _LEAST_IN_CELL, STANDS_OUT = 5, 4.0
 #: The longer residuals are plotted as long as this share of the image's width; deviations, of the target's.
 _ARROW_SHARE, _MAP_ARROW_SHARE, _LEAST_MM = 0.035, 0.06, 1e-4
 #: Of more pairs, and of more residuals, than these only the worst, and a random choice, are plotted.
-MOST_BARS, MOST_ARROWS, _MOST_LETTERS = 60, 3000, 50
+MOST_BARS, MOST_ARROWS = 60, 3000
 #: A pair whose error is this many times the median stands out.
 OUTSTANDING = 2.5
 #: Sigmas below the least total sigma divided by this all have one colour.
@@ -55,9 +54,8 @@ def volume_figure(calibration: Calibration) -> Figure:
         for column, share in enumerate(SHARES):
             axes, masked = panels[row, column], np.ma.masked_invalid(np.maximum(1e3 * sigma[column], low))
             colours = {"cmap": "viridis_r", "norm": LogNorm(low, high)}
-            filled = axes.pcolormesh(
-                x, z, masked, shading="nearest", rasterized=True, **colours
-            )  # as paths 12 MB of SVG
+            colours |= {"shading": "nearest", "rasterized": True}  # as paths 12 MB of SVG
+            filled = axes.pcolormesh(x, z, masked, **colours)
             if inside := [level for level in round_steps(low, high) if masked.min() < level < masked.max()]:
                 lines = axes.contour(x, z, masked, levels=inside, colors="white", linewidths=0.9)
                 for text in axes.clabel(lines, fmt="%g", fontsize=8, colors="white"):
@@ -211,12 +209,11 @@ def _enlargement(vectors: list[Array], length: float, least: float = 1e-9) -> fl
 
 
 def pairs_figure(calibration: Calibration) -> Figure:
-    """Plot the held-out errors of every pair, one bar each; pairs that were not used are named with their reason."""
+    """Plot the held-out errors of every pair, one bar each."""
     errors, heldout = calibration.errors, calibration.held_out
     order = np.sort(np.argsort(-errors.rigid_m)[:MOST_BARS])
     names = [plain(calibration.pairs[int(errors.pair[k])], 28) for k in order]
-    rejected = calibration.rejected[: max(MOST_BARS // 3, MOST_BARS - len(order))]
-    figure = new_figure(1.1 + 0.19 * (len(names) + len(rejected)))
+    figure = new_figure(1.1 + 0.19 * len(names))
     panels = figure.subplots(1, 2, sharey=True)
     shown = (
         (errors.epipolar_px, heldout.epipolar_rms_px, "epipolar error, px"),
@@ -232,13 +229,6 @@ def pairs_figure(calibration: Calibration) -> Figure:
         axes.grid(axis="x", color="#e4e7eb", linewidth=0.7)
         axes.set_axisbelow(True)
         axes.spines["left"].set_visible(False)
-        for k in range(len(names), len(names) + len(rejected)):
-            axes.axhspan(k - 0.45, k + 0.45, color=EMPTY, linewidth=0)
-    for k, pair in enumerate(rejected, start=len(names)):
-        reason = "not used: " + textwrap.shorten(plain(pair.reason, 500), _MOST_LETTERS, placeholder=" ...")
-        style = {"color": RED, "fontsize": 8, "parse_math": False, "transform": panels[0].get_yaxis_transform()}
-        panels[0].text(0.01, k, reason, va="center", **style)
-    names += [plain(pair.pair, 28) for pair in rejected]
     panels[0].set_yticks(range(len(names)), names, parse_math=False)
     panels[0].set_ylim(len(names) - 0.4, -0.6)
     return figure

@@ -32,7 +32,7 @@ from armsight.app.calibrate.figures import (
     volume_figure,
 )
 from armsight.app.show.messages import weak
-from armsight.app.show.page import PAGE, bullets, table, text
+from armsight.app.show.page import PAGE, bullets, folded, table, text
 from armsight.app.show.plotting import Figure
 from armsight.app.show.report import Block, Html, Plot, Report, Section, Text, figure_files
 from armsight.app.show.table import TextTable, plain_text
@@ -44,6 +44,8 @@ from armsight.vision.calibrate.weak import COVERAGE_GRID, contradicted
 from armsight.vision.rig import StereoRig
 
 _ROUNDING = 1e-12
+#: Lines of a kind that are printed, of rejected pairs, and shown, of notes; half, double: so many.
+_LISTED = 8
 #: Why the reprojection RMS may be far below the epipolar RMS of the same fit.
 MOTION_FITTED = (
     "The reprojection follows the board, which moved between the two exposures of a pair; the epipolar RMS does not."
@@ -167,7 +169,7 @@ FIGURES = {
         "Held-out errors by pair",
         pairs_figure,
         "Bars: held-out epipolar and rigid error of every pair",
-        "bars of similar length, all blue.{few}{rejected}",
+        "bars of similar length, all blue.{few}",
         f"orange bars, more than {OUTSTANDING:g} times the median. A pair that stands out in the epipolar error moved "
         "between the two images or was taken at two moments; one that stands out in the rigid error only was blurred, "
         "far away or bent. Look at its images and take it again. Each pair was measured with a rig fitted without it.",
@@ -208,8 +210,15 @@ def _words(calibration: Calibration) -> dict[str, object]:
         "few": f" Of {pairs} pairs the {MOST_BARS} with the largest rigid error are shown."
         if pairs > MOST_BARS
         else "",
-        "rejected": " Pairs that were not used are named below them." if calibration.rejected else "",
     }
+
+
+def _rejected(calibration: Calibration) -> dict[str, list[str]]:
+    """Return the pairs of each reason for which some were not used."""
+    reasons: dict[str, list[str]] = {}
+    for pair in calibration.rejected:
+        reasons.setdefault(pair.reason, []).append(pair.pair)
+    return reasons
 
 
 def _result(calibration: Calibration) -> str:
@@ -218,19 +227,19 @@ def _result(calibration: Calibration) -> str:
     weak_points = bullets(advice(calibration)) or "<p>None.</p>\n"
     rejected = f"<p>None: all {used} pairs were used.</p>\n"
     if calibration.rejected:
-        reasons: dict[str, list[str]] = {}
-        for pair in calibration.rejected:
-            reasons.setdefault(pair.reason, []).append(pair.pair)
-        rows = [(", ".join(text(name) for name in names), text(reason)) for reason, names in reasons.items()]
+        rows = [(", ".join(map(text, pairs)), text(reason)) for reason, pairs in _rejected(calibration).items()]
         counted = f"<p>{used} of {calibration.pairs_found} pairs were used.</p>\n"
         rejected = counted + table(("pair", "reason"), rows, "prose")
+    notes = bullets(calibration.notes)
+    if len(calibration.notes) > _LISTED:
+        notes = bullets(merged_notes(calibration.notes)) + folded(f"all {len(calibration.notes)}", notes)
     return (
         headline_table(calibration)
         + "<p>Rely on the held-out column: a fit adapts to the pairs it is made from, the more so the fewer they are. The "
         "held-out metrics come from pairs that were not fitted, measured as later measurements are.</p>\n"
         f"<h3>Weak points, and what to do</h3>\n{weak_points}"
         f"<h3>Pairs that were not used</h3>\n{rejected}"
-        + ("<h3>Corrected, or used in part</h3>\n" + bullets(calibration.notes) if calibration.notes else "")
+        + (f"<h3>Corrected, or used in part</h3>\n{notes}" if notes else "")
     )
 
 
@@ -270,7 +279,7 @@ def _provenance(rig: StereoRig) -> str:
 
 def _printed(calibration: Calibration, output: Path, board_file: Path | None, page: Path | None) -> str:
     """Return what is printed: the held-out errors first, then those of the fit, then what is weak."""
-    c, h, poor = calibration, calibration.held_out, _poor(calibration)
+    c, h, poor, rejected = calibration, calibration.held_out, _poor(calibration), _rejected(calibration)
     rows = (
         ("epipolar RMS", f"{h.epipolar_rms_px:.3f} px"),
         ("rigid RMS (shape of the target)", f"{1e3 * h.rigid_rms_m:.3f} mm"),
@@ -289,10 +298,11 @@ def _printed(calibration: Calibration, output: Path, board_file: Path | None, pa
         f"drawing by {1e3 * c.deviation_m:.3f} mm RMS",
         *([] if c.disc_radius_m is None else [f"radius of the board's discs: {1e3 * c.disc_radius_m:.3f} mm"]),
     ]
-    for reason, group in itertools.groupby(c.rejected, key=lambda r: r.reason):  # neighbours share a line
-        first, *more = (r.pair for r in group)
-        pairs = f"{1 + len(more)} pairs {first} to {more[-1]}" if more else f"pair {first}"
-        lines.append(f"rejected {pairs}: {reason}")
+    for reason, (first, *more) in itertools.islice(rejected.items(), _LISTED):
+        lines.append(
+            f"rejected {f'{1 + len(more)} pairs {first} to {more[-1]}' if more else f'pair {first}'}: {reason}"
+        )
+    lines += [f"and {len(rejected) - _LISTED} more reasons: --json, --report"] if len(rejected) > _LISTED else []
     lines += [f"note: {note}" for note in merged_notes(c.notes)]
     lines += map(weak, [*c.weaknesses, *([f"do not rely on this calibration yet: {', '.join(poor)}"] if poor else [])])
     lines.append(f"rig written to {output}" + ("" if page is None else f", report to {page}"))
@@ -313,7 +323,7 @@ def calibration_report(
 ) -> Report:
     """Return what a calibration says."""
     c, words, page = calibration, _words(calibration), None if report is None else report / PAGE
-    found = assess(c)
+    graded, meaning = assess(c)
     left, right = ("{} x {}".format(*camera.image_size_px) for camera in c.rig.cameras)
     size = f"{left} px" if left == right else f"{left} px left, {right} px right"
     used = f"{len(c.pairs)} of {c.pairs_found} pairs of images used"
@@ -331,7 +341,7 @@ def calibration_report(
         "rejected": c.rejected,
         "notes": c.notes,
         "weaknesses": c.weaknesses,
-        "grade": found.grade,
+        "grade": graded[0],
         "poor": _poor(c),
         "fit": {"epipolar_rms_px": c.epipolar_rms_px, "reprojection_rms_px": c.reprojection_rms_px},
         "heldout": c.held_out,
@@ -349,12 +359,4 @@ def calibration_report(
         "seconds": seconds,
     }
     what = f"{c.body.name} · {used} · {size} · baseline {1e3 * c.rig.baseline_m:.1f} mm"
-    return Report(
-        "calibrate",
-        "Calibration of two cameras",
-        what,
-        found.meaning,
-        sections,
-        values=values,
-        assessed=(found.grade, found.headline),
-    )
+    return Report("calibrate", "Calibration of two cameras", what, meaning, sections, values=values, assessed=graded)

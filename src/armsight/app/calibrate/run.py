@@ -76,9 +76,6 @@ class GivenDetections:
         if self._options.refine_body is not None:
             save_body_csv(calibration.body, self._options.refine_body)
 
-    def close(self) -> None:
-        """Close nothing."""
-
 
 def _open(spec: str, folder: Path, target: str) -> Source:
     """Open a folder or a recording; what cameras see is stored in a new folder first, so that it is there afterwards."""

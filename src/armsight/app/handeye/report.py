@@ -111,10 +111,8 @@ def _exchanged(run: HandEyeAnswer) -> str:
     held, still = (np.linalg.norm(T[:3, 3]) for T in (run.found.T_flange_held, run.found.T_base_still))
     if run.found.eye != "in_hand" or run.recording.seen.table is None or held < still:
         return ""
-    return (
-        f"the cameras are {held:.2f} m from the flange, the target only {still:.2f} m from the base: if that is not so, "
-        "--robot and --seen are exchanged"
-    )
+    far = f"the cameras are {held:.2f} m from the flange, the target only {still:.2f} m from the base"
+    return f"{far}: if that is not so, --robot and --seen are exchanged"
 
 
 def assess(run: HandEyeAnswer, why: list[str]) -> tuple[Grade, str]:

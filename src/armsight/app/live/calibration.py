@@ -405,9 +405,9 @@ class CalibrationStep(Guided[CalibrationState]):
         with self.lock:
             self._learned(result)
             self.show(rig=str(path), advice=tuple(advice(result)))
-        found, mm = assess(result), 1e3 * result.held_out.rigid_rms_m
-        text = f"{found.headline} {mm:.2g} mm RMS on held-out pairs; written to {path}"
-        self.say("good" if found.grade == "good" else "hint", text)
+        ((grade, headline), _), mm = assess(result), 1e3 * result.held_out.rigid_rms_m
+        text = f"{headline} {mm:.2g} mm RMS on held-out pairs; written to {path}"
+        self.say("good" if grade == "good" else "hint", text)
         self._changed(rig, path)
 
     def _command(self) -> str:
