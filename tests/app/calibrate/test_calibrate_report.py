@@ -235,7 +235,7 @@ def test_a_hundred_pairs_and_a_hundred_rejected_ones_still_make_a_page(calibrati
     page = page_of(tmp_path)
     assert all(f"bad{k:03d}" in page.text["result"] for k in range(100))
     assert page.text["result"].count("reason 13") == 1
-    assert f"Of 100 pairs the {MOST_BARS} with the largest rigid error are shown" in page.text["pairs"]
+    assert f"The {MOST_BARS} with the largest rigid error are shown" in page.text["pairs"]
     assert pairs_figure(many).get_figheight() < 2 + 0.2 * 4 / 3 * MOST_BARS
 
 

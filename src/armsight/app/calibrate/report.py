@@ -207,9 +207,7 @@ def _words(calibration: Calibration) -> dict[str, object]:
         "what": target(calibration),
         "sigma": np.sqrt(corner_variance_px2(calibration)),
         "deviation_mm": 1e3 * calibration.deviation_m,
-        "few": f" Of {pairs} pairs the {MOST_BARS} with the largest rigid error are shown."
-        if pairs > MOST_BARS
-        else "",
+        "few": f" The {MOST_BARS} with the largest rigid error are shown." if pairs > MOST_BARS else "",
     }
 
 
@@ -228,8 +226,7 @@ def _result(calibration: Calibration) -> str:
     rejected = f"<p>None: all {used} pairs were used.</p>\n"
     if calibration.rejected:
         rows = [(", ".join(map(text, pairs)), text(reason)) for reason, pairs in _rejected(calibration).items()]
-        counted = f"<p>{used} of {calibration.pairs_found} pairs were used.</p>\n"
-        rejected = counted + table(("pair", "reason"), rows, "prose")
+        rejected = f"<p>{used} of {calibration.pairs_found} were used.</p>\n{table(('pair', 'reason'), rows, 'prose')}"
     notes = bullets(calibration.notes)
     if len(calibration.notes) > _LISTED:
         notes = bullets(merged_notes(calibration.notes)) + folded(f"all {len(calibration.notes)}", notes)

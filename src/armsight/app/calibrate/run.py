@@ -48,6 +48,8 @@ _RECORDED_S = 60.0
 _SIM_CAMERAS, _SIM_SHOTS = "1280x720@60", 24
 
 Grey = NDArray[np.uint8]
+_Timed = tuple[Pair, float | None]
+_Sizes = tuple[tuple[int, int], tuple[int, int]]
 
 
 class GivenDetections:
@@ -145,9 +147,9 @@ class GivenImages:
         return (*stored, *(file for _, file in self._alone))
 
     def calibrated(self) -> Calibration:
-        """Detect the board in all images, and calibrate; where shots have times it may move, and the skew is found."""
+        """Detect the board in all images, and calibrate; Ctrl-C ends the detecting."""
         source, target = self._source, self._board
-        pairs, singles = list[tuple[Pair, float | None]](), list[Pair]()
+        pairs, singles = list[_Timed](), list[Pair]()
         sizes, unseen, total = None, _Unseen(target), None if source.count is None else source.count + len(self._alone)
         try:
             with bar("detecting the target", total) as advance:
@@ -176,16 +178,20 @@ class GivenImages:
         if sizes is None:
             why = [f"none of {len(pairs)} pairs can be read; {pair.name}: {pair.left.problem}" for pair, _ in pairs[:1]]
             raise InputError(*why or ["the recording has no shots"])
-        model = self._options.lens_model
-        how: Any = {"models": MODELS if model is None else (model,), "flat": self._options.flat_target}
-        how |= {"folds": self._options.folds, "singles": singles}
-        with steps() as progress, unseen.explained(source):
-            known = [(pair, t) for pair, t in pairs if t is not None]
+        with unseen.explained(source):
+            return self._fitted(pairs, sizes, singles)
+
+    def _fitted(self, pairs: list[_Timed], sizes: _Sizes, singles: list[Pair]) -> Calibration:
+        """Calibrate; where shots have times the board may move, and the skew is found."""
+        o, board, known = self._options, self._board, [(pair, t) for pair, t in pairs if t is not None]
+        how: Any = {"models": (o.lens_model,) if o.lens_model else MODELS, "flat": o.flat_target, "folds": o.folds}
+        with steps() as progress:
+            how |= {"singles": singles, "progress": progress}
             if not known:
-                return calibrate_boards(target, [pair for pair, _ in pairs], sizes, progress=progress, **how)
+                return calibrate_boards(board, [pair for pair, _ in pairs], sizes, **how)
             timed, t_s = zip(*known, strict=True)
-            found = calibrate_recording(target, timed, np.array(t_s), sizes, progress=progress, **how)
-            return replace(found, notes=(*notes_of(source), *found.notes))
+            found = calibrate_recording(board, timed, np.array(t_s), sizes, **how)
+            return replace(found, notes=(*notes_of(self._source), *found.notes))
 
     def save(self, calibration: Calibration) -> None:
         """Write the board as it was found."""
@@ -284,9 +290,7 @@ def _shots(source: Source) -> Iterator[tuple[Shot, tuple[Path | str, Path | str]
         yield next_one, (f"shot {next_one.name}", f"shot {next_one.name}")
 
 
-def _one_size(
-    sizes: tuple[tuple[int, int], ...] | None, images: tuple[Grey, Grey], files: tuple[Path | str, Path | str]
-) -> tuple[tuple[int, int], tuple[int, int]]:
+def _one_size(sizes: _Sizes | None, images: tuple[Grey, Grey], files: tuple[Path | str, Path | str]) -> _Sizes:
     """Return the sizes of a pair's images; an InputError if they differ from those before, or both images are one."""
     now = tuple((image.shape[1], image.shape[0]) for image in images)
     for side, path in enumerate(files):
