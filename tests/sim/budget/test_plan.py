@@ -142,11 +142,10 @@ def test_the_best_is_at_a_minimum_and_alternatives_are_grouped(monkeypatch):
     two = ("global-shutter-1mp", "machine-vision-2mp")
     monkeypatch.setattr(result, "catalogue", lambda: {name: catalogue()[name] for name in two})
     found = result.best(RigPlan.read("", volume="0.1x0.1x0.1m", distance="0.6m", speed="0m/s", body_scale=1.0))
-    assert [one.budget.plan.camera for one in found] == list(two)
-    assert [one.price for one in found] == [3, 5]
-    near = max(one.budget.mm for one in found) < result.PREDICTED * min(one.budget.mm for one in found)
+    assert [one.plan.camera for one in found] == list(two)
+    near = max(one.mm for one in found) < result.PREDICTED * min(one.mm for one in found)
     assert (found[0].group == found[1].group) == near
-    best = found[0].budget
+    best = found[0]
     for factor in (0.8, 1.25):  # beside the minimum of a search that ends where a step gains less than 1 %
         other = replace(best.plan, baseline=f"{factor * best.plan.baseline_m}m")
         assert result.RigBudget(other, planned(other)).mm > 0.98 * best.mm
@@ -208,6 +207,28 @@ def test_a_body_of_tags_or_a_board_has_a_budget(tmp_path):
         assert 0 < planned(plan).rms(planned(plan).cov())[0] < 1e-3
     with pytest.raises(InputError, match="boards of discs none"):
         planned(RigPlan(**given, body="circles:7x6:10mm:radius=3mm"))
+
+
+def test_a_camera_of_its_own_has_its_preset_aperture_and_readout(tmp_path):
+    (tmp_path / "mine.toml").write_text('preset = "webcam-good-light"\n[timing]\nreadout_ms = 9.0\n')
+    (tmp_path / "plan.toml").write_text('preset = "mine.toml"\nf_number = 8.0\n')  # beside the plan
+    own, usual = RigPlan.read(str(tmp_path / "plan.toml")), RigPlan()
+    assert own.timing["readout"] == pytest.approx(0.009)
+    assert RigPlan(readout_ms=5.0).timing["readout"] == pytest.approx(0.005)
+    assert own.defocus_px(0.5) == pytest.approx(usual.defocus_px(0.5) / 4)  # f/2
+    with pytest.raises(InputError, match="camera 'raw' is unknown; known are clean"):
+        RigPlan(preset="raw").check()
+    with pytest.raises(InputError, match=r"f_number is 0\.1: expected 0\.5 to 64"):
+        RigPlan(f_number=0.1).check()
+
+
+def test_what_is_not_reached_in_motion_is_reached_when_slower():
+    given = {"volume": "0.1x0.1x0.1m", "distance": "0.7m", "want": "0.6mm"}
+    found = armsight.budget(**given, speed="0.3m/s")
+    slower = armsight.budget(**given, speed=f"{found.slower_m_s}m/s")
+    assert 0 < found.slower_m_s < 0.3
+    assert slower.mm == pytest.approx(0.6, rel=0.02)
+    assert armsight.budget(**given, speed="0m/s").slower_m_s == 0.0
 
 
 def test_the_image_has_the_size_that_is_given():

@@ -11,6 +11,7 @@ import click
 
 from armsight.app.options import JSON, argument, declared, option, out
 from armsight.errors import InputError
+from armsight.files import as_input_error, check_folder
 
 if TYPE_CHECKING:
     from armsight.sim.budget.plan import RigPlan
@@ -46,7 +47,6 @@ def command(
     """
     from armsight.app.budget.report import REPORT_FILES, budget_report, to_build
     from armsight.app.progress import steps
-    from armsight.files import check_folder
     from armsight.sim.budget.plan import planned
     from armsight.sim.budget.result import RigBudget, best, chosen
 
@@ -75,17 +75,23 @@ def command(
 
 
 def _given(plan: Sequence[str], options: Mapping[str, str | None]) -> tuple[str, dict[str, Any]]:
-    """Return the path of the plan, "" without one, and what KEY=VALUE and options say."""
-    from armsight.sim.budget.plan import RigPlan
+    """Return the path of the plan, "" without one, and what KEY=VALUE and options say, each key once."""
+    from armsight.sim.budget.plan import KEYS
 
     settings = [each for each in plan if "=" in each and "/" not in each.partition("=")[0]]  # not runs/exp=3/plan.toml
     path, *more = [each for each in plan if each not in settings] or [""]
-    if keys := {each.name for each in RigPlan.settings()} & {path, *more}:
+    if keys := {*KEYS} & {path, *more}:
         raise InputError(f"{path} {' '.join(more)}: expected {min(keys)}=VALUE")
     if more:
         raise InputError(f"{more[0]}: {path} is the plan already: expected one PLAN.toml, and KEY=VALUE")
-    options_text = [f"{key}={value}" for key, value in options.items() if value is not None]
-    return path, dict.fromkeys(options) | RigPlan.of_text([*settings, *options_text])
+    found = dict[str, Any].fromkeys(options)
+    said = [(key, value) for key, value in options.items() if value is not None]
+    for key, value in (*(each.partition("=")[::2] for each in settings), *said):
+        if found.get(key) is not None:
+            raise InputError(f"{key}={value}: {key} is given twice; give it once")
+        with as_input_error(f"{key}={value}: expected a number", ValueError):
+            found[key] = value if KEYS.get(key, str) is str else float(value)
+    return path, found
 
 
 def _asked(path: str, run: str | None, given: dict[str, str | None]) -> RigPlan:

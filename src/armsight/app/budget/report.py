@@ -16,28 +16,26 @@ from armsight.app.show.page import PAGE
 from armsight.app.show.plotting import Figure, subplots
 from armsight.app.show.report import Fact, Grade, Plot, Report, Section, figure_files
 from armsight.app.show.table import TextTable
-from armsight.sim.budget.plan import PRICES, RigPlan
-from armsight.sim.budget.result import NOT_MODELLED, Alternative, RigBudget
+from armsight.sim.budget.plan import KEYS, PRICES, RigPlan, catalogue
+from armsight.sim.budget.result import AT_REST, NOT_MODELLED, RigBudget
 from armsight.sim.workcell.body import body_text
 from armsight.vision.calibrate.budget import Budget
 
 _SHOWN = 0.01  # share of lost shots that is shown; half: one in 200 is, double: one in 50 is not
-#: Why three cameras come out worse than two.
-THREE_WORSE = "three pairs are weighed by pixel noise alone: their common calibration counts twice"
 #: Names of all files that a report has.
 REPORT_FILES = (PAGE, "budget.json", "rig.json", "body.toml", "body.pdf", *figure_files("budget", ("volume",)))
 
 
-def budget_report(found: RigBudget, alternatives: Sequence[Alternative] = (), run: Path | None = None) -> Report:
+def budget_report(found: RigBudget, alternatives: Sequence[RigBudget] = (), run: Path | None = None) -> Report:
     """Return what a plan's budget says, the best one's beside its alternatives, that of a run beside what it measured."""
     plan, values = found.plan, found.to_dict()
     if alternatives:
         values["alternatives"] = [
-            {"group": one.group, "price": one.price, **_asked(one.budget.plan), **one.budget.moving._asdict()}
+            {"group": one.group, "price": one.plan.cameras.price, **_asked(one.plan), **one.moving._asdict()}
             for one in alternatives
         ]
     parts = [f"{name} {1e3 * values[f'{name}_rms_m']:.2g} mm" for name in ("precision", "trueness", "lateral", "depth")]
-    said = f"{', '.join(parts)} (RMS over the volume, in motion; lateral: one axis)"
+    shares = f"{', '.join(parts)} (RMS over the volume, in motion; lateral: one axis)"
     beside = []
     if run:
         from armsight.app.budget.run import against_run  # not above: a plan needs nothing of what reads runs
@@ -45,12 +43,10 @@ def budget_report(found: RigBudget, alternatives: Sequence[Alternative] = (), ru
         table, values["run"] = against_run(run, plan)
         beside.append(table)
     states = found.states
-    others = f"one camera at rest {states['one_camera']}; two {states['at_rest']}; three {states['three_cameras']}"
-    levels = [each.level_m for each in (states["one_camera"], found.at_rest, states["three_cameras"])]
-    if levels[1] > levels[0]:
+    others = f"one camera at rest {states['one_camera']}; two {states['at_rest']}; "
+    others += f"three, the mean of their pairs, {states['three_cameras']}"
+    if found.at_rest.level_m > states["one_camera"].level_m:
         others += "; two take the distance from the size of the calibration's board, one from that of the body"
-    if levels[2] > levels[1]:
-        others += f"; {THREE_WORSE}"
     rows = tuple(
         (each.cause, f"{1e3 * each.rms_m:.2g}", f"{math.degrees(each.rms_rad):.2g}")
         + (("loop", "") if each.loop else (f"{100 * each.share:.0f} %", f"{1e3 * each.halved_level_m:.2g} mm"))
@@ -64,22 +60,22 @@ def budget_report(found: RigBudget, alternatives: Sequence[Alternative] = (), ru
     )
     caption, title = "95 % of the errors in motion are within, mm.", "Error at 95 % over the volume, seen from above"
     sections: dict[str, Section] = {
-        "result": ("Result", [Fact(said), Fact(others), table, more, *_compared(alternatives), *beside]),
+        "result": ("Result", [Fact(shares), Fact(others), table, more, *_compared(alternatives), *beside]),
         "map": ("Over the volume", [Plot("volume", partial(_map, found.found), caption, title)]),
         "missing": ("Not in the budget", [Fact(f"not in the budget: {why}") for why in NOT_MODELLED]),
     }
-    notes = [Note("note", f"chosen: {_chosen(plan)}")]
-    cameras = f"{plan.cameras.text}; {plan.baseline} apart"
+    notes, cameras = [f"chosen: {_chosen(plan)}"], f"{plan.cameras.text}; {plan.baseline} apart"
     if plan.rig:
         cameras = f"{plan.rig}: {{}}x{{}} px, {1e3 * plan.baseline_m:.4g} mm apart".format(*plan.image_size_px)
-        if "camera" not in plan.named:
+        if not {"camera", "preset"} & {*plan.named}:
             text = f"noise and exposure of the rig's cameras are not known, those of {plan.camera} are taken: give --camera"
-            notes.insert(0, Note("note", text))
+            notes.insert(0, text)
         if chosen := [f"{key} {getattr(plan, key)}" for key in ("volume", "distance") if key not in plan.named]:
             text = f"{', '.join(chosen)}: chosen, as the rig file does not say where it measures: give --volume, --distance"
-            notes.insert(0, Note("note", text))
+            notes.insert(0, text)
     headline = f"{cameras}, volume {plan.volume} at {plan.distance}"
-    return Report("budget", "Before you buy", plan.volume, headline, sections, notes, values, "budget", _answer(found))
+    said, title = [Note("note", text) for text in notes], "Before you buy"
+    return Report("budget", title, plan.volume, headline, sections, said, values, "budget", _answer(found))
 
 
 def to_build(found: RigBudget) -> dict[str, str]:
@@ -104,21 +100,20 @@ def _asked(plan: RigPlan) -> dict[str, Any]:
     }
 
 
-def _compared(alternatives: Sequence[Alternative]) -> list[TextTable]:
+def _compared(alternatives: Sequence[RigBudget]) -> list[TextTable]:
     """Return the tables of alternatives; those of one group differ by less than the prediction is off."""
-    reached, build, asked = list[tuple[str, ...]](), list[tuple[str, ...]](), dict[str, Any]()
-    for one in alternatives:
-        move, asked = one.budget.moving, _asked(one.budget.plan)
-        name, lens = asked.pop("camera"), f"{asked.pop('focal_widths')} ({asked.pop('focal_mm')} mm)"
-        at = (f"{move.mm:.2g}", f"{move.deg:.2g}", f"{100 * move.lost_share:.0f} %")
-        reached.append((name, str(one.price), "ABCDEFGHIJ"[one.group], *at))
-        build.append((name, lens, *map(str, asked.values())))
+    if not alternatives:
+        return []
     title = "the best of each class, 95 % in motion; those of one group differ by less than predictions are off"
-    tables = (
+    reached = []
+    for one in alternatives:
+        at = f"{one.mm:.2g}", f"{one.deg:.2g}", f"{100 * one.moving.lost_share:.0f} %"
+        reached.append((one.plan.camera, str(one.plan.cameras.price), chr(ord("A") + one.group), *at))
+    build = [_asked(one.plan) for one in alternatives]
+    return [
         TextTable(title, ("camera", "price class", "group", "mm", "deg", "lost"), tuple(reached)),
-        TextTable("what to build for it", ("camera", "focal_widths", *asked), tuple(build)),
-    )
-    return list(tables) if alternatives else []
+        TextTable("what to build for it", tuple(build[0]), tuple(tuple(map(str, each.values())) for each in build)),
+    ]
 
 
 def _answer(found: RigBudget) -> tuple[Grade, str]:
@@ -130,8 +125,11 @@ def _answer(found: RigBudget) -> tuple[Grade, str]:
         said += f"; {lost}: their two images differ by more than the search allows"
     if loop := found.states.get("closed_loop_at_rest"):
         said += f"; the loop brings the arm to {loop.mm:.2g} mm at rest"
-    first = found.causes[0].cause
-    costs = f" {first.capitalize()} costs {1e3 * found.worst_m(first):.2g} mm"
+    costs = f" {(first := found.causes[0].cause).capitalize()} costs {1e3 * found.worst_m(first):.2g} mm"
+    ways = [one for one in found.changes if one.change != AT_REST and one.change.split(":")[0] not in catalogue()]
+    to_do = [min(ways, key=lambda one: one.level_m).change] if ways else []
+    to_do += [f"measure slower than {found.slower_m_s:.2g} m/s"] if found.slower_m_s else []
+    costs += f": {', or '.join(to_do)}" if to_do else ""
     if requested is None:
         return "fair", f"{said}.{costs}."
     asked = f"{1e3 * requested[0]:g} mm" + (f", {math.degrees(requested[1]):g} deg" if requested[1] else "")
@@ -142,16 +140,16 @@ def _answer(found: RigBudget) -> tuple[Grade, str]:
 
 def _chosen(plan: RigPlan) -> str:
     """Say what was left out."""
-    left = [each.name for each in plan.settings() if each.name not in (*plan.named, *plan.of_rig)]
     shown = {
         "focal_widths": f"{plan.focal_px / plan.image_size_px[0]:.2f} ({plan.focal_mm:.2g} mm)",
         "verging_deg": f"{plan.stereo_rig.convergence_deg:.0f}",
         "rate_hz": f"{plan.timing['rate']:g}",
-        **{f"{name}_ms": f"{1e3 * plan.timing[name]:.2g}" for name in ("skew", "start", "exposure")},
+        **{f"{name}_ms": f"{1e3 * plan.timing[name]:.2g}" for name in ("skew", "start", "readout", "exposure")},
+        **{name: getattr(plan.cameras, name) for name in ("preset", "f_number")},
         "body": "tool_body",
     }
-    said = {name: shown.get(name, getattr(plan, name)) for name in left}
-    return ", ".join(f"{name} {value}" for name, value in said.items() if value != "")
+    said = ((key, shown.get(key, getattr(plan, key))) for key in KEYS if key not in (*plan.named, *plan.of_rig))
+    return ", ".join(f"{key} {value}" for key, value in said if value != "")
 
 
 def _map(found: Budget) -> Figure:

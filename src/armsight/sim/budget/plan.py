@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import difflib
 import math
-import os
 import re
 from collections.abc import Iterable
-from dataclasses import Field, dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cache, cached_property, lru_cache
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,7 @@ import numpy as np
 
 from armsight.data import Array, Ids
 from armsight.errors import InputError
-from armsight.files import as_input_error, read_toml
+from armsight.files import read_toml
 from armsight.geometry.pose import inverse, pose
 from armsight.geometry.rotation import exp_so3
 from armsight.sim.budget.chart import marker_noise
@@ -68,13 +67,15 @@ _ANGLES = {"deg": math.pi / 180, "\N{DEGREE SIGN}": math.pi / 180, "arcmin": mat
 _NUMBER = r"((?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:e-?[0-9]+)?)"
 #: What a rig that there is says itself; and, where it says when its rows are exposed.
 _OF_RIG = ("image", "baseline", "verging_deg", "focal_widths", "board", "pairs", "board_bent")
-_OF_SHUTTERS = ("skew_ms", "start_ms")
+_OF_SHUTTERS = ("skew_ms", "start_ms", "readout_ms")
+_OF_DEFAULT = ("body_scale", "body_depth")  # of the default body alone
 #: Key -> least and most that a plan may say.
 _RANGES = {
     "verging_deg": (0.0, 120.0), "focal_widths": (0.2, 20.0), "body_scale": (0.05, 20.0), "body_depth": (0.0, 2.0),
     "pairs": (3, 1000),
     "board_print": (0.0, 0.1), "body_size": (0.0, 0.1), "warming_k": (0.0, 100.0), "mount_um_per_k": (0.0, 1000.0),
     "lens_ppm_per_k": (0.0, 10000.0), "skew_ms": (0.0, 1000.0), "start_ms": (0.0, 1000.0), "exposure_ms": (0.001, 1000.0),
+    "readout_ms": (0.0, 1000.0), "f_number": (0.5, 64.0),
     "rate_hz": (0.1, 1000.0), "backlash_deg": (0.0, 10.0),
 }  # fmt: skip
 
@@ -117,13 +118,8 @@ def length_m(text: str, what: str) -> float:
     return _amounts(what, text, "a length with its unit, such as 0.8m or 300mm", most=1)[0]
 
 
-def _amounts(
-    what: str, text: str, form: str, per: str = "", most: int = 2, *, errors: bool = False
-) -> tuple[float, float]:
-    """Read a length, m, and an angle, rad, in either order, each ``per`` that unit; an angle that is left out is 0.
-
-    ``errors``: those that are to be reached, none of which is 0.
-    """
+def _amounts(what: str, text: str, form: str, per: str = "", most: int = 2) -> tuple[float, float]:
+    """Read a length, m, and an angle, rad, in either order, each ``per`` that unit; an angle that is left out is 0."""
     parts, units = [part.strip() for part in text.split(",")], _UNITS | _ANGLES
     found = [re.fullmatch(rf"{_NUMBER}\s*({'|'.join(units)}){per}", part) for part in parts]
     values = {each[2] in _ANGLES: float(each[1]) * units[each[2]] for each in found if each}
@@ -131,9 +127,15 @@ def _amounts(
         comma = "; decimals have a point, not a comma" if any(map(str.isdecimal, parts)) and len(parts) > 1 else ""
         alone = "; an angle alone has no length: give one, too" if set(values) == {True} == {*map(bool, found)} else ""
         raise InputError(f"{what} {text!r}: expected {form}{comma}{alone}")
-    if errors and not all(values.values()):
+    if what == "want" and not all(values.values()):
         raise InputError(f"{what} {text!r}: no rig measures without error: expected {form}")
     return values[False], values.get(True, 0.0)
+
+
+def meant(name: str, known: Iterable[str]) -> str:
+    """Return the known name that is spelt alike as a question, "" without one."""
+    near = difflib.get_close_matches(name, list(known), 1)
+    return f": did you mean {near[0]}?" if near else ""
 
 
 def is_board(body: str) -> bool:
@@ -147,12 +149,6 @@ def up(value: float) -> str:
     return f"{math.ceil(value / unit - 1e-9) * unit:.2g}"
 
 
-def _plain(value: object) -> object:
-    """Return a path as text, and a number of NumPy as one of Python."""
-    value = os.fspath(value) if isinstance(value, os.PathLike) else value
-    return value.item() if isinstance(value, np.generic) else value
-
-
 @dataclass(frozen=True)
 class RigPlan:
     """A rig that is not built yet, and what it is to measure. Lengths m, angles and shares as the names say."""
@@ -162,7 +158,9 @@ class RigPlan:
     speed: str = "0.3m/s"  #: of the body, and its rate of rotation: 0.3m/s or 0.3m/s,20deg/s.
     want: str = ""  #: what 95 % of the errors are to be within: 0.1mm or 0.1mm,0.05deg; empty: nothing is asked.
     camera: str = "webcam-720p"  #: a class of the catalogue.
+    preset: str = ""  #: its noise and shutter: a preset of the camera model or a file of one; by default the class's.
     image: str = ""  #: width x height, px; by default the class's.
+    f_number: float = 0.0  #: aperture; by default the class's.
     rig: str = ""  #: a rig file, for a rig that there is: its lenses, baseline, calibration and, where known, shutters.
     baseline: str = "200mm"  #: between the cameras.
     verging_deg: float = -1.0  #: angle between their axes; by default both look at the middle of the volume.
@@ -183,6 +181,7 @@ class RigPlan:
     lens_ppm_per_k: float = 20.0  #: of the focal length.
     skew_ms: float = -1.0  #: by how much the right exposures are later, uncorrected; by default the preset's.
     start_ms: float = -1.0  #: how far the two exposures begin apart by chance; by default the preset's.
+    readout_ms: float = -1.0  #: from the first row to the last, uncorrected; by default the preset's.
     exposure_ms: float = -1.0  #: by default the preset's.
     rate_hz: float = -1.0  #: by default the preset's.
     arm: str = ""  #: for the closed loop; empty: none.
@@ -197,39 +196,22 @@ class RigPlan:
         Raises:
             InputError: an unknown key, or a value of another type; the message names it.
         """
-        known = {each.name: type(each.default) for each in RigPlan.settings()}
         values = read_toml(path) if path else {}
-        for key in {"rig", "body"} & values.keys():
-            if isinstance(values[key], str) and not is_board(values[key]):
+        for key in {"rig", "body", "preset"} & values.keys():
+            if str(values[key]).endswith(".toml" if key == "preset" else "") and not is_board(str(values[key])):
                 values[key] = str(Path(path).parent / values[key])
-        given = values | {key: _plain(value) for key, value in given.items() if value is not None}
+        given = values | {key: value for key, value in given.items() if value is not None}
         for key, value in given.items():
-            of = f"{path}: " if key in values else ""
-            if key not in known:
-                near = difflib.get_close_matches(key, known, 1)
-                raise InputError(f"{of}unknown key {key!r}{f': did you mean {near[0]}?' if near else ''}")
-            if known[key] is int and isinstance(value, float) and value.is_integer():
-                given[key] = value = int(value)
-            if not isinstance(value, (int, float) if known[key] is float else known[key]) or isinstance(value, bool):
-                kind = {str: "a text", int: "a whole number", float: "a number"}[known[key]]
-                raise InputError(f"{of}{key} must be {kind}, got {value!r}")
+            of, kind = f"{path}: " if key in values else "", KEYS.get(key)
+            if kind is None:
+                raise InputError(f"{of}unknown key {key!r}{meant(key, KEYS)}")
+            value = str(value) if isinstance(value, Path) else value.item() if isinstance(value, np.generic) else value
+            given[key] = value = (
+                int(value) if kind is int and isinstance(value, float) and value.is_integer() else value
+            )
+            if not isinstance(value, (int, float) if kind is float else kind) or isinstance(value, bool):
+                raise InputError(f"{of}{key} must be {_KINDS[kind]}, got {value!r}")
         return RigPlan(**given, named=tuple(given))
-
-    @staticmethod
-    def of_text(pairs: Iterable[str]) -> dict[str, Any]:
-        """Return what KEY=VALUE say, each key once, a number where the key has one."""
-        kinds, found = {each.name: type(each.default) for each in RigPlan.settings()}, dict[str, Any]()
-        for key, _, value in (pair.partition("=") for pair in pairs):
-            if key in found:
-                raise InputError(f"{key}={value}: {key} is given twice; give it once")
-            with as_input_error(f"{key}={value}: expected a number", ValueError):
-                found[key] = value if kinds.get(key, str) is str else float(value)
-        return found
-
-    @staticmethod
-    def settings() -> tuple[Field[Any], ...]:
-        """Return what a plan may say."""
-        return tuple(each for each in fields(RigPlan) if each.name != "named")
 
     @cached_property
     def size_m(self) -> Array:
@@ -237,9 +219,8 @@ class RigPlan:
         sides = [side.strip() for side in re.split("[xX]", self.volume)]
         unit = sides[-1].lstrip("0123456789.e- ")  # of the sides that have none
         if len(sides) != 3:
-            raise InputError(
-                f"volume {self.volume!r}: expected width x height x depth with a unit, such as 0.4x0.4x0.3m"
-            )
+            form = "width x height x depth with a unit, such as 0.4x0.4x0.3m"
+            raise InputError(f"volume {self.volume!r}: expected {form}")
         each = (side if side[-1:].isalpha() else side + unit for side in sides)
         size = np.array([length_m(side, f"volume {self.volume!r}: side") for side in each])
         for wrong, text in (
@@ -272,19 +253,15 @@ class RigPlan:
     @cached_property
     def of_rig(self) -> tuple[str, ...]:
         """Keys whose values the rig that there is has itself."""
-        if self.existing is None:
-            return ()
-        return _OF_RIG + (_OF_SHUTTERS if self.existing.shutters else ())
+        return _OF_RIG * bool(self.existing) + _OF_SHUTTERS * bool(self.existing and self.existing.shutters)
 
     @cached_property
     def image_size_px(self) -> tuple[int, int]:
         """Width and height."""
         if self.existing:
             return self.existing.left.image_size_px
-        found = re.fullmatch(
-            r"([1-9]\d{2,4})\s*x\s*([1-9]\d{2,4})", self.image.strip() or "{}x{}".format(*self.cameras.image_size_px)
-        )
-        if found is None:
+        given = self.image.strip() or "{}x{}".format(*self.cameras.image_size_px)
+        if not (found := re.fullmatch(r"([1-9]\d{2,4})\s*x\s*([1-9]\d{2,4})", given)):
             raise InputError(f"image {self.image!r}: expected width x height in pixels, such as 1280x720")
         return int(found[1]), int(found[2])
 
@@ -294,10 +271,8 @@ class RigPlan:
         if self.existing:
             return self.existing.baseline_m
         if (found := self._reach_m("baseline")) < _LEAST_APART_M:
-            raise InputError(
-                f"baseline {self.baseline}: two cameras cannot stand {1e3 * found:g} mm apart: at least "
-                f"{1e3 * _LEAST_APART_M:g} mm"
-            )
+            least = f"at least {1e3 * _LEAST_APART_M:g} mm"
+            raise InputError(f"baseline {self.baseline}: two cameras cannot stand {1e3 * found:g} mm apart: {least}")
         return found
 
     @cached_property
@@ -316,17 +291,14 @@ class RigPlan:
     @cached_property
     def requested(self) -> tuple[float, float] | None:
         """Metres and rad, 0 where it is not asked; None where nothing is."""
-        return _amounts("want", self.want, "0.1mm or 0.1mm,0.05deg", errors=True) if self.want else None
+        return _amounts("want", self.want, "0.1mm or 0.1mm,0.05deg") if self.want else None
 
     @cached_property
     def cameras(self) -> CameraClass:
         """The class."""
         if self.camera not in catalogue():
-            near = difflib.get_close_matches(self.camera, catalogue(), 1)
-            meant = f" (did you mean {near[0]}?)" if near else ""
-            raise InputError(
-                f"camera {self.camera!r} is not in the catalogue{meant}; known are {', '.join(catalogue())}"
-            )
+            known = f"{', '.join(catalogue())}{meant(self.camera, catalogue())}"
+            raise InputError(f"camera {self.camera!r} is not in the catalogue; known are {known}")
         return catalogue()[self.camera]
 
     @cached_property
@@ -347,21 +319,22 @@ class RigPlan:
     @cached_property
     def pipeline(self) -> CameraPipeline:
         """The camera's stages, its exposure as planned."""
-        found = CameraPipeline.load(self.cameras.preset)
+        found = CameraPipeline.load(self.preset or self.cameras.preset)
         return found if self.exposure_ms < 0 else found.exposed_for(1e-3 * self.exposure_ms)
 
     @cached_property
     def timing(self) -> dict[str, float]:
         """exposure, readout, skew, start, stamp, s; rate, Hz."""
-        t, known = self.pipeline.timing, self.existing.shutters if self.existing else None
+        t, known = self.pipeline.timing, self.existing and self.existing.shutters
         assert t is not None
         ms = {"exposure": t.exposure_ms, "readout": t.readout_ms, "skew": t.skew_ms,
               "start": t.sync_ms / math.sqrt(3.0), "stamp": t.jitter_ms}  # fmt: skip
-        ms |= {name: given for name, given in (("skew", self.skew_ms), ("start", self.start_ms)) if given >= 0}
+        asked = {"skew": self.skew_ms, "start": self.start_ms, "readout": self.readout_ms}
+        ms |= {name: given for name, given in asked.items() if given >= 0}
         if known:  # what was measured is corrected: its uncertainty remains
-            ms |= dict(zip(("skew", "readout"), 1e3 * known.sigmas, strict=True)) | {"start": 1e3 * known.jitter_s}
+            ms |= dict(zip(("skew", "readout", "start"), 1e3 * np.append(known.sigmas, known.jitter_s), strict=True))
         rate = min(t.rate_hz, self._most_hz) if self.rate_hz < 0 else self.rate_hz
-        return {name: 1e-3 * value for name, value in ms.items()} | {"rate": rate}
+        return {name: 1e-3 * float(value) for name, value in ms.items()} | {"rate": rate}
 
     @property
     def _most_hz(self) -> float:
@@ -375,9 +348,8 @@ class RigPlan:
         if is_board(self.body):
             board = MountedBoard("board", open_board(self.body), np.eye(4), np.array([0.0, 0.0, -1.0]))
             return Composite(self.body, (BoardTarget(self.body, (board,)),))
-        if self.body:
-            return read_layout(self.body)
-        return Composite("tool_body", (), body_target(self.body_scale, self.body_depth).discs)
+        of_demo = body_target(self.body_scale, self.body_depth).discs
+        return read_layout(self.body) if self.body else Composite("tool_body", (), of_demo)
 
     @cached_property
     def stereo_rig(self) -> StereoRig:
@@ -402,14 +374,15 @@ class RigPlan:
 
     def marker(self, distance_m: float) -> tuple[str, float]:
         """Return the kind of the body's markers and their least size in the image at a distance, px."""
-        per_m, layout = self.focal_px / distance_m, self.layout
+        layout = self.layout
         if layout.discs is not None:
-            return "disc", 2 * float(layout.discs.radii_m.mean()) * per_m
-        if layout.tags is not None:
-            return "tag", min(tag.size_m for tag in layout.tags.tags) * per_m
-        assert layout.boards is not None
-        kind, size_m = min((_smallest(each.board) for each in layout.boards.boards), key=lambda each: each[1])
-        return kind, size_m * per_m
+            kind, size_m = "disc", 2 * float(layout.discs.radii_m.mean())
+        elif layout.tags is not None:
+            kind, size_m = "tag", min(tag.size_m for tag in layout.tags.tags)
+        else:
+            assert layout.boards is not None
+            kind, size_m = min((_smallest(each.board) for each in layout.boards.boards), key=lambda each: each[1])
+        return kind, size_m * self.focal_px / distance_m
 
     @cached_property
     def marker_of(self) -> Ids:
@@ -427,22 +400,8 @@ class RigPlan:
 
     def defocus_px(self, distance_m: float) -> float:
         """Return the radius of the blur away from the lens's focus, px: aperture times the difference of dioptres."""
-        c = self.cameras
-        focus = c.focus_m or self.distance_m
-        aperture_m = 1e-3 * c.focal_mm / c.f_number
-        return 0.5 * aperture_m * self.focal_px * abs(1 / focus - 1 / distance_m)
-
-    def _check_numbers(self) -> None:
-        """Refuse numbers that no rig has."""
-        for key, (least, most) in _RANGES.items():
-            value = getattr(self, key)
-            if value != getattr(RigPlan, key) and not least <= value <= most:
-                raise InputError(f"{key} is {value}: expected {least:g} to {most:g}")
-        if own := [key for key in self.named if key in self.of_rig]:
-            raise InputError(f"{self.rig} has its own {', '.join(own)}: leave out what it says itself")
-        for key in ("body_scale", "body_depth") if self.body else ():
-            if getattr(self, key) != 1.0:
-                raise InputError(f"{key} is {getattr(self, key):g}: it is of the default body, not of {self.body}")
+        c, focus = self.cameras, self.cameras.focus_m or self.distance_m
+        return 5e-4 * c.focal_mm / (self.f_number or c.f_number) * self.focal_px * abs(1 / focus - 1 / distance_m)
 
     def check(self) -> None:
         """Refuse what cannot be built.
@@ -450,7 +409,14 @@ class RigPlan:
         Raises:
             InputError: one line: what was found, what was expected, and the nearest that can be had.
         """
-        self._check_numbers()
+        for key, (least, most) in _RANGES.items():
+            value = getattr(self, key)
+            if value != getattr(RigPlan, key) and not least <= value <= most:
+                raise InputError(f"{key} is {value}: expected {least:g} to {most:g}")
+            if key in _OF_DEFAULT and self.body and value != 1.0:
+                raise InputError(f"{key} is {value:g}: it is of the default body, not of {self.body}")
+        if own := [key for key in self.named if key in self.of_rig]:
+            raise InputError(f"{self.rig} has its own {', '.join(own)}: leave out what it says itself")
         c, size, t, _, _, _ = self.cameras, self.size_m, self.timing, self.speeds, self.requested, self.handeye_errors
         near, far = self.distance_m - size[2] / 2, self.distance_m + size[2] / 2
         (width, height), body = self.image_size_px, np.ptp(self.layout.body.points, axis=0).max()
@@ -506,16 +472,21 @@ class RigPlan:
     def conditions(self) -> Conditions:
         """Return what is not known."""
         t, (speed, rotation) = self.timing, self.speeds
-        arm = (0.0, 0.0)
+        arm, handeye = (0.0, 0.0), (0.0, 0.0)
         if self.arm:
             from armsight.robot.arm_file import open_arm  # not above: only the loop needs it
 
-            model, sigma = open_arm(self.arm), math.radians(self.backlash_deg)
-            J = model.jacobian(model.home)
-            arm = tuple(sigma * float(np.sqrt((part**2).sum() / 3)) for part in (J[:3], J[3:]))  # type: ignore[assignment]
+            model, handeye = open_arm(self.arm), self.handeye_errors
+            square = math.radians(self.backlash_deg) ** 2 / 3 * (model.jacobian(model.home) ** 2).sum(axis=1)
+            arm = math.sqrt(square[:3].sum()), math.sqrt(square[3:].sum())
         bent = length_m(self.body_print, "body_print"), length_m(self.body_bent, "body_bent")
         mount, lens = (1e-6 * each * self.warming_k for each in (self.mount_um_per_k, self.lens_ppm_per_k))
-        noise, cov, gate = self._noise_px(), self._cov_calibration(), Gates()
+        noise, gate, cov = self._noise_px(), Gates(), self.existing.cov if self.existing else np.zeros((0, 0))
+        if not self.existing:
+            keys = ("camera", "preset", "image", "baseline", "board", "pairs", "board_bent")
+            kept = {key: getattr(self, key) for key in keys}
+            widths, angle = self.focal_px / self.image_size_px[0], self.stereo_rig.convergence_deg
+            cov = _calibrated(RigPlan(focal_widths=widths, verging_deg=angle, **kept))
         if self.apart:  # as `run` and `live` search
             loose, moved_m = replace(self.stereo_rig, cov=cov, sigma_px=LOOSE_PX), math.hypot(t["skew"], t["start"])
             moved_m *= speed / math.sqrt(3)
@@ -523,16 +494,13 @@ class RigPlan:
         return Conditions(
             noise, cov, self.board_print, self.marker_of, bent, self.body_size, mount, lens,
             t["skew"], t["start"], t["readout"], t["stamp"], speed, rotation, gate,
-            self.handeye_errors if self.arm else (0.0, 0.0), arm,
+            handeye, arm,
         )  # fmt: skip
 
-    def _cov_calibration(self) -> Array:
-        """Return the covariance (P, P) of the rig's parameters."""
-        if self.existing:
-            return self.existing.cov
-        kept = {key: getattr(self, key) for key in ("camera", "image", "baseline", "board", "pairs", "board_bent")}
-        lens, angle = self.focal_px / self.image_size_px[0], self.stereo_rig.convergence_deg
-        return _calibrated(RigPlan(focal_widths=lens, verging_deg=angle, **kept))
+
+#: Key -> its type: what a plan may say; and types in words.
+KEYS: dict[str, Any] = {each.name: type(each.default) for each in fields(RigPlan) if each.name != "named"}
+_KINDS = {str: "a text", int: "a whole number", float: "a number"}
 
 
 def _smallest(board: CalibrationBoard) -> tuple[str, float]:
@@ -540,9 +508,8 @@ def _smallest(board: CalibrationBoard) -> tuple[str, float]:
     if isinstance(board, AprilGrid):
         return "tag", board.tag_m
     if not isinstance(board, (Chessboard, Charuco)):
-        raise InputError(
-            f"{board.body.name}: chessboards, ChArUco boards and aprilgrids have a budget, boards of discs none"
-        )
+        have = "chessboards, ChArUco boards and aprilgrids have a budget, boards of discs none"
+        raise InputError(f"{board.body.name}: {have}")
     return "square", board.square_m
 
 

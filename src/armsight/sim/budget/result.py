@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, reduce
 from itertools import combinations, product
 from typing import Any, NamedTuple
 
-from armsight.data import Array, Record
+from scipy.optimize import brentq
+
+from armsight.data import Record
 from armsight.errors import InputError
-from armsight.sim.budget.plan import RigPlan, catalogue, planned, up
+from armsight.sim.budget.plan import KEYS, RigPlan, catalogue, planned, up
 from armsight.vision.calibrate.budget import CAUSES, LEVEL, Budget
 
 #: A change that gains less than this share is not worth a line; half: lines that nobody buys, double: cheap gains lack.
@@ -19,19 +21,18 @@ WORTH = 0.1
 #: Share of shots in motion that may be lost at the worst position: beyond it 95 % of the shots are within nothing; half:
 #: longer exposures and skews count as not reached, double: an answer holds for fewer shots than it says.
 MOST_LOST = 1 - LEVEL
+AT_REST = "measure at rest"
+_MEASURED = {"body_print": "0.01mm", "body_bent": "0.02mm", "body_size": 1e-4}
 #: What would make it better -> class of its price, 0 for nothing, and what of a plan it changes.
 CHANGES: dict[str, tuple[int, Callable[[RigPlan], dict[str, object]]]] = {
     "start both cameras by one trigger": (2, lambda plan: {"skew_ms": 0.0, "start_ms": 0.05}),
-    "measure at rest": (0, lambda plan: {"speed": "0m/s"}),
+    AT_REST: (0, lambda plan: {"speed": "0m/s"}),
     "twice as many pairs of the board": (0, lambda plan: {"pairs": 2 * plan.pairs}),
     "cameras 1.5 times as far apart": (0, lambda plan: {"baseline": f"{1.5e3 * plan.baseline_m:g}mm"}),
     "a body half as large again": (1, lambda plan: {} if plan.body else {"body_scale": 1.5 * plan.body_scale}),
     "half the exposure, twice the light": (1, lambda plan: {"exposure_ms": 0.5e3 * plan.timing["exposure"]}),
     "a board printed on a stiff plate, its size measured": (1, lambda _: {"board_print": 1e-4, "board_bent": "0.03mm"}),
-    "the body's markers measured after printing": (
-        0,
-        lambda _: {"body_print": "0.01mm", "body_bent": "0.02mm", "body_size": 1e-4},
-    ),
+    "the body's markers measured after printing": (0, lambda _: dict(_MEASURED)),
     "calibrate again when the room is 1 K warmer": (0, lambda _: {"warming_k": 1.0}),
 }
 #: What another class of cameras brings along.
@@ -66,15 +67,11 @@ class Accuracy(NamedTuple):
     lost_share: float = 0.0
 
     @staticmethod
-    def of(found: Budget, cov: Array, lost: float = 0.0) -> Accuracy:
-        """Return that of covariances (G, 6, 6)."""
+    def of(found: Budget, *, moving: bool = False, loop: bool = False) -> Accuracy:
+        """Return that of a budget, by default at rest; in motion of the shots that are not lost."""
+        cov, lost = found.cov(moving=moving, loop=loop), float(found.lost.max()) if moving else 0.0
         far, rotated = found.at_level(cov)
         return Accuracy(*found.rms(cov), float(far.max()), float(rotated.max()), lost)
-
-    @staticmethod
-    def moving(found: Budget) -> Accuracy:
-        """Return that in motion, of the shots that are not lost."""
-        return Accuracy.of(found, found.cov(), float(found.lost.max()))
 
     def over(self, m: float = 1.0, rad: float = 0.0) -> float:
         """Return the levels over what is requested; more than 1, and rising, where more shots are lost than may be."""
@@ -124,6 +121,7 @@ class RigBudget(Record):
 
     plan: RigPlan
     found: Budget  #: the covariances by cause and position, m and rad.
+    group: int = 0  #: of alternatives: those of one differ by less than what the prediction is off.
 
     def __repr__(self) -> str:
         """Return the answer in one line."""
@@ -132,21 +130,20 @@ class RigBudget(Record):
     @cached_property
     def moving(self) -> Accuracy:
         """In motion."""
-        return Accuracy.moving(self.found)
+        return Accuracy.of(self.found, moving=True)
 
     @cached_property
     def at_rest(self) -> Accuracy:
         """At rest."""
-        return Accuracy.of(self.found, self.found.cov(moving=False))
+        return Accuracy.of(self.found)
 
     @cached_property
     def states(self) -> dict[str, Accuracy]:
         """moving, at_rest; closed_loop_at_rest where there is an arm; one_camera and three_cameras, at rest."""
-        found = {"moving": self.moving, "at_rest": self.at_rest}
-        if self.plan.arm:
-            found["closed_loop_at_rest"] = Accuracy.of(self.found, self.found.cov(moving=False, loop=True))
-        others = {"one_camera": planned(self.plan, cameras=1), "three_cameras": planned(self.plan, cameras=3)}
-        return found | {name: Accuracy.of(each, each.cov(moving=False)) for name, each in others.items()}
+        loop = {"closed_loop_at_rest": Accuracy.of(self.found, loop=True)} if self.plan.arm else {}
+        others = (("one_camera", 1), ("three_cameras", 3))
+        found = {name: Accuracy.of(planned(self.plan, cameras)) for name, cameras in others}
+        return {"moving": self.moving, "at_rest": self.at_rest} | loop | found
 
     @property
     def mm(self) -> float:
@@ -161,11 +158,10 @@ class RigBudget(Record):
     @cached_property
     def causes(self) -> tuple[Cause, ...]:
         """The causes, the costliest first."""
-        total, rows = self.moving.rms_m**2, []
-        for name in self.found.factors:
-            m, rad = self.found.rms(self.found.cov(of=name, loop=True))
-            kind = CAUSES[name]
-            halved = float(self.found.at_level(self.found.cov(scaled=name, by=0.5))[0].max())
+        found, total, rows = self.found, self.moving.rms_m**2, []
+        for name in found.factors:
+            (m, rad), kind = found.rms(found.cov(of=name, loop=True)), CAUSES[name]
+            halved = float(found.at_level(found.cov(scaled=name, by=0.5))[0].max())
             share = 0.0 if kind.loop else m**2 / total
             rows.append(Cause(name, m, rad, share, halved, kind.moving, kind.common, kind.loop))
         return tuple(sorted(rows, key=lambda row: (-row.share, -row.rms_m)))
@@ -177,11 +173,8 @@ class RigBudget(Record):
     def check(self) -> None:
         """Raise an InputError where the print of the body alone costs more than what was requested: no camera helps."""
         floor = self.found.at_level(self.found.cov(of="print of the body"))
-        had = ", ".join(
-            f"{up(each.mm)}mm,{up(each.deg)}deg {when}"
-            for each, when in ((self.moving, f"at {self.plan.speed}"), (self.at_rest, "at rest"))
-            if each.lost_share <= MOST_LOST
-        )
+        states = (self.moving, f"at {self.plan.speed}"), (self.at_rest, "at rest")
+        had = ", ".join(f"{up(s.mm)}mm,{up(s.deg)}deg {when}" for s, when in states if s.lost_share <= MOST_LOST)
         units = ("mm", 1e3), ("deg", 180 / math.pi)
         for least, most, (unit, scale) in zip(floor, self.plan.requested or (0.0, 0.0), units, strict=True):
             if 0 < most < least.max():
@@ -190,6 +183,18 @@ class RigBudget(Record):
                     f"camera reaches {scale * most:g}: {had} can be had with this plan, less with the body's markers "
                     "measured after printing: body_print, body_bent, body_size"
                 )
+
+    @property
+    def slower_m_s(self) -> float:
+        """Speed below which what was requested is reached, m/s; 0 where that is never, or at the plan's own speed."""
+        rest, found = self.found.cov(moving=False), self.found
+        more = found.cov() - rest
+
+        def over(share: float) -> float:  # what motion costs is proportional to its speed
+            m, rad = (float(each.max()) for each in found.at_level(rest + share**2 * more))
+            return Accuracy(0.0, 0.0, m, rad).over(*self.plan.requested or ()) - 1
+
+        return self.plan.speeds[0] * float(brentq(over, 0.0, 1.0)) if over(0.0) < 0 < over(1.0) else 0.0
 
     def worst_m(self, cause: str) -> float:
         """Return what 95 % would be within at the worst position if a cause were alone."""
@@ -209,26 +214,25 @@ class RigBudget(Record):
                 after = planned(replace(plan, **change))  # type: ignore[arg-type]
             except InputError:  # such a rig cannot be built
                 continue
-            state = Accuracy.moving(after)
+            state = Accuracy.of(after, moving=True)
             if state.over() < (1 - WORTH) * self.moving.over():
                 found.append((price, state.over(), Improvement(text, price, state.level_m, state.lost_share)))
         return tuple(one for *_, one in sorted(found))
 
     def to_dict(self) -> dict[str, Any]:
         """Return what ``armsight budget --json`` prints, in m and rad."""
-        found, whole, plan = self.found, self.found.cov(), self.plan
+        found, plan = self.found, self.plan
         rig = {"file": plan.rig, "image_size_px": plan.image_size_px, "baseline_m": plan.baseline_m}
         shares = {f"{share}_rms_m": found.rms(found.cov(of=share))[0] for share in ("precision", "trueness")}
+        axes = zip(("lateral_rms_m", "depth_rms_m"), found.along(found.cov()), strict=True)
         return {
-            "plan": {
-                n: None if n in plan.of_rig else getattr(plan, n) for n in (each.name for each in plan.settings())
-            },
+            "plan": {key: None if key in plan.of_rig else getattr(plan, key) for key in KEYS},
             **({"rig": rig} if plan.rig else {}),
             "focal_px": plan.focal_px,
             "results": {name: state._asdict() for name, state in self.states.items()},
             "lost_share_in_motion": float(found.lost.mean()),
             **shares,
-            **dict(zip(("lateral_rms_m", "depth_rms_m"), found.along(whole), strict=True)),
+            **dict(axes),
             "causes": [cause._asdict() for cause in self.causes],
             "changes": [change._asdict() for change in self.changes],
             "not_modelled": list(NOT_MODELLED),
@@ -251,15 +255,7 @@ def budget(path: str = "", **plan: Any) -> RigBudget:  # noqa: ANN401
     return found
 
 
-class Alternative(NamedTuple):
-    """The best plan with a class of cameras; alternatives of one group differ by less than what the prediction is off."""
-
-    budget: RigBudget
-    group: int
-    price: int
-
-
-def best(plan: RigPlan, progress: Callable[[str], None] = lambda _: None) -> tuple[Alternative, ...]:
+def best(plan: RigPlan, progress: Callable[[str], None] = lambda _: None) -> tuple[RigBudget, ...]:
     """Return the plans that measure best, one for each class of cameras, the cheapest first, then by mm.
 
     What the plan names stays. Both cameras see the body everywhere, in focus, its markers large enough
@@ -273,7 +269,8 @@ def best(plan: RigPlan, progress: Callable[[str], None] = lambda _: None) -> tup
         InputError: none can be built; the message is that of the plan itself.
     """
     found = []
-    for name in [plan.camera] if "camera" in plan.named else catalogue():
+    classes = [name for name, each in catalogue().items() if each.price]
+    for name in [plan.camera] if "camera" in plan.named else classes:
         progress(name)
         pairs = plan.pairs if "pairs" in plan.named else PAIRS
         searched = replace(_searched(replace(plan, **_of_camera(plan, name))), pairs=pairs)
@@ -283,12 +280,12 @@ def best(plan: RigPlan, progress: Callable[[str], None] = lambda _: None) -> tup
         plan.check()
         raise InputError("no class of the catalogue can measure this volume with what the plan names")
     found.sort(key=lambda one: one.moving.over())
-    groups, first, group = list[Alternative](), found[0], 0
+    groups, first, group = list[RigBudget](), found[0], 0
     for one in found:
         if one.moving.over() > PREDICTED * first.moving.over():
             first, group = one, group + 1
-        groups.append(Alternative(one, group, one.plan.cameras.price))
-    return tuple(sorted(groups, key=lambda one: (one.price, one.budget.moving.over())))
+        groups.append(replace(one, group=group))
+    return tuple(sorted(groups, key=lambda one: (one.plan.cameras.price, one.moving.over())))
 
 
 def _of_camera(plan: RigPlan, name: str) -> dict[str, Any]:
@@ -300,21 +297,25 @@ def _of_camera(plan: RigPlan, name: str) -> dict[str, Any]:
 def loss(plan: RigPlan) -> float:
     """Return what 95 % are within in motion over what was requested, or m; infinity for what cannot be built."""
     try:
-        return Accuracy.moving(planned(replace(plan))).over(*plan.requested or ())  # a key that holds no views
+        return Accuracy.of(planned(replace(plan)), moving=True).over(*plan.requested or ())  # a key that holds no views
     except InputError:
         return math.inf
 
 
-def chosen(alternatives: tuple[Alternative, ...]) -> RigBudget:
+def chosen(found: Sequence[RigBudget]) -> RigBudget:
     """Return the cheapest alternative that reaches what was requested, else that with the least error."""
-    enough = [one.budget for one in alternatives if one.budget.plan.requested and one.budget.reached(one.budget.moving)]
-    return enough[0] if enough else min((one.budget for one in alternatives), key=lambda one: loss(one.plan))
+    enough = [one for one in found if one.plan.requested and one.reached(one.moving)]
+    return enough[0] if enough else min(found, key=lambda one: loss(one.plan))
 
 
 def kept(plan: RigPlan) -> set[str]:
     """Return what the search leaves: what is named, a body of its own or its depth where mm are asked, a webcam's lens."""
-    given = {"body_scale": plan.body, "body_depth": plan.body or not (plan.requested or (0, 0))[1]}
-    return {*plan.named, *(key for key, own in (given | {"focal_widths": plan.cameras.focus_m}).items() if own)}
+    own = {"body_scale": plan.body, "body_depth": plan.body or not (plan.requested or (0, 0))[1]}
+    return {
+        *plan.named,
+        *(key for key, is_own in own.items() if is_own),
+        *["focal_widths"] * (plan.cameras.focus_m > 0),
+    }
 
 
 def _searched(plan: RigPlan) -> RigPlan:
@@ -323,9 +324,9 @@ def _searched(plan: RigPlan) -> RigPlan:
     free = [key for key in BOUNDS if key not in fixed]
 
     def changed(now: RigPlan, key: str, by: float) -> RigPlan:
-        lens = now.focal_px / now.image_size_px[0]
+        lens, (least, most) = now.focal_px / now.image_size_px[0], BOUNDS[key]
         values = dict(zip(BOUNDS, (now.baseline_m, now.distance_m, lens, now.body_scale, now.body_depth), strict=True))
-        value = float(f"{min(max(by * values[key], BOUNDS[key][0]), BOUNDS[key][1]):.3g}")
+        value = float(f"{min(max(by * values[key], least), most):.3g}")
         new: dict[str, Any] = {key: f"{value:g}m" if key in ("baseline", "distance") else value}
         return replace(now, **new)
 

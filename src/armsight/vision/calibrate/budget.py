@@ -319,26 +319,21 @@ def _gated(
 
 
 def of_three(pairs: Sequence[Budget], rig: StereoRig, board_scale: float = 0.0) -> Budget:
-    """Return the budget of three cameras from those of their three pairs.
+    """Return the budget of the mean of the poses that three cameras measure, each two of them as a pair.
 
-    The least-squares pose of three cameras is the mean of the pairs' poses, weighted by their information: each camera is
-    in two of them. What is each camera's own is independent, and counts twice for that; all else is the same in all pairs.
+    Each camera is in two pairs: what is its own is independent, and counts twice for that; all else is the same in all.
 
     ``pairs`` are those of :func:`volume_views`, 0, 1 and 2; axes are those of the first one's left camera.
     ``board_scale``: of the board's size, as a share: the distances of all three cameras grow with it.
     """
-    first = pairs[0]
+    first, factors = pairs[0], dict[str, Array]()
     # A larger board moves each pair's own left camera away from the triangle's middle.
     down = np.cross(first.forward, aside := rig.T_left_right[:3, 3])
     middle = np.append(aside / 2 + down / (2 * np.sqrt(3.0)), np.zeros(3))
-    back = [np.kron(np.eye(2), exp_so3(-_THIRD * k * first.forward)) for k in range(3)]
-    informations = [R @ np.linalg.inv(each.cov(of="pixel noise")) @ R.T for R, each in zip(back, pairs, strict=True)]
-    whole = np.linalg.inv(np.sum(informations, axis=0))
-    weighed = [whole @ each for each in informations]
-    factors = {}
+    back = [np.kron(np.eye(2), exp_so3(-_THIRD * k * first.forward)) / 3 for k in range(3)]
     for name in first.factors:
         larger = board_scale * middle[:, None] if name == "print of the board" else 0.0
-        parts = [W @ R @ (each.factors[name] - larger) for W, R, each in zip(weighed, back, pairs, strict=True)]
+        parts = [R @ (each.factors[name] - larger) for R, each in zip(back, pairs, strict=True)]
         own = CAUSES[name].camera
         factors[name] = np.sqrt(2.0) * np.concatenate(parts, axis=2) if own else np.sum(parts, axis=0) + larger
     return replace(first, factors=factors, shared=())
