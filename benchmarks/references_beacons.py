@@ -22,7 +22,7 @@ from armsight.geometry.pose import pose
 from armsight.geometry.rotation import exp_so3, log_so3
 from armsight.loop.identify.fit import linear_of, variances_of, with_joint_noise
 from armsight.loop.identify.identify import identify
-from armsight.loop.identify.lengths import identify_wire
+from armsight.loop.identify.lengths import without_blunders
 from armsight.loop.identify.model import motion, nominal_table
 from armsight.loop.identify.selection import folds_of
 from armsight.loop.references.distance import Distance, follow_ranges
@@ -37,15 +37,17 @@ def draw_wire(folder: Path) -> None:
     arm = open_arm("irb120")
     rows = np.loadtxt(folder / "irb120_even.csv", delimiter=",", skiprows=1)
     q, length = np.deg2rad(rows[:, 3:9]), rows[:, 9] * 1e-3
-    wire = identify_wire(arm, q, length, rows[:, :3] * 1e-3)
-    for lines, text in wire.blunders:
+    measured, used, blunders = without_blunders(arm, q, length, rows[:, :3] * 1e-3)
+    for lines, text in blunders:
         print(f"  lines {lines.min() + 2} to {lines.max() + 2}: {text}")
-    used = wire.used  # the peer's outliers, taken out by hand, are the same rows
+    used[used] = identify(
+        arm, measured.rows(used)
+    ).solution.used  # the peer's outliers, taken out by hand, are the same
     for name, of in (("random", np.random.default_rng(0).integers(0, FOLDS, len(q))), ("clusters", folds_of(q, FOLDS))):
         e, squares, peer = (np.zeros(len(q)) for _ in range(3))
         for k in range(FOLDS):
             train, test = used & (of != k), used & (of == k)
-            found, part = identify(arm, wire.measured.rows(train)), wire.measured.rows(test)
+            found, part = identify(arm, measured.rows(train)), measured.rows(test)
             x, free = found.solution.x, found.solution.free
             weighted = with_joint_noise(found.model, x, part, found.joint_sigma_rad)
             linear = linear_of(found.model, x, weighted, free, found.prior)

@@ -13,13 +13,14 @@ ROWS = 80
 HOOKED = np.arange(30, 36)
 
 
-def files(folder, *, timed):
+def files(folder, *, timed, off_m=0.0, noise_m=1e-3):
     """Write a nominal arm, the joints at rests of one with a longer link, and a wire's recording; return arguments."""
     rng, nominal = np.random.default_rng(5), replace(FOUR, name="four")
     true = replace(nominal, a=nominal.a + 4e-3 * np.eye(nominal.joints)[1])
     q, t_s = rng.uniform(-1.0, 1.0, (ROWS, nominal.joints)), 2.0 * np.arange(ROWS)
     T = true.forward(q)
     length = np.linalg.norm(T[:, :3, 3] + T[:, :3, :3] @ [0.01, 0.02, 0.05] - [0.4, -0.6, -0.1], axis=1)
+    length += off_m * np.sin(4.0 * q[:, 0]) * np.sin(3.0 * q[:, 1])  # no arm does that
     length[HOOKED] += 0.02
     names = ["t_s"] * timed + [f"q{k + 1}_rad" for k in range(nominal.joints)]
     table = np.column_stack([t_s, q] if timed else [q])
@@ -30,7 +31,7 @@ def files(folder, *, timed):
         wire = np.column_stack([at + late, np.repeat(length, 5) + rng.normal(0.0, 1e-4, len(at))])
     wire[:, -1] *= 1e3
     np.savetxt(folder / "wire.csv", wire, "%.6f", ",", header="t_s,range_mm" if timed else "range_mm", comments="")
-    text = f'[wire]\nkind = "range"\nsource = "wire.csv"\ndelay_s = {late}\n'
+    text = f'[wire]\nkind = "range"\nsource = "wire.csv"\ndelay_s = {late}\nnoise_m = {noise_m}\n'
     (folder / "references.toml").write_text(text)
     arm = arm_toml(folder / "four.toml", nominal)
     return "--arm", str(arm), "--data", str(folder / "joints.csv"), "--references", str(folder / "references.toml")
@@ -58,7 +59,17 @@ def test_one_wire_finds_a_longer_link_and_its_hooks(tmp_path, capsys):
         assert ("columns not used: x_cm, y_cm, z_cm" in json.dumps(found)) is not timed
         assert "lines 32 to 37: the wire reads" in json.dumps(found), timed  # line 1 has the names
     assert (tmp_path / "out" / "corrected.toml").exists()
+    assert "Usable for the wire" in (tmp_path / "out" / "report.html").read_text()
     assert not (tmp_path / "out" / "zeros.toml").exists()  # one wire shows no zero alone
+
+
+def test_a_residual_far_above_the_ranges_noise_is_not_usable(tmp_path, capsys):
+    given = files(tmp_path, timed=False, off_m=1.5e-3, noise_m=2e-4)
+    said = said_of(capsys, "identify", *given)
+    assert said.out.startswith(
+        "Do not use this identification: its residual is 0.64 mm where noise_m and rounded joints"
+    )
+    assert "Is four the maker's nominal arm" in said.out
 
 
 def test_what_does_not_fit_is_one_line(tmp_path, capsys):

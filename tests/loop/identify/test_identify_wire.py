@@ -9,7 +9,8 @@ import pytest
 
 from armsight.data import Array
 from armsight.errors import InputError
-from armsight.loop.identify.lengths import identify_wire, unrounded, without_blunders
+from armsight.loop.identify.identify import identify
+from armsight.loop.identify.lengths import unrounded, without_blunders
 from armsight.robot.arm_file import open_arm
 
 ROWS, NOISE_M, STEP_RAD, STEP_M = 90, 2e-4, np.deg2rad(0.1), 1e-4
@@ -34,13 +35,14 @@ def _recording(seed: int) -> tuple[Array, Array, Array, Array]:
 def test_the_anchor_is_found_and_blunders_are_named() -> None:
     _, printed, length, p = _recording(3)
     p[10, 2] += 0.099
-    found = identify_wire(open_arm("irb120"), printed, length, p)
-    named = {text: set(rows) for rows, text in found.blunders}
+    measured, used, blunders = without_blunders(open_arm("irb120"), printed, length, p)
+    found = identify(open_arm("irb120"), measured.rows(used))
+    named = {text: set(rows) for rows, text in blunders}
     assert {10} == set().union(*(rows for text, rows in named.items() if "contradicts" in text))
     assert set(LOST) == set().union(*(rows for text, rows in named.items() if "sign of joint 6" in text))
     assert set(HOOKED) == set().union(*(rows for text, rows in named.items() if "too long" in text))
-    sigma = np.sqrt(np.diag(found.identified.cov))[:3]
-    assert (np.abs(found.anchor - ANCHOR) < 4 * sigma).all()
+    sigma = np.sqrt(np.diag(found.cov))[:3]
+    assert (np.abs(found.solution.x[:3] + ANCHOR) < 4 * sigma).all()  # the base in the anchor's frame
     assert (sigma < 0.03).all()
 
 

@@ -85,13 +85,14 @@ def command(
         said = said_columns(",".join(columns) or None, ("rotation",))
         how = {"rotation": said.rotation, "columns": said.columns}
         if references is not None:
-            read = _by_wire(arm, data, references, columns, progress)
+            read, range_noise_m = _by_wire(arm, data, references, columns, progress)
         else:
-            read = read_measured(data, arm, joints, **how)
+            read, range_noise_m = read_measured(data, arm, joints, **how), None
         held = None if other is None else read_measured(other, arm, joints, **how)
         notes = read.notes if held is None else (*read.notes, *(f"{other}: {note}" for note in held.notes))
         validated = None if held is None else held.measured
-        more: dict[str, Any] = {"priors": _priors(priors), "notes": notes, "progress": progress}
+        more: dict[str, Any] = {"priors": _priors(priors), "notes": notes, "range_noise_m": range_noise_m}
+        more["progress"] = progress
         run = run_identify(arm, read.measured, read.lines, validated, other_name=str(other), **more)
         report = identify_report(run, everything=verbose)
         if output is not None:
@@ -104,8 +105,10 @@ def command(
         click.echo(f"\nwritten: {output}/{', '.join(each for each in FILES if (output / each).exists())}")
 
 
-def _by_wire(arm: Arm, data: Path, references: Path, columns: tuple[str, ...], progress: Callable[[str], None]) -> Read:
-    """Return rows with a wire's length, blunders left out and noted."""
+def _by_wire(
+    arm: Arm, data: Path, references: Path, columns: tuple[str, ...], progress: Callable[[str], None]
+) -> tuple[Read, float]:
+    """Return rows with a wire's length, blunders left out and noted, and its noise, m."""
     from armsight.loop.identify.lengths import read_wire, without_blunders
     from armsight.loop.identify.measured import Read
 
@@ -113,7 +116,8 @@ def _by_wire(arm: Arm, data: Path, references: Path, columns: tuple[str, ...], p
     measured, used, blunders = without_blunders(arm, wire.q, wire.length_m, wire.p_base, progress)
     notes = [f"lines {wire.lines[rows.min()]:.0f} to {wire.lines[rows.max()]:.0f}: {why}" for rows, why in blunders]
     said = "errors are of the wire's length; one wire does not show where the base is: it stays the anchor's"
-    return Read(measured.rows(used), wire.lines[used], (said, *wire.notes, *(f"{each}; left out" for each in notes)))
+    notes = [said, *wire.notes, *(f"{each}; left out" for each in notes)]
+    return Read(measured.rows(used), wire.lines[used], tuple(notes)), wire.noise_m
 
 
 @command.command()

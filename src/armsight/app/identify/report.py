@@ -21,6 +21,7 @@ from armsight.files import table_text, write_text
 from armsight.loop.identify.backlash import JointBacklash, joint_backlashes
 from armsight.loop.identify.corrected import Corrected, zeros_text
 from armsight.loop.identify.identify import contributions, value_text
+from armsight.loop.identify.lengths import explained_m
 from armsight.loop.identify.selection import PLACEMENT
 from armsight.robot.arm_file import MOVED, undetermined
 
@@ -182,6 +183,9 @@ FIGURES: dict[str, tuple[Callable[[Identification], Figure], str, str]] = {
         "Strong colours off the diagonal: these poses distinguish the two badly; their sigmas say so.",
     ),
 }
+#: Residual over what a range's noise and rounded joints explain, beyond which the model is wrong; half: arms with some
+#: scatter of their own are, double: another maker's arm passes where noise_m was not given.
+UNEXPLAINED = 2.0
 _FOLDED = ("sources", "selection", "correlation")  # figures that stand beneath a line until a reader asks for them
 
 
@@ -242,7 +246,13 @@ def assess(run: Identification) -> tuple[Grade, str]:
         why = f"the nominal arm of {run.arm.name} predicts as well"
         return "poor", f"Do not use this identification: {why}; take more poses."
     said = f"the corrected {run.arm.name} is off by {after:.2f} mm where the nominal one is by {before:.2f}"
-    if run.measured.length_m is not None:
+    if run.range_noise_m is not None:
+        left = run.found.solution.noise[0]
+        if left > UNEXPLAINED * (own := explained_m(run.found, run.measured, run.range_noise_m)):
+            return "poor", (
+                f"Do not use this identification: its residual is {1e3 * left:.2f} mm where noise_m and rounded joints "
+                f"explain {1e3 * own:.2f} mm. Is {run.arm.name} the maker's nominal arm of this one, and noise_m true?"
+            )
         return (
             "fair",
             f"Usable for the wire's point near these poses: {said}; one wire shows no attitude, so there is no zeros.toml.",

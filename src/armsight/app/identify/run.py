@@ -31,6 +31,7 @@ class Identification(Record):
     how: str  #: which poses those are, as text
     lines: Array  #: (N,) lines of the file that the poses come from
     notes: tuple[str, ...]  #: what a person should know
+    range_noise_m: float | None = None  #: of the range it was identified by, as its table says, m; None: by poses
 
 
 def run_identify(
@@ -42,6 +43,7 @@ def run_identify(
     other_name: str = "the poses to validate with",
     priors: Mapping[str, float] | None = None,
     notes: tuple[str, ...] = (),
+    range_noise_m: float | None = None,
     progress: Callable[[str], None] = lambda line: None,
 ) -> Identification:
     """Identify an arm and validate it on poses left out.
@@ -64,7 +66,7 @@ def run_identify(
             f"residuals of poses left out are {held_out.scale:.2f} times as large as predicted: the arm does something "
             f"that the model does not know; all sigmas are made {held_out.scale:.2f} times as large",
         )
-    return Identification(arm, measured, found, *held_out[:3], lines, (*shown, *notes))
+    return Identification(arm, measured, found, *held_out[:3], lines, (*shown, *notes), range_noise_m)
 
 
 def _notes(arm: Arm, found: Identified, measured: Measured, lines: Array) -> list[str]:

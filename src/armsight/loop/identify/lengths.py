@@ -27,7 +27,7 @@ from armsight.errors import InputError
 from armsight.estimate.chance import chi_square_limit
 from armsight.files import columns_unused
 from armsight.loop.identify.fit import Mask, fit, prior_sigma
-from armsight.loop.identify.identify import Identified, identify
+from armsight.loop.identify.identify import Identified
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.misread import TRIMS, without_tool
 from armsight.loop.identify.model import Model
@@ -48,9 +48,8 @@ BEGIN_M = 1e-3  # m; noise of a wire to begin at; half, double: nothing
 CHANCE = 1e-4  # of a good row beyond the limit; half, double: one row in ten thousand
 AGREE = 1e-6  # chance of a joint's sign that is found by mistake; half, double: nothing
 REST_S = 0.25  # s; so long about a row's time the arm rests; half: noise, double: arms that go on early pull
-MOVES = (
-    3.0  # of a range's noise; at a rest half of the ranges are nearer to their median; half: noise, double: slow motion
-)
+#: Of a range's noise; at a rest half of the ranges are nearer to their median; half: noise, double: slow motion.
+MOVES = 3.0
 #: What rounding hides at least, rad and m, as positions are computed in single precision; half, double: nothing.
 LEAST_ROUNDED = 1e-7
 MOST_ROUNDED = 5.1e-3  # rad; sigma of whole degrees; half: these are taken for another arm's, double: nothing
@@ -65,20 +64,6 @@ class Blunder(NamedTuple):
 
     rows: NDArray[np.int64]  #: from 0
     text: str  #: what is wrong about them
-
-
-class WireIdentified(NamedTuple):
-    """An arm identified by a wire."""
-
-    identified: Identified  #: its base is in a frame with the base's axes and the anchor as origin
-    measured: Measured  #: all rows, their joints without rounding where the controller's position says it
-    used: Mask  #: (N,) the rows that were fitted
-    blunders: tuple[Blunder, ...]  #: the others
-
-    @property
-    def anchor(self) -> Array:
-        """The anchor (3,) in the base, m."""
-        return -self.identified.solution.x[:3]
 
 
 def unrounded(arm: Arm, q: Array, p_base: Array, sigma_m: float) -> tuple[Array, Mask]:
@@ -129,6 +114,7 @@ class WireRead(NamedTuple):
     p_base: Array | None  #: (N, 3) the tool's origin as the controller computes it, m; None: not known
     lines: Array  #: (N,) of the file of joints
     notes: tuple[str, ...]  #: what was left out
+    noise_m: float  #: of a range, as its table says
 
 
 def read_wire(data: Path, arm: Arm, references: Path, columns: Renames | None = None) -> WireRead:
@@ -155,16 +141,16 @@ def read_wire(data: Path, arm: Arm, references: Path, columns: Renames | None = 
             raise InputError(f"{data}: positions of up to {far:.0f} m: name x_mm, y_mm, z_mm if they are in mm")
     elif table.unused:
         notes = (*notes, f"{data}: {columns_unused(table.unused)}")
-    (t_s, z), lines = read_lengths(source), table.lines[rows].astype(float)
+    (t_s, z), lines, noise_m = read_lengths(source), table.lines[rows].astype(float), ranges[0].noise_m
     if t_s is None:
         if len(z) != len(table.q):
             raise InputError(
                 f"{source}: {len(z)} ranges for {len(table.q)} rows of {data}; give one a row, or times t_s"
             )
-        return _possible(WireRead(table.q[rows], z[rows], p, lines, notes), arm)
+        return _possible(WireRead(table.q[rows], z[rows], p, lines, notes, noise_m), arm)
     if table.t_s is None:
         raise InputError(f"{data}: line 1: a column t_s is needed, as {source} has times")
-    found_m = _at_rests(t_s, z, table.t_s[rows] + ranges[0].reference.delay_s, ranges[0].noise_m)
+    found_m = _at_rests(t_s, z, table.t_s[rows] + ranges[0].reference.delay_s, noise_m)
     there = np.isfinite(found_m)
     if there.sum() < SHARE * len(rows):
         raise InputError(
@@ -177,9 +163,8 @@ def read_wire(data: Path, arm: Arm, references: Path, columns: Renames | None = 
             *notes,
             f"{data}: line {alone}: {(~there).sum()} rows without a range at rest within {REST_S:g} s: left out",
         )
-    return _possible(
-        WireRead(table.q[rows][there], found_m[there], None if p is None else p[there], lines[there], notes), arm
-    )
+    p = None if p is None else p[there]
+    return _possible(WireRead(table.q[rows][there], found_m[there], p, lines[there], notes, noise_m), arm)
 
 
 def _at_rests(t_s: Array, z: Array, at_s: Array, noise_m: float) -> Array:
@@ -209,10 +194,23 @@ def _step(values: Array) -> float:
     return float(next((s for s in steps if np.abs(values / s - np.round(values / s)).max() < 1e-3), 0.0))
 
 
+def explained_m(found: Identified, measured: Measured, noise_m: float) -> float:
+    """Return the residual, m, RMS, that a range's noise and the step explain that joints are rounded to."""
+    rows = slice(found.model.table_at, found.model.sources_at, 5)
+    by_joints = found.model.linearised(found.solution.x, measured)[1][:, 0, rows]
+    sigma_rad = np.deg2rad(_step(np.rad2deg(measured.q))) / np.sqrt(12)
+    return float(np.sqrt(noise_m**2 + sigma_rad**2 * np.mean(np.sum(by_joints**2, axis=1))))
+
+
 def without_blunders(
     arm: Arm, q: Array, length_m: Array, p_base: Array | None, progress: Callable[[str], None] = lambda line: None
 ) -> tuple[Measured, Mask, tuple[Blunder, ...]]:
-    """Return rows as measured, which (N,) of them are good, and the others; arguments as for :func:`identify_wire`."""
+    """Return rows as measured, which (N,) of them are good, and the others.
+
+    ``q``: (N, n) joints, rad. ``length_m``: (N,) of the wire, m. ``p_base``: (N, 3) the tool's origin as the controller
+    computes it, m; None: not known. What joints and positions are rounded by is found from them. InputError: so many rows
+    contradict the rest that no arm of this kind explains them.
+    """
     good, blunders = np.ones(len(q), np.bool_), []
     if p_base is not None:
         q, good = unrounded(arm, q, p_base, max(1e-3 * _step(1e3 * p_base) / np.sqrt(12), LEAST_ROUNDED))
@@ -237,28 +235,6 @@ def without_blunders(
         side = "long" if mm.mean() > 0 else "short"
         blunders.append(Blunder(rows, f"the wire reads {np.abs(mm).min():.1f} to {np.abs(mm).max():.1f} mm too {side}"))
     return measured, good & ~far, tuple(blunders)
-
-
-def identify_wire(
-    arm: Arm,
-    q: Array,
-    length_m: Array,
-    p_base: Array | None = None,
-    *,
-    progress: Callable[[str], None] = lambda line: None,
-) -> WireIdentified:
-    """Identify an arm, the anchor and the tool's point by the lengths of one wire.
-
-    ``q``: (N, n) joints, rad. ``length_m``: (N,) of the wire, m. ``p_base``: (N, 3) the tool's origin as the controller
-    computes it, m; None: not known. What joints and positions are rounded by is found from them.
-
-    Raises:
-        InputError: so many rows contradict the rest that no arm of this kind explains them.
-    """
-    measured, used, blunders = without_blunders(arm, q, length_m, p_base, progress)
-    found = identify(arm, measured.rows(used), progress=progress)
-    kept = np.flatnonzero(used)[found.solution.used]
-    return WireIdentified(found, measured, np.isin(np.arange(len(q)), kept), blunders)
 
 
 def _trimmed(arm: Arm, measured: Measured) -> tuple[Model, Array, float]:
