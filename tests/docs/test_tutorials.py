@@ -61,6 +61,7 @@ def test_the_commands_run_and_make_the_pictures(runner, page, monkeypatch):
     monkeypatch.setattr(run_command, "_HANDEYE_POSES", 12)  # 30 take two thirds of a run
     monkeypatch.setattr(motion_file, "_REST_S", 0.8)
     monkeypatch.setattr(run_calibrate, "SWEEP_S", 2.0)
+    monkeypatch.setattr("armsight.loop.identify.validate.MANY", 0)  # one part of the poses is left out, not five
     run = [command for block in blocks(page) if block.how != "no" for command in block.commands]
     assert any(command.startswith("armsight ") for command in run)
     folder = runner.run(page)

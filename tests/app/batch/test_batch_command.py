@@ -123,12 +123,12 @@ def test_a_recording_that_fails_is_a_row_with_its_reason(tmp_path):
     assert done.shots == []
 
 
-def test_what_failed_is_tried_again_and_makes_the_exit_code_1(armsight, tmp_path):
+def test_what_failed_is_tried_again_and_makes_the_exit_code_1(armsight, tmp_path, clusters):
     for name in ("a", "b"):
         (tmp_path / f"{name}.csv").write_text("hello\n")
-    arguments = ("batch", "identify", tmp_path / "*.csv", "-o", tmp_path / "out", "--arm", "six_r", "--workers", 1)
-    for _ in range(2):
-        done = armsight(*arguments)
+    arguments = ("batch", "identify", tmp_path / "*.csv", "-o", tmp_path / "out", "--arm", "six_r")
+    for workers in (1, clusters[0]):  # a process of its own, and another's cluster
+        done = armsight(*arguments, "--workers", workers)
         assert done.code == 1, done.err
         assert_has(done.out, "2 recordings: 0 done, 0 of them before, 2 failed", "  failed 2 times: ")
         assert list((tmp_path / "out" / "parts").iterdir()) == []
