@@ -154,7 +154,6 @@ def read_ply(path):
     return np.frombuffer(body, np.dtype(fields), count)
 
 
-@pytest.mark.opencv
 def test_a_rig_gives_depth_in_mm_and_a_cloud_in_the_left_cameras_frame(dense, seen, tmp_path):
     folder, rig, truth = seen
     out = tmp_path / "out"
