@@ -15,7 +15,7 @@ from armsight.app.arm.report import write_report
 from armsight.app.check.evaluate import evaluate as evaluate_check
 from armsight.app.check.run_folder import attained_in
 from armsight.app.run.motion_file import read_motions
-from armsight.app.run.tracks import ToolTrack, joint_columns, write_columns, write_track
+from armsight.app.run.tracks import ToolTrack, columns, joint_columns, write_columns
 from armsight.geometry.pose import exp_se3
 from armsight.loop.identify.identify import identify
 from armsight.loop.identify.measured import Measured
@@ -55,8 +55,8 @@ def run(tmp_path_factory):
     T = ARM.forward(q + np.radians(ZERO_DEG)) @ exp_se3(SIGMA * rng.normal(size=(len(q), 6)))
     T[:, 0, 3] += 1e-3 * DRIFT_MM_PER_H * t_s / 3600.0
     covs = np.tile(np.diag(SIGMA**2), (len(q), 1, 1))
-    write_track(folder, "vision", ToolTrack(t_s, T, phase, name, covs))
-    write_track(folder, "reference", ToolTrack(t_s, ARM.forward(q_ref), phase, name))
+    write_columns(folder, "vision", [columns(ToolTrack(t_s, T, phase, name, covs))])
+    write_columns(folder, "reference", [columns(ToolTrack(t_s, ARM.forward(q_ref), phase, name))])
     write_columns(folder, "joints", [joint_columns(t_s, q, q_ref)])
     (folder / "summary.json").write_text(json.dumps({"nominal_arm": "so101", "board": "feetech", "health": []}))
     return folder

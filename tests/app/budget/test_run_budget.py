@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from armsight.app.budget.run import against_run, run_plan
-from armsight.app.run.tracks import ToolTrack, write_track
+from armsight.app.run.tracks import ToolTrack, columns, write_columns
 from armsight.files import write_text
 from armsight.geometry.pose import exp_se3, pose
 from armsight.sim.budget import result
@@ -43,7 +43,7 @@ def run(tmp_path_factory):
     T_base_rig = exp_se3(np.array([0.3, -0.2, 0.5, 0.1, 0.4, -0.2]))
     for name, times, Ts in (("truth", t, true), ("vision", t[20:-20], np.array(seen))):
         words = np.full(len(times), "open_loop")
-        write_track(folder, name, ToolTrack(times + 1.0, T_base_rig @ Ts, words, words))
+        write_columns(folder, name, [columns(ToolTrack(times + 1.0, T_base_rig @ Ts, words, words))])
     write_text(
         folder / "handeye.json", json.dumps({"T_base_rig": T_base_rig.tolist(), "T_tool_body": np.eye(4).tolist()})
     )

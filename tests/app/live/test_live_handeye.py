@@ -141,7 +141,7 @@ def test_the_rig_of_an_earlier_session_is_offered_and_can_be_put_aside(tmp_path)
 def test_a_calibration_that_is_good_enough_ends_once_by_itself(tmp_path, monkeypatch):
     said, finished = [], []
     shared = Shared(SessionOptions(tmp_path), tmp_path, lambda level, text: said.append(text))
-    step = CalibrationStep(shared, "chessboard:9x6:25mm", CalibrationAim(2e-4, 0.8))
+    step = CalibrationStep(shared, "chessboard:9x6:25mm", CalibrationAim(2e-4, 0.8), lambda rig, path: None)
     monkeypatch.setattr(step, "finish_calibration", lambda: (finished.append(1), step.show(running=False)))
     good = False
     monkeypatch.setattr(step, "fit", lambda: step.show(good=good, goal_mm=0.2))

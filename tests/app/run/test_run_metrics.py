@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from armsight.app.run.metrics import Spread, path_distances, spread, track_metrics
-from armsight.app.run.tracks import ToolTrack, errors, write_track
+from armsight.app.run.tracks import ToolTrack, columns, errors, write_columns
 from armsight.errors import InputError
 from armsight.geometry.pose import exp_se3, inverse, log_se3
 from armsight.geometry.rotation import from_quaternion_wxyz
@@ -60,7 +60,7 @@ def test_the_metrics_of_noise_with_a_known_covariance():
 
 def test_the_files_hold_what_the_track_holds(tmp_path):
     whole = track(cov=np.diag([1e-8, 4e-8, 9e-8, 1e-6, 1e-6, 1e-6]))
-    write_track(tmp_path, "vision", whole)
+    write_columns(tmp_path, "vision", [columns(whole)])
     rows = list(csv.DictReader((tmp_path / "vision.csv").read_text().splitlines()))
     assert len(rows) == 40
     assert list(rows[0])[:8] == ["t_s", "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz"]
@@ -75,7 +75,7 @@ def test_the_files_hold_what_the_track_holds(tmp_path):
 
 def test_a_track_that_cannot_be_written_leaves_nothing(tmp_path):
     with pytest.raises(InputError, match="there is no folder"):
-        write_track(tmp_path / "missing", "vision", track())
+        write_columns(tmp_path / "missing", "vision", [columns(track())])
 
 
 def test_distances_from_a_path_do_not_ask_when():

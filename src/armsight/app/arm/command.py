@@ -232,10 +232,8 @@ def plan(
     write_text(output, text)
     size = " x ".join(f"{100 * each:.0f}" for each in extent) + " cm"
     if extent.min() < _NARROW_M:
-        note(
-            f"the poses are between those at which {around} saw the body, and cover only {size}: zeros, base "
-            "and tool, and lengths will hardly be distinguished; first record a run whose hand-eye poses cover more"
-        )
+        lost = "zeros, base and tool, and lengths will hardly be distinguished"
+        note(f"{around} saw the body over only {size}: {lost}; first record a run whose hand-eye poses cover more")
     answer: dict[str, Any] = {"arm": arm.name, "poses": poses, "cycles": cycles}
     answer |= {"extent_m": extent.tolist(), "output": str(output)}
     _print((answer, [f"{output}: {poses} poses over {size}"]), as_json)
@@ -275,7 +273,6 @@ def report(
 
 
 def _keep(output: Path, yes: bool) -> None:
-    """Keep a file that is to be replaced as OUT.old, after asking."""
     old = output.with_name(f"{output.name}.old")
     if old.exists():
         raise InputError(f"{old}: exists; what was kept is never written over: move it away")

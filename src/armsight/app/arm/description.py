@@ -1,10 +1,7 @@
 """What ``armsight arm`` answers, as JSON objects (units in the keys) and as text (mm and degrees).
 
-In: an arm, joint angles (n,) in rad or a pose (4, 4), the inverse solutions of a pose. Out: for each subcommand a function
-of the same name that returns both, the object and the lines.
-
-Angles of a rotation are Euler angles about z, y and x, in that sequence: R = Rz(euler_z) Ry(euler_y) Rx(euler_x). Robot
-sources that call them roll, pitch, yaw put roll about z; ROS puts roll about x.
+For each subcommand a function of the same name returns both, the object and the lines. Angles of a rotation are Euler
+angles about z, y and x, in that sequence: R = Rz(euler_z) Ry(euler_y) Rx(euler_x); ROS calls euler_x roll.
 """
 
 from __future__ import annotations
@@ -33,7 +30,6 @@ def _fixed(value: float) -> str:
 
 
 def _short(value: float) -> str:
-    """Return a number with at most three decimals."""
     return f"{round(float(value), 3) + 0.0:.10g}"
 
 
@@ -89,10 +85,8 @@ def show(arm: Arm) -> Shown:
             parts = [f"{factor:+g} {other}" for factor, other in zip(row, arm.joint_names, strict=True) if factor]
             lines.append(f"coupling: the angle of {name} is that of the motors {' '.join(parts)}")
     lines.append(f"tool at home: {_pose_text(home)}")
-    lines.append(
-        f"reach of the tool: {1e3 * extent.radius_m:.1f} mm from joint 1's axis, from {1e3 * extent.low_m:.1f} to "
-        f"{1e3 * extent.high_m:.1f} mm along it"
-    )
+    far, low, high = 1e3 * extent.radius_m, 1e3 * extent.low_m, 1e3 * extent.high_m
+    lines.append(f"reach of the tool: {far:.1f} mm from joint 1's axis, from {low:.1f} to {high:.1f} mm along it")
     found: dict[str, Any] = {"arm": arm.name, "convention": arm.convention, "joints": joints}
     found |= {name: getattr(arm, name) for name in ("coupling", "T_base_0", "T_flange_tool")}
     found |= {"T_base_tool_home": home, "reach_m": extent, "source": arm.source}
@@ -119,17 +113,9 @@ def inverse(arm: Arm, T_base_tool: Array, found: Solutions) -> Shown:
     for i, configuration in enumerate(found.configurations):
         kind, q = None if configuration is None else dataclasses.asdict(configuration), found.q[i]
         outside, singular = beyond(arm, q), bool(found.singular[i])
-        solutions.append(
-            {
-                "configuration": kind,
-                **_angles_json(q),
-                "within_limits": bool(found.within_limits[i]),
-                "outside": outside,
-                "singular": singular,
-                "residual_m": float(found.residual_m[i]),
-                "residual_rad": float(found.residual_rad[i]),
-            }
-        )
+        off = {name: float(getattr(found, name)[i]) for name in ("residual_m", "residual_rad")}
+        within = {"within_limits": bool(found.within_limits[i]), "outside": outside, "singular": singular}
+        solutions.append({"configuration": kind, **_angles_json(q), **within, **off})
         remark = "outside limits: " + " ".join(text.split(" at ")[0] for text in outside) if outside else ""
         angles, names = map(_fixed, np.degrees(q)), "-" if kind is None else " ".join(kind.values())
         rows.append((f"{i + 1}", *angles, names, remark or "singular" * singular))
@@ -164,11 +150,8 @@ def difference(nominal: Arm, arm: Arm, found: Difference, sigma_m: float | None)
     ]
     if np.isnan(found.a_m).any():
         lines.append("-: axes that were parallel no longer are, or another convention: these rows cannot be compared")
-    values: dict[str, float | None] = {
-        "tool_apart_mean_m": found.mean_m,
-        "tool_apart_max_m": found.most_m,
-        "sigma_tool_apart_m": sigma_m,
-    }
+    values: dict[str, Any] = {"tool_apart_mean_m": found.mean_m, "tool_apart_max_m": found.most_m}
+    values |= {"sigma_tool_apart_m": sigma_m}
     values |= {"tool_rotated_mean_rad": found.mean_rad, "tool_rotated_max_rad": found.most_rad}
     return {"nominal": nominal.name, "arm": arm.name, **values, "changes": json_of(changes)}, lines
 

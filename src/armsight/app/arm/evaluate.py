@@ -5,12 +5,10 @@ saw the tool, what the joints' own sensors read, and what was commanded. The err
 
     error = controller + base and tool + the arm's error sources + rest,
 
-all of it, in the frames of the run. The controller's part is what readings and commands put apart by the nominal table.
-The others are what a fit of everything that may be off (``loop.identify``) says that each moves the tool by; a joint's
-zero has the mean of its other sources over these poses. The fit's covariance gives their sigmas, which are large where
-these poses do not distinguish two of them (another zero looks like another base). A part's share is its component along
-the error, over the error: shares sum to 1, and one that cancels others is negative. What a remedy leaves is the error
-less that part.
+in the frames of the run. The controller's part is what readings and commands put apart by the nominal table. The others
+are what a fit of all that may be off (``loop.identify``) says that each moves the tool by; a joint's zero has the mean of
+its other sources. Their sigmas are large where these poses do not distinguish two of them. A part's share is its component
+along the error, over the error: shares sum to 1, and one that cancels others is negative.
 """
 
 from __future__ import annotations
@@ -26,6 +24,7 @@ from numpy.typing import NDArray
 from armsight.app.check.evaluate import evaluate
 from armsight.app.check.rows import NAMED
 from armsight.app.check.run_folder import WINDOW_S, JointTrack, Noise, attained_in, joint_track, noise_of, segments_of
+from armsight.app.run.motion_file import motion_text
 from armsight.app.run.tracks import read_track
 from armsight.app.show.encode import json_of
 from armsight.data import Array, Record
@@ -123,10 +122,8 @@ def rests_of(folder: Path, arm: Arm) -> RestPoses:
         q_ref = track.q_ref[read[-1]]
         rows.append((end_s, T, arm.forward(q_ref), cov, track.q[read].mean(axis=0), q_ref, track.sides(end_s)))
     if len(rows) < MIN_RESTS:
-        raise InputError(
-            f"{folder}: {len(rows)} rests were seen in open loop, {MIN_RESTS} at least are needed: armsight arm plan "
-            "writes the motions of such a recording"
-        )
+        needed = f"{MIN_RESTS} at least are needed: armsight arm plan writes the motions of such a recording"
+        raise InputError(f"{folder}: {len(rows)} rests were seen in open loop, {needed}")
     t_s, T_seen, T_ref, cov, q, q_ref, came = (np.array(part) for part in zip(*rows, strict=True))
     return RestPoses(t_s, T_seen, T_ref, cov, q, q_ref, came, noise_of(segments))
 
@@ -214,7 +211,6 @@ _PAIRS = {
 
 
 def _with_sigmas(values: dict[str, Any]) -> dict[str, Any]:
-    """Return values whose pairs stand as NAME and sigma_NAME."""
     shown = {name: value[0] if isinstance(value, tuple) else value for name, value in values.items()}
     return shown | {f"sigma_{name}": value[1] for name, value in values.items() if isinstance(value, tuple)}
 
@@ -232,9 +228,7 @@ def evaluate_arm(folder: Path, arm: Arm, *, progress: Callable[[str], None] = la
     if len(found.left_out):
         times = ", ".join(f"{t:.0f}" for t in rests.t_s[found.left_out][:NAMED])
         more = ", ..." if len(found.left_out) > NAMED else ""
-        notes.append(
-            f"left out as mistakes: {len(found.left_out)} of {len(rests.q)} rests, at {times}{more} s of the run"
-        )
+        notes.append(f"left out as mistakes: {len(found.left_out)} of {len(rests.q)} rests, at {times}{more} s")
     off, parts = _split(arm, kept, found)
     lever, backlash, latencies = gravity_levers(arm, kept.q), joint_backlashes(found, measured), _latencies(folder, arm)
     joints = [_joint(arm, i, kept, found, lever[:, i], backlash[i]._asdict(), latencies[i]) for i in range(arm.joints)]
@@ -318,9 +312,7 @@ def _displacements(arm: Arm, rests: RestPoses, found: Identified) -> tuple[Array
     true[3:6], true[at - 3 : at] = log_so3(T_base[:3, :3]), log_so3(T_tool[:3, :3].T @ T_body[:3, :3])
     measured, phi = rests.measured(), model.feature_values(rests.q, rests.approach)
     middle, R = 0.5 * (nominal + true), rests.T_seen[:, :3, :3]
-    J, constant = (
-        R @ model.linearised(middle, measured, p)[1][:, :3] for p in (phi, np.tile(phi.mean(0), (len(phi), 1)))
-    )
+    J, constant = (R @ model.linearised(middle, measured, p)[1][:, :3] for p in (phi, 0 * phi + phi.mean(axis=0)))
     constant[:, :, : model.sources_at] = 0.0
     return J, constant, true - nominal
 
@@ -372,7 +364,6 @@ _LEVER_M = 0.02  # a joint whose gravity load has a lever below this at all pose
 
 
 def _mean_mm(metrics: list[Metric]) -> float | None:
-    """Return the mean of a metric over poses, without the instrument's noise where it is resolved, mm; None of none."""
     return 1e3 * float(np.mean([m.raw if m.clean is None else m.clean for m in metrics])) if metrics else None
 
 
@@ -426,7 +417,6 @@ def _latencies(folder: Path, arm: Arm) -> list[float | None]:
 
 
 def _left(track: JointTrack, i: int, rows: NDArray[np.int64], delay_s: float) -> float:
-    """Return what is left of a joint's readings less its delayed commands, less their mean, squares summed."""
     off = track.q[rows, i] - np.interp(track.t_s[rows] - delay_s, track.t_s, track.q_ref[:, i])
     return float(((off - off.mean()) ** 2).sum())
 
@@ -436,18 +426,8 @@ def plan_report(
 ) -> tuple[str, Array]:
     """Return the motions of the recording that a report needs, as a motion file, and the space (3,) it covers, m.
 
-    Poses all over where the body is seen, each from two opposite sides of all joints, and five of them again and again.
-
-    Args:
-        arm: the nominal arm, as slow as its board.
-        around: (M, n) joint angles at which the body was seen, rad; the arm stands at the first to begin with.
-        visible: returns whether the body is seen at poses (N, 4, 4) of the tool.
-        poses: how many poses from both sides.
-        cycles: how often five of them come again.
-        seed: of the choice.
-
-    Raises:
-        InputError: too few poses are in view.
+    ``around``: (M, n) joint angles at which the body was seen, rad; the arm stands at the first. ``visible``: whether it
+    is seen at poses (N, 4, 4) of the tool. Each of ``poses`` comes from both sides, five of them for ``cycles``.
     """
     rng, found = np.random.default_rng([seed, 40]), list[tuple[Array, Array]]()
     low, high = arm.q_min + 2 * _ASIDE_RAD, arm.q_max - 2 * _ASIDE_RAD
@@ -464,41 +444,32 @@ def plan_report(
     extent = np.ptp(arm.forward(np.array([q for q, _ in found]))[:, :3, 3], axis=0)
     text = f"# armsight arm plan: {arm.name}, {len(found)} poses from both sides, {cycles} cycles of five.\n"
     text += f"start_deg = {np.degrees(around[0]).round(4).tolist()}\n"
-    every = max(1, round(len(found) / max(cycles, 1)))
-    done = 0
+    every, done, motions = max(1, round(len(found) / max(cycles, 1))), 0, list[tuple[str, Array, float]]()
     for n, (q, side) in enumerate(found, start=1):
         for sign, word in ((1.0, "one side"), (-1.0, "the other")):
-            text += _motion(f"W{n} aside, {word}", q - sign * _ASIDE_RAD * side, 0.0)
-            text += _motion(f"W{n} from {word}", q, _REST_S)
+            motions += [(f"W{n} aside, {word}", q - sign * _ASIDE_RAD * side, 0.0), (f"W{n} from {word}", q, _REST_S)]
         if n % every == 0 or n == len(found):
             due = round(cycles * n / len(found))
             for cycle in range(done + 1, due + 1):
-                text += _motion(f"before cycle {cycle}", found[4][0], 0.0)  # P1 always comes from P5, as the others do
-                for k, (pose, _) in enumerate(found[:5], start=1):
-                    text += _motion(f"P{k} cycle {cycle}", pose, _REST_S)
+                motions.append((f"before cycle {cycle}", found[4][0], 0.0))  # P1 always comes from P5, as the others do
+                motions += [(f"P{k} cycle {cycle}", pose, _REST_S) for k, (pose, _) in enumerate(found[:5], start=1)]
             done = due
-    return text, extent
+    each = [motion_text("joints", name, {"q_deg": np.degrees(q), "rest_s": rest_s}) for name, q, rest_s in motions]
+    return "".join([text, *each]), extent
 
 
 #: How far a joint goes aside before it comes to a pose, rad; rest at a pose, s; candidates for a pose; fewest poses.
 _ASIDE_RAD, _REST_S, _TRIES, _LEAST_POSES = np.radians(3.0), 1.0, 60, 8
 
 
-def _motion(name: str, q: Array, rest_s: float) -> str:
-    return f'\n[[motion]]\nkind = "joints"\nname = "{name}"\nq_deg = {np.degrees(q).round(4).tolist()}\nrest_s = {rest_s}\n'
-
-
 def nominal_arm(folder: Path, name: str | None) -> Arm:
     """Return the nominal arm of a run: the one of this name, or the one that the run names."""
     if not folder.is_dir():
-        raise InputError(
-            f"{folder}: {'is no folder' if folder.exists() else 'no such folder'}: give one of armsight run or demo"
-        )
+        raise InputError(f"{folder}: {'no' if folder.exists() else 'no such'} folder: give one of armsight run or demo")
     if name is not None:
         return open_arm(name)
     summary = _summary(folder)
-    named = str(summary.get("nominal_arm", summary.get("arm", "")))
-    if not named:
+    if not (named := str(summary.get("nominal_arm", summary.get("arm", "")))):
         raise InputError(f"{folder}: the run does not name its arm: give --arm")
     return open_arm(named)
 

@@ -39,7 +39,6 @@ def _skeleton(arm: Arm) -> tuple[Array, Array]:
 
 
 def _figure(arm: Arm) -> Figure:
-    """Space on the left, the views on the right."""
     points, Ts = _skeleton(arm)
     points, origins = 1e3 * points, 1e3 * Ts[:, :3, 3]
     low, high = points.min(axis=0), points.max(axis=0)

@@ -149,12 +149,10 @@ def _parts_figure(report: ArmReport, figure: FigureBase) -> None:
 def _joints_figure(report: ArmReport, figure: FigureBase) -> None:
     for i, axes in enumerate(panels(figure, len(report.joints))):
         axes.scatter(1e3 * report.lever[:, i], np.degrees(report.lag[:, i]), s=8, color=BLUE)
-        slope = report.joints[i].droop_deg_per_m
-        if slope is not None:
-            middle = report.lever[:, i].mean()
-            ends = np.array([report.lever[:, i].min(), report.lever[:, i].max()])
-            mean = float(np.degrees(report.lag[:, i].mean()))
-            axes.plot(1e3 * ends, mean + slope[0] * (ends - middle), color=RED, linewidth=1)
+        if (slope := report.joints[i].droop_deg_per_m) is not None:
+            lever, mean = report.lever[:, i], float(np.degrees(report.lag[:, i].mean()))
+            ends = np.array([lever.min(), lever.max()])
+            axes.plot(1e3 * ends, mean + slope[0] * (ends - lever.mean()), color=RED, linewidth=1)
         axes.set(title=report.joints[i].name, xlabel="lever of the load, mm", ylabel="difference, deg")
         low, high = axes.get_xlim()
         if high - low < 1.0:  # a joint that gravity does not load: no digits of rounding
@@ -171,11 +169,7 @@ def _drift_figure(report: ArmReport, figure: FigureBase) -> None:
 _FIGURES: dict[str, tuple[str, float, Callable[[ArmReport, FigureBase], None]]] = {
     "parts": ("What explains the error, and what each remedy alone would leave.", 3.2, _parts_figure),
     "map": ("The error over the workspace after base and tool were fitted, enlarged.", 4.6, _map_figure),
-    "joints": (
-        "What each joint lacks of its command by its own sensor, against the gravity load.",
-        4.6,
-        _joints_figure,
-    ),
+    "joints": ("What each joint lacks of its command by its sensor, against the gravity load.", 4.6, _joints_figure),
     "drift": ("The pose that came most often.", 2.8, _drift_figure),
 }
 _PAGE = 13.0  # height of a page of the PDF, inches

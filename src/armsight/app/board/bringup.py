@@ -4,14 +4,13 @@ In: a board with factory values, and an :class:`Operator` who moves joints, read
 stored on the board and written as ``board.toml``, what was found as ``bringup.json``, and a page of figures. The steps:
 
     readings         every potentiometer at rest: its noise; an open or short one by name; encoders without sound readings
-    potentiometers   each joint moved by hand: the table of its potentiometer, direction, range, dead spots; of an encoder
-                     its counts of a revolution, direction and zero
+    potentiometers   each joint moved by hand: its table, direction, range, dead spots; or counts of a revolution and zero
     motors           each motor by a pulse of at most 3 degrees: which joint it moves, which way, from which duty on
     swing            each joint by 10 degrees, after a yes: R, K, inertia, friction, backlash
     verify           all joints by 2 degrees with the gains computed of it
     store            the configuration and the files
 
-What a step found is kept in ``bringup.json`` at once. While a step runs, a silent host makes the board release the motors.
+What a step found is kept at once. While a step runs, a silent host makes the board release the motors.
 """
 
 from __future__ import annotations
@@ -68,7 +67,8 @@ _GENTLE_RAD_S, _GENTLE_NOISE = 12.0, 0.02  # bandwidth of the second swing, and 
 _TRAVEL_RAD, _TRAVEL_S = 1.6, 6.0  # way and time of the travel that shows an uneven transmission
 #: Twist of a spring by its load, rad: more gives way and swings; half: joints that hold are warned of, double: none is.
 _SOFT_TWIST_RAD = 0.2
-_TRACE = 400  # points of a figure's line
+#: Time -> offsets, speeds and duties (6,).
+_Way = Callable[[float], tuple[Array, Array, Array]]
 
 
 class Operator(Protocol):
@@ -136,6 +136,7 @@ class Bringup:
         abilities, name, path = board.welcome.abilities, board.welcome.board, folder / FOUND_FILE
         count = JOINTS if abilities is None else abilities.joints
         self._board, self._person, self._folder = board, person, folder
+        self._goes_on = f"what was found is kept in {folder}: the same command goes on there"
         self._joints, self._again, self._current_a = [j for j in joints if j < count], again, most_current_a
         self.found = Found.read(path) if path.exists() else Found(name, [JointFound() for _ in range(JOINTS)])
         if self.found.board != name:
@@ -153,7 +154,6 @@ class Bringup:
 
     def run(self, steps: Sequence[str] = tuple(STEPS)) -> None:
         """Do the steps, in their order; what was found is kept whatever happens."""
-        goes_on = f"what was found is kept in {self._folder}: the same command goes on there"
         try:
             self._board.watch_sensors(_EVERY_S)
             self.found.supply_v = round(self._board.status.supply_v, 1)
@@ -167,10 +167,10 @@ class Bringup:
             self._person.say("ended; what was found is kept")
         except KeyboardInterrupt:
             self._off()
-            self._person.say(f"motors off; {goes_on}")
+            self._person.say(f"motors off; {self._goes_on}")
             raise
         except DeviceError as error:
-            raise DeviceError(f"{error}; {goes_on}") from None
+            raise DeviceError(f"{error}; {self._goes_on}") from None
         finally:
             self._off()
             with contextlib.suppress(ArmsightError):
@@ -200,16 +200,12 @@ class Bringup:
                 self._person.ask(kind, joint, said)
             self._take(self._sensed(_ASK_S))
             waited_s += _ASK_S
-        raise InputError(
-            f"no answer for {_PATIENCE_S / 60:.0f} minutes; what was found is kept in {self._folder}: the same command"
-            " goes on there"
-        )
+        raise InputError(f"no answer for {_PATIENCE_S / 60:.0f} minutes; {self._goes_on}")
 
     def _yes(self, question: str) -> bool:
         return self._wait("yes", None, f"{question} [y/n]").startswith("y")
 
     def _each(self, step: str, action: Callable[[int], None]) -> None:
-        """Do a step for each joint; a problem is named, and the joint done again or skipped."""
         for joint in self._joints:
             found = self.found.joints[joint]
             missing = [each for each in list(STEPS)[: list(STEPS).index(step)] if not found.done(each)]
@@ -283,9 +279,8 @@ class Bringup:
             if found.range_counts is None or found.counts_per_rev is None:
                 continue
             question = f"joint {j + 1}: its encoder counts from where it was switched on. At which angle is it, degrees"
-            angle = None
-            while angle is None:
-                angle = _angle(self._wait("angle", j, question))
+            while (angle := _angle(self._wait("angle", j, question))) is None:
+                pass
             zero = self._last[j] - angle * found.counts_per_rev / (2 * np.pi)
             shift, found.zero_counts = zero - found.zero_counts, zero
             found.range_counts = [each + shift for each in found.range_counts]
@@ -317,7 +312,6 @@ class Bringup:
             self.found.arm_time_s += float(readings.t_s[-1] - readings.t_s[0]) + _EVERY_S
 
     def _taken(self) -> list[SensorReadings]:
-        """Return what was read since the last call."""
         taken, self._motion = self._motion, []
         return taken
 
@@ -337,13 +331,7 @@ class Bringup:
             raise _Mistake(f"the board stopped: {status.first_fault or status.faults[0]}.")
         return readings
 
-    def _moved(
-        self,
-        seconds: float,
-        way: Callable[[float], tuple[Array, Array, Array]],
-        joint: int = 0,
-        most_rad: float = np.inf,
-    ) -> SensorReadings:
+    def _moved(self, seconds: float, way: _Way, joint: int = 0, most_rad: float = np.inf) -> SensorReadings:
         """Move from where the arm is along a way, time -> offsets (6,), speeds (6,), duties (6,); return what was read."""
         start = self._board.joints.reference_rad.copy()
         self._motion.clear()
@@ -355,7 +343,6 @@ class Bringup:
         return _joined(self._taken())
 
     def _q(self, readings: SensorReadings) -> Array:
-        """Return the joints' angles (n, 6) of readings."""
         return np.stack([self.found.joints[j].angles(readings.counts[:, j]) for j in range(JOINTS)], axis=1)
 
     def _configuration(self, reaction: Reaction, *, gains: bool) -> Configuration:
@@ -438,10 +425,9 @@ class Bringup:
         found = self.found.joints[joint]
         try:
             if (off := found.fit_encoder()) > _UNEVEN_RAD:
-                raise InputError(
-                    f"the angles measured are off an even count by up to {np.degrees(off):.1f} degrees:"
-                    f" {_pairs(np.array(sorted(found.marks)))}. Are counts lost, or was an angle misread? Measure again."
-                )
+                far = f"{np.degrees(off):.1f} degrees: {_pairs(np.array(sorted(found.marks)))}"
+                lost = "Are counts lost, or was an angle misread? Measure again."
+                raise InputError(f"the angles measured are off an even count by up to {far}. {lost}")
         except InputError as error:
             found.range_counts = found.counts_per_rev = None
             raise _mistake(joint, str(error)) from None
@@ -457,7 +443,6 @@ class Bringup:
         self._off()
 
     def _jog(self, joint: int) -> None:
-        """Raise a motor's duty until a joint moves, once each way."""
         self._board.enable(inward=True)
         ways, found = list[float](), self.found.joints[joint]
         for sign in (1.0, -1.0):
@@ -555,7 +540,6 @@ class Bringup:
             self._check_drum(joint, motor, travelled)
 
     def _travel_rad(self, joint: int) -> float:
-        """Return how far a joint travels: to the side where it has more room."""
         ends = self._board.configuration()["joint"][joint]
         here = float(self._board.joints.reference_rad[joint])
         low, high = float(ends["soft_min_rad"]) - here, float(ends["soft_max_rad"]) - here
@@ -571,7 +555,6 @@ class Bringup:
         return self._moved(seconds, way, joint, _SWING_MOST_RAD)
 
     def _of_motor(self, joint: int, readings: SensorReadings) -> tuple[Array, Array, Array, Array]:
-        """Return time, the voltage and current of a joint's motor, and the angle, each (n,)."""
         sign = float(self.found.joints[joint].motor_direction or 1)
         volts, amperes = sign * readings.duty[:, joint] * self.found.supply_v, sign * readings.current_a[:, joint]
         return readings.t_s, volts, amperes, self.found.joints[joint].angles(readings.counts[:, joint])
@@ -595,11 +578,8 @@ class Bringup:
             mend = "Tighten its belt or cable, or put the sensor on the motor's side."
             raise _mistake(joint, f"it is too soft to be held: {swings}, and no gains are stable. {mend}")
         twist_rad = (found.gravity_n_m or 0.0) / found.elastic.stiffness_n_m
-        soft = (
-            f". Its load twists it by {twist_rad:.2f} rad: it is too soft to be held well, and swings when a hand lets go"
-            " of it. Take load off, or tighten its belt or cable"
-        )
-        soft = soft if twist_rad > _SOFT_TWIST_RAD else ""
+        soft = f". Its load twists it by {twist_rad:.2f} rad: it is too soft to be held well, and swings when a hand"
+        soft = f"{soft} lets go. Take load off, or tighten its belt or cable" if twist_rad > _SOFT_TWIST_RAD else ""
         self._say(joint, f"it is elastic: {swings}; it is damped by its motor's speed{soft}")
 
     def _identify(self, joint: int, readings: SensorReadings) -> MotorFigures:
@@ -618,9 +598,8 @@ class Bringup:
             setattr(found, each.name, getattr(fit.motor, each.name))
         found.backlash_rad, found.gravity_n_m = fit.backlash_rad, fit.gravity_n_m
         found.fit_rms_v = float(np.sqrt(np.mean((fit.voltage_v - fit.predicted_v) ** 2)))
-        found.traces |= _traces(
-            swing_t_s=fit.t_s, swing_voltage_v=fit.voltage_v, swing_predicted_v=fit.predicted_v, swing_rad=angles
-        )
+        volts = {"swing_voltage_v": fit.voltage_v, "swing_predicted_v": fit.predicted_v}
+        found.traces |= _traces(swing_t_s=fit.t_s, swing_rad=angles, **volts)
         return fit.motor
 
     def _verify(self) -> None:
@@ -757,7 +736,7 @@ def _only(joint: int | list[int], value: float) -> Array:
     return values
 
 
-def _way(joint: int | list[int], far_rad: float, hz: float) -> Callable[[float], tuple[Array, Array, Array]]:
+def _way(joint: int | list[int], far_rad: float, hz: float) -> _Way:
     """Return the way of joints that go so far and back, so often a second, from rest to rest; as ``_moved`` takes it."""
     rate = 2 * np.pi * hz
 
@@ -769,8 +748,6 @@ def _way(joint: int | list[int], far_rad: float, hz: float) -> Callable[[float],
 
 
 def _swing_at(t_s: float, seconds: float) -> tuple[float, float]:
-    """Return angle and speed of a swing that begins and ends smoothly."""
-
     def angle(t: float) -> float:
         grow = float(np.clip(min(t, seconds - t) / _GROW_S, 0.0, 1.0))
         swing = sum(a * np.sin(2 * np.pi * f * t) for a, f in zip(_SWING_RAD, _SWING_HZ, strict=True))
@@ -786,7 +763,7 @@ def _dither_at(t_s: float) -> float:
 
 
 def _traces(**lines: Array) -> dict[str, list[float]]:
-    return {name: [round(float(v), 5) for v in each[:: max(1, len(each) // _TRACE)]] for name, each in lines.items()}
+    return {name: [round(float(v), 5) for v in each[:: max(1, len(each) // 400)]] for name, each in lines.items()}
 
 
 def _pairs(marks: Array) -> str:

@@ -40,11 +40,6 @@ STEPS = {
 }
 
 
-def _new_offsets_file() -> Path:
-    """Return where old offsets are kept: a file that is not there yet."""
-    return unused(Path("old_offsets.json"))
-
-
 _BOARD = option(
     "emulated: (unicorn, qemu or host behind it), serial:PORT, feetech:PORT[,LEROBOT.json] or ar4:PORT; ,baud=N behind a "
     "port.",
@@ -93,9 +88,7 @@ def command() -> None:
 @command.command("build")
 @declared
 def build_(
-    name: str | None = option(
-        "Build this board's image; by default the firmware that armsight emulates.", "--board", metavar="NAME"
-    ),
+    name: str | None = option("This board's image; by default the one armsight emulates.", "--board", metavar="NAME"),
     output: Path = _FOLDER,
     compiler: str | None = _COMPILER,
     as_json: bool = JSON,
@@ -158,8 +151,7 @@ def monitor(
             states = board.receive(every)
             passed += every
             if (now := not_homed(board)) != said:
-                note(f"{now or 'all joints are homed'}")
-                said = now
+                note((said := now) or "all joints are homed")
             if not is_real(name):
                 time.sleep(every)  # its time passes at once
             print_answer(as_json, text.status_json(board, states), text.status_text(board, states))
@@ -169,9 +161,7 @@ def monitor(
 @declared
 def gains(
     name: str = _BOARD,
-    changes: tuple[str, ...] = option(
-        "Such as 3:kp_per_rad=5 or all:ki_per_rad_s=0.", "--set", metavar="JOINT:NAME=VALUE"
-    ),
+    changes: tuple[str, ...] = option("3:kp_per_rad=5 or all:ki_per_rad_s=0.", "--set", metavar="JOINT:NAME=VALUE"),
     store: bool = option("Keep them over a restart too; only with the drives off."),
     as_json: bool = JSON,
 ) -> None:
@@ -231,12 +221,7 @@ def selftest_(
 @declared
 def bringup(
     name: str = _BOARD,
-    folder: Path = out(
-        "DIR",
-        "Folder of board.toml, report.html, and bringup.json, where what was found is kept.",
-        default="bringup",
-        report=True,
-    ),
+    folder: Path = out("DIR", "Folder of board.toml, report.html and what was found.", default="bringup", report=True),
     steps: tuple[str, ...] = option("Only this step; may be repeated.", "--step", choices=STEPS),
     joints: tuple[int, ...] = option("Only this joint; may be repeated.", "--joint", min=1, max=6),
     encoders: tuple[str, ...] = option(
@@ -288,7 +273,6 @@ def bringup(
 
 
 def _encoders(given: tuple[str, ...]) -> dict[int, tuple[SensorKind, int]]:
-    """Return kind and input of the encoders given, by joint from 0."""
     from armsight.robot.boards.codes import SensorKind
 
     found: dict[int, tuple[SensorKind, int]] = {}
@@ -382,18 +366,14 @@ def release(name: str = _BOARD, as_json: bool = JSON) -> None:
 @declared
 def offsets(
     name: str = _BOARD,
-    identified: str | None = option(
-        "Correct by what `armsight identify` found; with --arm, the arm it began with.", metavar="ARM"
-    ),
+    identified: str | None = option("Correct by what `armsight identify` found; needs --arm.", metavar="ARM"),
     nominal: str | None = option("The nominal arm of --identified.", "--arm", metavar="ARM"),
-    further: str | None = option(
-        "Correct by these: true angle less reported one of each joint, degrees.", metavar="DEG,..."
-    ),
+    further: str | None = option("Correct by these: true less reported angles, degrees.", metavar="DEG,..."),
     restore: Path | None = option("Write back what --keep has kept.", metavar="FILE"),
     keep: Path = option(
         "New file for the offsets as they were; otherwise old_offsets.json, or with -2, -3 ...",
         metavar="FILE",
-        default=_new_offsets_file,
+        default=lambda: unused(Path("old_offsets.json")),
         show_default=False,
     ),
     yes: bool = _YES,
@@ -434,9 +414,7 @@ def offsets(
 
     if name.startswith("ar4:"):
         if not (file := name.removeprefix("ar4:")).endswith((".yaml", ".yml")):
-            raise InputError(
-                f"{name}: an AR4 keeps no zeros; its driver's joint_offsets file does: --board ar4:mk3.yaml"
-            )
+            raise InputError(f"{name}: an AR4 keeps no zeros; its driver's file does: --board ar4:mk3.yaml")
         offer(kept.ar4_zeros(Path(file), angles, restore, keep))
     elif name.startswith("feetech:"):
         with open_any(name) as board:
@@ -546,9 +524,8 @@ def set_(
             try:
                 put(changed, path, tomllib.loads(f"value = {text}")["value"])
             except tomllib.TOMLDecodeError:
-                if not path.endswith(
-                    (".sync_led_pin", ".encoder.sensor")
-                ):  # names, which a shell takes the quotes from
+                # Names, which a shell takes the quotes from.
+                if not path.endswith((".sync_led_pin", ".encoder.sensor")):
                     raise InputError(f"{change}: a path, = and a number are needed: joint.3.soft_max_rad=1.2") from None
                 put(changed, path, text)
         board.store(changed)
@@ -556,7 +533,6 @@ def set_(
 
 
 def _same_board(file: Path, name: str, board: Board) -> None:
-    """Raise InputError where a file is for another board."""
     if name != board.welcome.board:
         raise InputError(f"{file} is for board {name}; this one is {board.welcome.board}; nothing was changed")
 

@@ -79,11 +79,8 @@ def _dfu_util(built: Built) -> list[list[str]]:
 
 
 #: Programmer -> what to call; the first one installed is taken.
-PROGRAMMERS: Mapping[str, Callable[[Built], list[list[str]]]] = {
-    "st-flash": _st_flash,
-    "openocd": _openocd,
-    "dfu-util": _dfu_util,
-}
+_Calls = Callable[[Built], list[list[str]]]
+PROGRAMMERS: Mapping[str, _Calls] = {"st-flash": _st_flash, "openocd": _openocd, "dfu-util": _dfu_util}
 
 
 def flash(built: Built, programmer: str | None = None) -> str:
@@ -100,6 +97,6 @@ def flash(built: Built, programmer: str | None = None) -> str:
         if ran.returncode:
             said = (ran.stderr.strip() or ran.stdout.strip() or "nothing said").splitlines()[-1]
             raise DeviceError(
-                f"{name} could not write the board ({said}): is it plugged in and powered? The firmware lies in {lies}"
+                f"{name} could not write the board ({said}): is it plugged in? The firmware lies in {lies}"
             )
     return name

@@ -52,18 +52,15 @@ def _is_pair(value: object) -> bool:
     return isinstance(value, list) and len(value) == 2 and all(map(_is_number, value))
 
 
+_POSITIVE = "resistance_ohm constant_v_s inertia_kg_m2 stiffness_n_m"
+_NOT_NEGATIVE = (
+    "noise_counts breakaway_duty viscous_n_m_s dry_n_m backlash_rad gravity_n_m fit_rms_v following_rms_rad "
+    "spring_damping_n_m_s uneven"
+)
 #: What can have been found of a joint, by name; None where it was not yet.
 _POSSIBLE: Mapping[str, Callable[[Any], bool]] = {
-    **dict.fromkeys(
-        ("resistance_ohm", "constant_v_s", "inertia_kg_m2", "stiffness_n_m"), lambda v: _is_number(v) and v > 0
-    ),
-    **dict.fromkeys(
-        (
-            *("noise_counts", "breakaway_duty", "viscous_n_m_s", "dry_n_m", "backlash_rad"),
-            *("gravity_n_m", "fit_rms_v", "following_rms_rad", "spring_damping_n_m_s", "uneven"),
-        ),
-        lambda v: _is_number(v) and v >= 0,
-    ),
+    **dict.fromkeys(_POSITIVE.split(), lambda v: _is_number(v) and v > 0),
+    **dict.fromkeys(_NOT_NEGATIVE.split(), lambda v: _is_number(v) and v >= 0),
     "link_share": lambda v: _is_number(v) and 0 < v < 1,
     "motor_direction": lambda v: v in (1, -1),
     "sensor": lambda v: v in [kind.name.lower() for kind in SensorKind],
@@ -150,10 +147,8 @@ class JointFound:
         per_rev = float(2 * np.pi * slope)
         if self.kind == SensorKind.ABSOLUTE:
             if not 0.95 < abs(per_rev) / ENCODER_REV < 1.05:
-                raise InputError(
-                    f"its encoder counts {abs(per_rev):.0f} a revolution of the joint; an absolute one must count"
-                    f" {ENCODER_REV}. Is its magnet on the joint's own axis?"
-                )
+                must = f"an absolute one must count {ENCODER_REV}. Is its magnet on the joint's own axis?"
+                raise InputError(f"its encoder counts {abs(per_rev):.0f} a revolution of the joint; {must}")
             per_rev = float(np.copysign(ENCODER_REV, per_rev))
             offset = np.mean(marks[:, 0] - per_rev / (2 * np.pi) * marks[:, 1])
         self.counts_per_rev, self.zero_counts = float(round(per_rev)), float(offset)
@@ -225,9 +220,8 @@ class Found:
             found._check()
             return found
         except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise InputError(
-                f"{path}: not what a bring-up kept ({error}): remove it, or name another folder with -o"
-            ) from None
+            mend = "remove it, or name another folder with -o"
+            raise InputError(f"{path}: not what a bring-up kept ({error}): {mend}") from None
 
     def _check(self) -> None:
         """Raise ValueError where a value cannot have been found: its file was changed by hand."""
@@ -251,14 +245,9 @@ class Found:
     def configuration(self, most_current_a: float, reaction: Reaction, *, gains: bool) -> Configuration:
         """Return the configuration of what is known; without ``gains`` joints are not controlled and nothing is watched."""
         config, supply = lab_configuration(), self.supply_v
-        _put(
-            config,
-            joint_count=self.joint_count,
-            supply_nominal_mv=round(1e3 * supply),
-            supply_min_mv=round(800 * supply),
-            supply_max_mv=round(1200 * supply),
-            silence_reaction=reaction,
-        )
+        for name, share in (("nominal", 1.0), ("min", 0.8), ("max", 1.2)):
+            config[f"supply_{name}_mv"] = round(1e3 * share * supply)
+        _put(config, joint_count=self.joint_count, silence_reaction=reaction)
         for joint, found in zip(config["joint"], self.joints, strict=True):
             _put_sensor(joint, found)
             current_ma = round(1e3 * most_current_a)
@@ -276,7 +265,6 @@ def _put(record: Configuration, **values: object) -> None:
 
 
 def _put_sensor(joint: Configuration, found: JointFound) -> None:
-    """Put what reads a joint, and its soft limits."""
     counts, angles, direction = found.pot_table()
     low, high = sorted((direction * angles[0], direction * angles[-1]))
     _put(joint, soft_min_rad=low + _MARGIN_RAD, soft_max_rad=high - _MARGIN_RAD)

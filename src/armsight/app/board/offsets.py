@@ -1,10 +1,8 @@
 """``armsight board offsets``: the zeros where an arm keeps them, corrected by what ``armsight identify`` found.
 
-In: an identified arm or angles, and where the zeros are: register 31 of the servos of a bus, and LeRobot's calibration file
-beside it; the ``joint_offsets`` file of ar4_ros_driver; the tables of the potentiometers on a board with our firmware. Out:
-the same with other zeros, and a file of the old ones, written first; ``--restore`` writes that back.
-
-Each of the three is :class:`Zeros`: what would change, what looks like a mistake in it, how it is written.
+The zeros are in register 31 of the servos of a bus, and LeRobot's calibration file beside it; in the ``joint_offsets`` file
+of ar4_ros_driver; in the tables of the potentiometers on a board with our firmware: each is :class:`Zeros`. The old ones
+are written to a file first; ``--restore`` writes that back.
 """
 
 from __future__ import annotations
@@ -31,12 +29,7 @@ from armsight.robot.boards.codes import Command
 from armsight.robot.boards.configuration import JOINTS, Configuration, check_configuration
 from armsight.robot.boards.feetech.board import FeetechBoard
 from armsight.robot.boards.feetech.calibration import read_calibration, write_offsets
-from armsight.robot.boards.feetech.offsets import (
-    corrected_offsets,
-    doubts,
-    require_released,
-    write_changes,
-)
+from armsight.robot.boards.feetech.offsets import corrected_offsets, doubts, require_released, write_changes
 from armsight.robot.boards.feetech.registers import MOST_OFFSET, RAD_PER_COUNT, TORQUE
 from armsight.robot.kinematics.arm import Arm
 
@@ -70,9 +63,7 @@ def further_of(identified: str, nominal: Arm) -> Array:
 
 def parsed_degrees(text: str) -> Array:
     """Return angles, rad, of a text such as 0.5,-1.2,0,0,0 in degrees."""
-    with as_input_error(
-        f"--further {text}: numbers of degrees with commas between are needed, one a joint", ValueError
-    ):
+    with as_input_error(f"--further {text}: expected numbers of degrees with commas between, one a joint", ValueError):
         return np.radians([float(each) for each in text.split(",")])
 
 
@@ -150,9 +141,7 @@ def offer_release(board: FeetechBoard, *, changes: bool, yes: bool) -> None:
         board.confirm(board.command(Command.DISABLE))
 
 
-def servo_zeros(
-    board: FeetechBoard, further_rad: Array | None, restore: Path | None, calibration: Path | None
-) -> Zeros:
+def servo_zeros(board: FeetechBoard, further_rad: Array | None, restore: Path | None, lerobot: Path | None) -> Zeros:
     """Return the homing offsets of the servos of a bus, and of LeRobot's file where there is one; torques must be off."""
     none, bus = np.zeros(board.abilities.joints), board.bus
     changes = corrected_offsets(bus, board.calibration, none if further_rad is None else further_rad)
@@ -163,41 +152,32 @@ def servo_zeros(
     require_released(bus, changes)
 
     def write(keep: Path) -> None:
-        check_outputs([keep], [calibration])
-        if calibration is not None:
-            read_calibration(calibration)
-            check_writable(calibration)
+        check_outputs([keep], [lerobot])
+        if lerobot is not None:
+            read_calibration(lerobot)
+            check_writable(lerobot)
         old = {"homing_offsets": {str(c.id): c.old for c in changes}, "names": [c.name for c in changes]}
         keep_old(keep, json.dumps(old, indent=1) + "\n")
         write_changes(bus, changes)
-        if calibration is not None:
-            write_offsets(calibration, calibration, {c.id: c.new for c in changes})
+        if lerobot is not None:
+            write_offsets(lerobot, lerobot, {c.id: c.new for c in changes})
 
-    lines = [f"{'joint':16}{'id':>4}{'old':>8}{'new':>8}{'change':>12}"]
-    lines += [
-        f"{c.name:16}{c.id:4}{c.old:8}{c.new:8}{np.degrees((c.new - c.old) * RAD_PER_COUNT):8.2f} deg" for c in changes
-    ]
+    deg, lines = np.degrees(RAD_PER_COUNT), [f"{'joint':16}{'id':>4}{'old':>8}{'new':>8}{'change':>12}"]
+    lines += [f"{c.name:16}{c.id:4}{c.old:8}{c.new:8}{deg * (c.new - c.old):8.2f} deg" for c in changes]
     shown = [{"name": c.name, "id": c.id, "old_counts": c.old, "new_counts": c.new} for c in changes]
     return Zeros("write the new offsets to the servos?", shown, "\n".join(lines), said, write)
 
 
 def _kept_offsets(board: FeetechBoard, path: Path) -> dict[int, int]:
-    with as_input_error(
-        f"{path}: not a file of old offsets that `armsight board offsets` kept",
-        KeyError,
-        TypeError,
-        ValueError,
-        AttributeError,
-    ):
+    what = f"{path}: not a file of old offsets that `armsight board offsets` kept"
+    with as_input_error(what, KeyError, TypeError, ValueError, AttributeError):
         wished = {int(id): int(value) for id, value in read_json(path)["homing_offsets"].items()}
     for id, value in wished.items():
         if abs(value) > MOST_OFFSET:
             holds = f"the register holds -{MOST_OFFSET} to {MOST_OFFSET}"
             raise InputError(f"{path}: the offset of id {id} is {value}; {holds}")
     if set(wished) != set(board.calibration.ids):
-        raise InputError(
-            f"{path}: its offsets are of ids {sorted(wished)}, the arm's are {sorted(board.calibration.ids)}"
-        )
+        raise InputError(f"{path}: its offsets are of ids {sorted(wished)}, the arm's {sorted(board.calibration.ids)}")
     return wished
 
 
@@ -219,9 +199,7 @@ def ar4_changes(path: Path, further_rad: Array) -> tuple[str, list[ZeroChange]]:
 
     text = _AR4_LINE.sub(corrected, read_text(path))
     if sorted(each.name for each in changes) != [f"joint_{k}" for k in range(1, len(SENSE) + 1)]:
-        raise InputError(
-            f"{path}: no joint_offsets of ar4_ros_driver: joint_1: to joint_6: are needed, once each, degrees"
-        )
+        raise InputError(f"{path}: no joint_offsets of ar4_ros_driver: each of joint_1: to joint_6: once, degrees")
     return text, changes
 
 

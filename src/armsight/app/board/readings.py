@@ -34,11 +34,7 @@ def _check_homed(board: MotionBoard, name: str) -> None:
 
 
 class BoardReadings:
-    """Reads the joints of the board of this name, from :meth:`start` on.
-
-    Raises:
-        InputError: there is no such kind of board. One whose port is not there is waited for.
-    """
+    """Reads the joints of a board from :meth:`start` on; an InputError: no such kind; a missing port is waited for."""
 
     def __init__(self, name: str) -> None:
         with contextlib.suppress(DeviceError):

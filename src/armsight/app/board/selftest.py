@@ -1,8 +1,7 @@
 """The board's self-test: the scenarios that every board must pass, a hash of its answers, its speed and its size.
 
-In: the name of a board. Out: a :class:`SelftestResult`. A scenario is a function of a :class:`BoardTestRig`: it moves the
-board as a host would, disturbs its wire, and notes on the rig what is not as it must be. Those in :data:`DRIVEN` switch the
-drives on, those in :data:`AT_REST` only on a rig that may: the drives of a real board whose arm is not to move stay off.
+A scenario is a function of a :class:`BoardTestRig`: it moves the board as a host would, disturbs its wire, and notes on the
+rig what is not as it must be. Those in :data:`AT_REST` also run where the drives of a real board must stay off.
 """
 
 from __future__ import annotations
@@ -323,22 +322,11 @@ def gain_change(rig: BoardTestRig) -> None:
 
 
 DRIVEN: Mapping[str, Scenario] = {
-    "nominal": nominal,
-    "crc_faults": crc_faults,
-    "host_loss": host_loss,
-    "sensor_faults": sensor_faults,
-    "e_stop": e_stop,
-    "gain_change": gain_change,
+    each.__name__: each for each in (nominal, crc_faults, host_loss, sensor_faults, e_stop, gain_change)
 }
 #: What needs an arm whose sensors can be broken, and what also runs with the drives off.
 EMULATED_ONLY, AT_REST = ("sensor_faults",), ("nominal", "crc_faults", "e_stop", "gain_change")
-_POT_FAULTS = {
-    PotFault.OPEN: Fault.POT_OPEN,
-    PotFault.SHORT: Fault.POT_SHORT,
-    PotFault.FROZEN: Fault.POT_FROZEN,
-    PotFault.JUMP: Fault.POT_JUMP,
-    PotFault.INVERTED: Fault.POT_INVERTED,
-}
+_POT_FAULTS = {PotFault[name]: Fault[f"POT_{name}"] for name in ("OPEN", "SHORT", "FROZEN", "JUMP", "INVERTED")}
 
 
 def _rejection(rig: BoardTestRig) -> Rejection:
@@ -362,11 +350,10 @@ def _expect_fault(rig: BoardTestRig, fault: Fault, joint: int | None) -> None:
     first = status.first_fault
     named = first is not None and (first.fault, first.joint) == (fault, joint)
     rig.expect(named, f"{fault.name} is reported as: {'nothing' if first is None else first}")
-    if joint is None:
-        rig.expect(not status.drives_on, f"{fault.name} leaves the drives on")
-    else:
-        driven = bool(rig.board.joints.duty[joint])
-        rig.expect(not driven, f"{fault.name} leaves the drive of joint {joint + 1} on")
+    driven, which = status.drives_on, "drives"
+    if joint is not None:
+        driven, which = bool(rig.board.joints.duty[joint]), f"drive of joint {joint + 1}"
+    rig.expect(not driven, f"{fault.name} leaves the {which} on")
 
 
 _SMALL_RAD = 0.05  # a real arm swings by this much where it may move, rad: less than 3 degrees
@@ -400,12 +387,8 @@ class SelftestResult:
 
     def record(self) -> dict[str, Any]:
         """Return it ready for JSON."""
-        scenarios = {
-            name: {"passed": not each.problems, "trace_sha256": each.trace_sha256}
-            for name, each in self.scenarios.items()
-        }
-        speed = round(self.ticks_per_s, 1)
-        return {"board": self.board, "scenarios": scenarios, "ticks_per_s": speed, "elf": self.elf}
+        found = {n: {"passed": not s.problems, "trace_sha256": s.trace_sha256} for n, s in self.scenarios.items()}
+        return {"board": self.board, "scenarios": found, "ticks_per_s": round(self.ticks_per_s, 1), "elf": self.elf}
 
 
 def run_scenario(scenario: Scenario, emulator: Emulator) -> ScenarioResult:
@@ -459,9 +442,8 @@ def _on_real(
 ) -> tuple[ScenarioResult, Array]:
     """Run a scenario on a real board, its drives off afterwards; returns where its joints are at home, too."""
     problems, link = list[str](), SerialLink.open(port, baud)
-    rig = BoardTestRig.connect(
-        link, None, problems, amplitude_rad=_SMALL_RAD, home_rad=home_rad, driven=drives, name=port
-    )
+    how: Any = {"amplitude_rad": _SMALL_RAD, "home_rad": home_rad, "driven": drives, "name": port}
+    rig = BoardTestRig.connect(link, None, problems, **how)
     try:
         scenario(rig)
     except ArmsightError as error:
@@ -477,5 +459,4 @@ def _ticks_per_s(port: str, baud: int) -> float:
         board.receive(0.1)
         start, from_s = time.perf_counter(), board.joints.t_s
         board.receive(_SPEED_S)
-        took_s = time.perf_counter() - start
-        return (board.joints.t_s - from_s) * board.welcome.ticks_per_s / took_s
+        return (board.joints.t_s - from_s) * board.welcome.ticks_per_s / (time.perf_counter() - start)

@@ -121,10 +121,8 @@ def with_gains(config: Configuration, values: Array) -> Configuration:
 
 def selftest_text(result: SelftestResult) -> str:
     """Return the result of a self-test as lines."""
-    lines = [
-        f"{name:14} {'failed' if each.problems else 'passed'}  {(each.trace_sha256 or '')[:16]}".rstrip()
-        for name, each in result.scenarios.items()
-    ]
+    each = [(n, "failed" if s.problems else "passed", (s.trace_sha256 or "")[:16]) for n, s in result.scenarios.items()]
+    lines = [f"{name:14} {how}  {trace}".rstrip() for name, how, trace in each]
     lines.append(f"{result.ticks_per_s:.0f} ticks/s, {result.ticks_per_s / 1000:.1f} times real time")
     if (sizes := result.elf)["flash_bytes"] is not None:
         lines.append(f"flash {sizes['flash_bytes']}, RAM {sizes['ram_bytes']} bytes, {_floats(sizes['hard_float'])}")

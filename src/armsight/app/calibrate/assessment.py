@@ -1,8 +1,7 @@
 """Assessment of a calibration: its predicted uncertainty in space, and its held-out metrics with a grade each.
 
-In: a Calibration. Out: the predicted sigma of a triangulated point where both cameras see, split into the shares of pixel
-noise and of calibration, computed as in a measurement (:func:`predicted_sigmas`, :func:`volume_slice`); and metrics of the
-held-out errors with grades and advice. The limits of the grades are a guide for the reader; nothing is rejected by them.
+The predicted sigma of a triangulated point is split into the shares of pixel noise and of calibration, as in a measurement
+(:func:`predicted_sigmas`, :func:`volume_slice`). The grades are a guide for the reader; nothing is rejected by them.
 """
 
 from __future__ import annotations
@@ -44,14 +43,10 @@ class Slice(Record):
 
 
 def predicted_sigmas(rig: StereoRig, p_left: Array, variance_px2: Array) -> tuple[Array, Array]:
-    """Predict the uncertainty of triangulated points.
+    """Return one sigma of triangulated points along the line of sight and, at worst, across it, (3, N) m, by SHARES.
 
-    ``p_left``: (N, 3) points, m, left camera's frame. ``variance_px2``: (2,) variance of a detection in the left and
-    the right image, px^2.
-
-    Returns:
-        (3, N) one sigma along the line of sight from between the cameras, m, by SHARES; (3, N) across it, in the worse
-        direction, m. NaN where a point is not in both images.
+    ``p_left``: (N, 3) points, m, left camera's frame. ``variance_px2``: (2,) of a detection left and right, px^2. NaN
+    where a point is not in both images.
     """
     T, size = rig.T_left_right, np.array([camera.image_size_px for camera in rig.cameras])
     p_right = (p_left - T[:3, 3]) @ T[:3, :3]

@@ -26,9 +26,7 @@ class CalibrateOptions:
         "detections:D.csv of a body.",
         metavar="SOURCE",
     )
-    alone: str | None = option(
-        "Globs of more images of the target by one camera alone, or empty.", metavar="LEFT,RIGHT"
-    )
+    alone: str | None = option("Globs of more images by one camera alone, or empty.", metavar="LEFT,RIGHT")
     target: str = option(
         "The target, such as chessboard:9x6:25mm (inner corners, square); of detections the body's points.",
         metavar="SPEC|BODY.csv",
@@ -41,9 +39,7 @@ class CalibrateOptions:
     )
     folds: int = option("Parts for the held-out errors.", min=2, default=FOLDS)
     output: Path = out("RIG.json", "The rig to write.", kind=IS_RIG)
-    report: Path | None = out(
-        "DIR", "Write an HTML report with figures; needs armsight[report].", "--report", report=True
-    )
+    report: Path | None = out("DIR", "Write a report with figures; needs armsight[report].", "--report", report=True)
     as_json: bool = JSON
 
 
@@ -58,9 +54,7 @@ def command(o: CalibrateOptions) -> int:
     """
     images = not o.source.startswith(DETECTIONS)
     if images == (o.cameras is not None):
-        raise InputError(
-            "--cameras and --source detections:D.csv belong together; images show the intrinsics themselves"
-        )
+        raise InputError("--cameras and --source detections:D.csv belong together; images show the intrinsics")
     if o.refine_body is not None and images:
         raise InputError("--refine-body goes with detections; a target in images is estimated without it")
     if o.alone is not None and not images:

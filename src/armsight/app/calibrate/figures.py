@@ -137,7 +137,6 @@ def _image_axes(axes: Axes, calibration: Calibration, side: int, title: str) -> 
 
 
 def _tall(calibration: Calibration) -> float:
-    """Return the height of two images side by side at the report's width, inches."""
     return 0.46 * WIDTH_IN * max(h / w for w, h in (camera.image_size_px for camera in calibration.rig.cameras))
 
 
@@ -162,11 +161,7 @@ def coverage_figure(calibration: Calibration) -> Figure:
 
 
 def mean_residuals(calibration: Calibration, side: int) -> tuple[Array, Array, Array]:
-    """Average one camera's residuals over cells.
-
-    Returns:
-        (C, 2) mean positions, px; (C, 2) mean residuals, px; (C,) their length over their standard error.
-    """
+    """Return of a camera's cells mean positions (C, 2), residuals (C, 2), px, and their length over its sigma (C,)."""
     uv, residuals = corners(calibration, side)
     _, edges_u, edges_v = grid_counts(calibration, side, MEAN_CELLS)
     cell = np.digitize(uv[:, 0], edges_u) * (len(edges_v) + 1) + np.digitize(uv[:, 1], edges_v)

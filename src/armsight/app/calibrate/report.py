@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from armsight.app.calibrate import figures
 from armsight.app.calibrate.assessment import (
     BEYOND,
     SHARES,
@@ -20,16 +21,6 @@ from armsight.app.calibrate.assessment import (
     predicted_sigmas,
     target,
     target_points,
-)
-from armsight.app.calibrate.figures import (
-    MOST_BARS,
-    OUTSTANDING,
-    STANDS_OUT,
-    coverage_figure,
-    pairs_figure,
-    residuals_figure,
-    target_figure,
-    volume_figure,
 )
 from armsight.app.show.messages import weak
 from armsight.app.show.page import PAGE, bullets, folded, table, text
@@ -47,23 +38,15 @@ _ROUNDING = 1e-12
 #: Lines of a kind that are printed, of rejected pairs, and shown, of notes; half, double: so many.
 _LISTED = 8
 #: Why the reprojection RMS may be far below the epipolar RMS of the same fit.
-MOTION_FITTED = (
-    "The reprojection follows the board, which moved between the two exposures of a pair; the epipolar RMS does not."
-)
+MOTION_FITTED = "The reprojection follows the board, which moved between the two exposures; the epipolar RMS does not."
 
 
 def headline_table(calibration: Calibration) -> str:
     """Return the held-out metrics beside those of the fit, each with its meaning and its grade."""
-    rows = [
-        (
-            text(row.name),
-            f"<b>{text(row.heldout)}</b>",
-            text(row.fit),
-            f'<span class="grade {row.grade}">{row.grade}</span>' if row.grade else "your call",
-            text(row.meaning),
-        )
-        for row in graded_metrics(calibration)
-    ]
+    rows = list[tuple[str, ...]]()
+    for row in graded_metrics(calibration):
+        grade = f'<span class="grade {row.grade}">{row.grade}</span>' if row.grade else "your call"
+        rows.append((text(row.name), f"<b>{text(row.heldout)}</b>", text(row.fit), grade, text(row.meaning)))
     meaning = "Error of the fitted model at the points it was fitted to. It does not predict errors in millimetres."
     meaning += "" if calibration.motion is None else f" {MOTION_FITTED}"
     rows.append(("reprojection RMS", "–", f"{calibration.reprojection_rms_px:.3g} px", "", meaning))
@@ -147,7 +130,7 @@ class Captioned(NamedTuple):
 FIGURES = {
     "coverage": Captioned(
         "Coverage of the images",
-        coverage_figure,
+        figures.coverage_figure,
         "Maps of both images: how many points were seen in which part",
         "points of the {what} (dots) in nearly all cells of both images, up to their corners. Colour: their number. The "
         f"percentages are counted in {COVERAGE_GRID} x {COVERAGE_GRID} cells, larger than those of the map.",
@@ -156,27 +139,28 @@ FIGURES = {
     ),
     "residuals": Captioned(
         "Residuals of the fit",
-        residuals_figure,
+        figures.residuals_figure,
         "Residual vectors over both images, every point and averaged by region",
         "above, short arrows in all directions, alike in both images, as random noise is: one sigma of a point along u or "
         "v is {sigma[0]:.3g} px left and {sigma[1]:.3g} px right. Below, tiny arrows without a pattern. Note the scale "
         "over each panel.",
         "neighbours that point the same way, or a vortex or a star below: the lens differs from its model there, or the "
-        f"{{what}} from its drawing. Red arrows are more than {STANDS_OUT:g} times their own uncertainty. "
+        f"{{what}} from its drawing. Red arrows are more than {figures.STANDS_OUT:g} times their own uncertainty. "
         "Longer arrows in one image than in the other: that camera is out of focus, moves, or has too little light.",
     ),
     "pairs": Captioned(
         "Held-out errors by pair",
-        pairs_figure,
+        figures.pairs_figure,
         "Bars: held-out epipolar and rigid error of every pair",
         "bars of similar length, all blue.{few}",
-        f"orange bars, more than {OUTSTANDING:g} times the median. A pair that stands out in the epipolar error moved "
-        "between the two images or was taken at two moments; one that stands out in the rigid error only was blurred, "
-        "far away or bent. Look at its images and take it again. Each pair was measured with a rig fitted without it.",
+        f"orange bars, more than {figures.OUTSTANDING:g} times the median. A pair that stands out in the epipolar error "
+        "moved between the two images or was taken at two moments; one that stands out in the rigid error only was "
+        "blurred, far away or bent. Look at its images and take it again. Each pair was measured with a rig fitted "
+        "without it.",
     ),
     "volume": Captioned(
         "Predicted uncertainty of a measurement",
-        volume_figure,
+        figures.volume_figure,
         "Maps of the predicted depth and lateral sigma over a slice of the volume",
         "one sigma of a triangulated point, in a slice through the middle of the {what}'s positions (dots): of 100 "
         "measurements of a point, 95 have an error of less than two sigma. Depth is along the line of sight, and its sigma "
@@ -189,7 +173,7 @@ FIGURES = {
     ),
     "target": Captioned(
         "Shape of the target",
-        target_figure,
+        figures.target_figure,
         "Map of the target's deviation from its drawing",
         "the deviation of the target from its drawing, {deviation_mm:.2g} mm RMS: a few hundredths of a "
         "millimetre for a target on glass or aluminium, tenths for paper on card. It was estimated together with the "
@@ -203,11 +187,12 @@ FIGURES = {
 
 def _words(calibration: Calibration) -> dict[str, object]:
     pairs = len(calibration.errors.pair)
+    most, few = figures.MOST_BARS, " The {} with the largest rigid error are shown."
     return {
         "what": target(calibration),
         "sigma": np.sqrt(corner_variance_px2(calibration)),
         "deviation_mm": 1e3 * calibration.deviation_m,
-        "few": f" The {MOST_BARS} with the largest rigid error are shown." if pairs > MOST_BARS else "",
+        "few": few.format(most) if pairs > most else "",
     }
 
 
@@ -220,7 +205,6 @@ def _rejected(calibration: Calibration) -> dict[str, list[str]]:
 
 
 def _result(calibration: Calibration) -> str:
-    """Return the assessment, the held-out metrics, what is weak, and which pairs were rejected or used in part."""
     used = len(calibration.pairs)
     weak_points = bullets(advice(calibration)) or "<p>None.</p>\n"
     rejected = f"<p>None: all {used} pairs were used.</p>\n"
@@ -267,15 +251,12 @@ def _parameters(calibration: Calibration) -> str:
 
 def _provenance(rig: StereoRig) -> str:
     shown = {key: round(value, 6) if isinstance(value, float) else value for key, value in rig.provenance.items()}
-    rows = [
-        (text(key), text(value if isinstance(value, str) else json.dumps(value, ensure_ascii=False, default=str)))
-        for key, value in shown.items()
-    ]
+    texts = {k: v if isinstance(v, str) else json.dumps(v, ensure_ascii=False, default=str) for k, v in shown.items()}
+    rows = [(text(key), text(value)) for key, value in texts.items()]
     return table(("", ""), rows, "provenance") if rows else "<p>Nothing is recorded.</p>"
 
 
 def _printed(calibration: Calibration, output: Path, board_file: Path | None, page: Path | None) -> str:
-    """Return what is printed: the held-out errors first, then those of the fit, then what is weak."""
     c, h, poor, rejected = calibration, calibration.held_out, _poor(calibration), _rejected(calibration)
     rows = (
         ("epipolar RMS", f"{h.epipolar_rms_px:.3f} px"),
@@ -332,28 +313,12 @@ def calibration_report(
     sections["parameters"] = "Parameters of the cameras", [Html(_parameters(c))]
     sections["provenance"] = "Provenance", [Html(_provenance(c.rig))]
     sections["printed"] = "", [Text(_printed(c, output, board_file, page))]
-    values = {
-        "pairs_found": c.pairs_found,
-        "pairs_used": len(c.pairs),
-        "rejected": c.rejected,
-        "notes": c.notes,
-        "weaknesses": c.weaknesses,
-        "grade": graded[0],
-        "poor": _poor(c),
-        "fit": {"epipolar_rms_px": c.epipolar_rms_px, "reprojection_rms_px": c.reprojection_rms_px},
-        "heldout": c.held_out,
-        "models": c.models,
-        "baseline_m": c.rig.baseline_m,
-        "convergence_deg": c.rig.convergence_deg,
-        "distortion_model": c.rig.left.model,
-        "sigma_px": c.rig.sigma_px,
-        "body_deviation_rms_m": c.deviation_m,
-        "disc_radius_m": c.disc_radius_m,
-        "shutters": None if c.rig.shutters is None else c.rig.shutters.to_json(),
-        "rig": output,
-        "board": board_file,
-        "report": page,
-        "seconds": seconds,
-    }
+    values = {name: getattr(c, name) for name in ("pairs_found", "rejected", "notes", "weaknesses", "models")}
+    values |= {name: getattr(c.rig, name) for name in ("baseline_m", "convergence_deg", "sigma_px")}
+    values |= {"fit": {name: getattr(c, name) for name in ("epipolar_rms_px", "reprojection_rms_px")}}
+    values |= {"pairs_used": len(c.pairs), "grade": graded[0], "poor": _poor(c), "heldout": c.held_out}
+    values |= {"distortion_model": c.rig.left.model, "body_deviation_rms_m": c.deviation_m}
+    values |= {"disc_radius_m": c.disc_radius_m, "rig": output, "board": board_file, "report": page, "seconds": seconds}
+    values["shutters"] = None if c.rig.shutters is None else c.rig.shutters.to_json()
     what = f"{c.body.name} · {used} · {size} · baseline {1e3 * c.rig.baseline_m:.1f} mm"
     return Report("calibrate", "Calibration of two cameras", what, meaning, sections, values=values, assessed=graded)

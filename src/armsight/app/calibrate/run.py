@@ -206,7 +206,6 @@ class GivenImages:
 
 
 def _files_of(pattern: str) -> list[Path]:
-    """Return the images that a glob matches, sorted; none without one."""
     files = sorted(image_files(pattern), key=natural_key) if pattern else []
     if pattern and not files:
         raise InputError(no_files(pattern))
@@ -219,10 +218,8 @@ def _single(path: Path, depth: BitDepth, target: CalibrationBoard, side: int, si
     height, width = image.shape
     scale = size[0] / width
     if abs(height * scale - size[1]) > 0.5 * max(scale, 1.0):
-        raise InputError(
-            f"{path}: is {width}x{height}, and the {SIDES[side]} images in the pairs {size[0]}x{size[1]}: take both with "
-            "the same field of view, and so the same ratio of width to height"
-        )
+        other = f"the {SIDES[side]} images in the pairs {size[0]}x{size[1]}"
+        raise InputError(f"{path}: is {width}x{height}, {other}: take both with the same ratio of width to height")
     found, square = target.detect(image), scale**2
     uv, common = (found.uv + 0.5) * scale - 0.5, found.common * [scale, scale, 1.0]
     found = replace(found, uv=uv, cov_uv=found.cov_uv * square, shape=found.shape * square, common=common)
@@ -257,9 +254,8 @@ class _Unseen:
                 for side, (kept, missed) in enumerate(zip(self._kept, self._missed, strict=True))
                 if (why := self._why(kept))
             ]
-            raise CalibrationError(
-                " ".join([str(error), *odd, *(f"Note: {note}." for note in notes_of(source))])
-            ) from None
+            lines = [str(error), *odd, *(f"Note: {note}." for note in notes_of(source))]
+            raise CalibrationError(" ".join(lines)) from None
 
     def _why(self, images: list[Grey]) -> str:
         if images and all(darkness(image) for image in images):
@@ -296,13 +292,9 @@ def _one_size(sizes: _Sizes | None, images: tuple[Grey, Grey], files: tuple[Path
     for side, path in enumerate(files):
         if sizes is not None and sizes[side] != now[side]:
             (w, h), (w0, h0) = now[side], sizes[side]
-            raise InputError(
-                f"{path}: is {w}x{h}, the {SIDES[side]} images before it are {w0}x{h0}: a calibration needs one size"
-            )
+            raise InputError(f"{path}: is {w}x{h}, the {SIDES[side]} images before it {w0}x{h0}: one size is needed")
     if one_image(*images):
-        raise InputError(
-            f"{files[0]}, {files[1]}: the left and the right image are the same: give the images of two cameras"
-        )
+        raise InputError(f"{files[0]}, {files[1]}: both images are the same: give the images of two cameras")
     return now[0], now[1]
 
 

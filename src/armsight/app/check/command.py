@@ -54,12 +54,8 @@ def command() -> None:
 def evaluated(
     data: Path = argument("RUN|POSES.csv"),
     closed: bool = option("Of a run: evaluate the motions with the loop closed on vision."),
-    output: Path | None = out(
-        "DIR", "Folder for report.html, check.json, figures; needs armsight[report].", report=True
-    ),
-    columns: str | None = option(
-        "Names of columns in your CSV, such as x_m=X,command_x_m=X0.", metavar="NAME=COLUMN,..."
-    ),
+    output: Path | None = out("DIR", "Folder of report.html, check.json, plots; needs armsight[report].", report=True),
+    columns: str | None = option("Columns of your CSV, such as x_m=X,command_x_m=X0.", metavar="NAME=COLUMN,..."),
     limit_texts: tuple[str, ...] = option(
         "Limit of a metric, such as AP=0.5mm: prints PASS or FAIL, exit code 1 if one fails. May be repeated.",
         "--limit",
@@ -112,9 +108,7 @@ def plan(
     ),
     speed: float = option("Speed on paths, mm/s.", min=1.0, max=1e4, default=100.0),
     visible_in: Path | None = option("An earlier run; both of its cameras must see the whole test.", metavar="RUN"),
-    output: Path | None = out(
-        "FILE", "check.toml for armsight run --motion; .csv: the poses alone.", kind=r"^\[\[motion|^pose,"
-    ),
+    output: Path | None = out("FILE", "check.toml for run --motion; .csv: poses alone.", kind=r"^\[\[motion|^pose,"),
     as_json: bool = JSON,
 ) -> None:
     """Plan a test in the largest cube the arm reaches, clear of its limits and of singularities.

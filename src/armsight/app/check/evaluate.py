@@ -11,14 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from armsight.app.check import DRIFT_CYCLES
-from armsight.app.check.result import (
-    CheckResult,
-    CircleResult,
-    DistanceResult,
-    DriftResult,
-    JumpResult,
-    WorkspaceResult,
-)
+from armsight.app.check.result import CheckResult, CircleResult, DistanceResult, DriftResult, Jump, WorkspaceResult
 from armsight.app.check.rows import SAME_M, TESTS, Attained, Reversal, Row, first_few, read_rows
 from armsight.app.check.run_folder import attained_in
 from armsight.data import Array
@@ -46,9 +39,7 @@ def read_check(path: Path, *, closed: bool = False, columns: str | None = None) 
         raise InputError(f"{path}: --closed goes with a run's folder; this is a table of attained poses")
     rows = read_rows(path / "check.csv" if path.is_dir() else path, columns)
     unknown = not any(row.cov.any() for row in rows)
-    return Attained(
-        rows, ["no sigma_x_m .. are given: the instrument's noise is taken for none"] if unknown else [], []
-    )
+    return Attained(rows, ["no sigma_x_m .. is given: the instrument's noise is taken for none"] if unknown else [], [])
 
 
 def evaluate(attained: Attained) -> CheckResult:
@@ -62,12 +53,9 @@ def evaluate(attained: Attained) -> CheckResult:
     poses, notes = {name: _pose(group) for name, group in often.items()}, [*attained.notes, *said]
     circle = _circle(by_test["circle"], attained.reversals) if by_test["circle"] else None
     if not (poses or workspace or followed or circle):
-        reasons = [*([seldom] if seldom else []), *notes] or ["no motion was attained"]
-        more = f"; {len(reasons) - 2} more left out" if len(reasons) > 2 else ""
-        reason = "; ".join(reasons[:2]) + more
-        raise InputError(
-            f"nothing can be evaluated: {reason}; run motions that repeat: armsight check plan writes them"
-        )
+        reasons = [*filter(None, (seldom, *notes))] or ["no motion was attained"]
+        reason = "; ".join(reasons[:2] + ([f"{len(reasons) - 2} more left out"] if len(reasons) > 2 else []))
+        raise InputError(f"nothing can be evaluated: {reason}; run motions that repeat (armsight check plan)")
     notes += [f"left out: all poses, as none was attained {few} times"] if seldom else []
     ways = _several_ways(often)
     return CheckResult(poses, ways, workspace, _distance(often), _drift(often), followed, circle, notes)
@@ -174,10 +162,8 @@ def _path(name: str, rows: list[Row]) -> PathMetrics:
     for cycle, group in cycles.items():
         same = [row.pose for row in group] == [row.pose for row in first]
         if not same or np.abs(each[cycle].p_ref - p_ref).max() > SAME_M:
-            raise InputError(
-                f"path {name}: every cycle must have the same path points, with the same commanded positions, in the same "
-                f"sequence; cycle {cycle or 'without a name'} ({len(group)} rows) differs from {first_cycle} ({len(first)})"
-            )
+            which = f"cycle {cycle or 'without a name'} ({len(group)} rows) differs from {first_cycle} ({len(first)})"
+            raise InputError(f"path {name}: every cycle must have the same path points, commands and sequence; {which}")
     attained, cov = np.array([c.p for c in each.values()]), np.array([c.cov for c in each.values()])
     with naming(f"path {name}"):
         return path_metrics(attained, p_ref, cov, _stacked(rows).common)
@@ -186,9 +172,7 @@ def _path(name: str, rows: list[Row]) -> PathMetrics:
 def _circle(rows: list[Row], reversals: list[Reversal]) -> CircleResult:
     ways = _groups(rows, lambda row: row.approach)
     if set(ways) != {"1", "-1"}:
-        raise InputError(
-            "circle: approach must be 1 for counter-clockwise and -1 for clockwise, and both must be there"
-        )
+        raise InputError("circle: approach must be 1 counter-clockwise and -1 clockwise, and both must be there")
     _, p_ref, cov, _ = _stacked(rows)
     axes = plane_axes(np.linalg.svd(p_ref - p_ref.mean(axis=0), full_matrices=False)[2][2])
     middle = (p_ref.max(axis=0) + p_ref.min(axis=0)) / 2
@@ -197,4 +181,4 @@ def _circle(rows: list[Row], reversals: list[Reversal]) -> CircleResult:
     asked = [(angle, reversal.way) for angle, reversal in zip(at, reversals, strict=True)]
     metrics = circle_metrics(_stacked(ways["1"]).p, _stacked(ways["-1"]).p, axes, cov.mean(axis=0), asked)
     jumps = zip(reversals, at, metrics.jumps_m, strict=True)
-    return CircleResult(axes, metrics, [JumpResult(each.joints, each.way, angle, jump) for each, angle, jump in jumps])
+    return CircleResult(axes, metrics, [Jump(each.joints, each.way, angle, jump) for each, angle, jump in jumps])

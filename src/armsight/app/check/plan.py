@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.app.check import CYCLES, DRIFT_CYCLES, REQUIRED_CYCLES
-from armsight.app.run.motion_file import read_motions
+from armsight.app.run.motion_file import motion_text, read_motions
 from armsight.data import Array
 from armsight.errors import InputError
 from armsight.files import read_json, table_text, write_text
@@ -63,11 +63,7 @@ class PlannedTest(NamedTuple):
 def plan_test(
     arm: Arm, name: str, cycles: int | None, centre: Array | None, speed_m_s: float, visible_in: Path | None
 ) -> PlannedTest:
-    """Plan a test.
-
-    ``centre``: (3,) of the cube, base, m; None to let it be found. ``visible_in``: an earlier run, whose cameras must
-    see all of it; None to let all be seen.
-    """
+    """Plan a test about ``centre`` (3,), base, m, or where it fits; ``visible_in``: a run whose cameras see it all."""
     allowed = everywhere if visible_in is None else seen_by(visible_in)
     path = {"line": _line, "circle": _circle}.get(name)
     too_fast: list[CheckPlan] = []  # cubes whose poses would do, but not the path
@@ -88,9 +84,9 @@ def plan_test(
         poses = [("joints", at, {"q_deg": np.degrees(q)}) for at, q in zip(plan.names, plan.q, strict=True)]
         last = (f"to {plan.names[-1]}", plan.q[-1]) if cycles > 1 else None
         begin, each = (last, poses) if path is None else path(arm, plan, speed_m_s)[1:]
-        first = "" if begin is None else _motion("joints", begin[0], {"q_deg": np.degrees(begin[1])})
+        first = "" if begin is None else motion_text("joints", begin[0], {"q_deg": np.degrees(begin[1])})
         numbered = [(kind, f"{at} cycle {n}", keys) for n in range(1, cycles + 1) for kind, at, keys in each]
-        return first + "".join(_motion(*motion) for motion in numbered)
+        return first + "".join(motion_text(*motion) for motion in numbered)
 
     with tempfile.TemporaryDirectory() as folder:  # it is planned as it will be; after two cycles all come again
         write_text(Path(folder) / "motion.toml", motions(min(times, 2)))
@@ -165,14 +161,6 @@ def _circle(arm: Arm, plan: CheckPlan, speed_m_s: float) -> _Path:
     ways = {"counter-clockwise": angle, "clockwise": -angle}
     motions = [("circle", name, {**keys, "angle_deg": at, "duration_s": duration_s}) for name, at in ways.items()]
     return _Path(way, ("to the circle", q), motions)
-
-
-def _motion(kind: str, name: str, keys: Mapping[str, Any]) -> str:
-    text = f'\n[[motion]]\nkind = "{kind}"\nname = "{name}"\n'
-    for key, value in keys.items():
-        number = f"{value:.{1 if key == 'angle_deg' else 4}f}" if np.ndim(value) == 0 else ""
-        text += f"{key} = {number or '[' + ', '.join(f'{v:.6f}' for v in value) + ']'}\n"
-    return text
 
 
 def plan_csv(plan: CheckPlan) -> str:

@@ -79,11 +79,8 @@ def scatter_figure(result: CheckResult, rows: Sequence[Row]) -> Figure | None:
             ax.axhline(0, **_GRID)
             ax.axvline(0, **_GRID)
             ax.plot(radius * np.cos(a), radius * np.sin(a), color=ORANGE, lw=1.2, ls=":" if RP is None else "-")
-            ax.set(aspect="equal", xlabel="x, mm" if row else "")
-            ax.set(
-                title="" if row else f"{name}: command is\n{1e3 * metrics.AP_m.raw:.2f} mm off",
-                ylabel="" if column else f"{'xyz'[j]}, mm ({view})",
-            )
+            ax.set(aspect="equal", xlabel="x, mm" if row else "", ylabel="" if column else f"{'xyz'[j]}, mm ({view})")
+            ax.set_title("" if row else f"{name}: command is\n{1e3 * metrics.AP_m.raw:.2f} mm off")
     panels[0, 0].set(xlim=(-reach, reach), ylim=(-reach, reach))
     bar = figure.colorbar(dots, ax=panels, label="cycle", shrink=0.7)
     bar.locator = MaxNLocator(integer=True)
@@ -172,9 +169,7 @@ def circle_figure(result: CheckResult, rows: Sequence[Row]) -> Figure | None:
         ax.plot([at, at], [-0.2 * span, 1.1 * span], color=RED, lw=0.8, ls=":")
         ax.annotate("J" + ",".join(map(str, reversal.joints)), (at, 1.3 * span), color=RED, **style)
     first, second = (direction(axis) for axis in result.circle.axes)
-    ax.set_title(
-        f"radius {1e3 * c.radius_m:.1f} mm, grey rings {step:g} mm off; 0 deg is along {first}, 90 deg along {second}"
-    )
+    ax.set_title(f"radius {1e3 * c.radius_m:.1f} mm, rings {step:g} mm off; 0 deg is along {first}, 90 along {second}")
     ax.legend(loc="lower left", bbox_to_anchor=(-0.35, -0.02))
     return figure
 
@@ -188,16 +183,8 @@ FIGURES: dict[str, tuple[Callable[[CheckResult, Sequence[Row]], Figure | None], 
         "is the bound. The instrument's noise is still in the dots.",
     ),
     "anywhere": (anywhere_figure, "The workspace", "How far from the command each pose was attained."),
-    "drift": (
-        drift_figure,
-        "Drift",
-        "Attained positions of the first pose over time, and how far their mean has wandered.",
-    ),
-    "paths": (
-        paths_figure,
-        "The paths",
-        "Distance from the commanded path along it: mean path thick, every cycle thin.",
-    ),
+    "drift": (drift_figure, "Drift", "Positions of the first pose over time, and how far their mean has wandered."),
+    "paths": (paths_figure, "The paths", "Distance from the commanded path along it: mean path thick, cycles thin."),
     "circle": (
         circle_figure,
         "The circle",
@@ -219,18 +206,10 @@ def check_report(
     remarks = ["" if each is None else each.text() for each in outcomes or [None] * len(listed)]
     wide = max(len(row.what) for row in listed)
     printed = [f"{name:14s} {what:{wide}s}  {metric_text(metric)}" for name, what, metric in listed]
-    cells = [
-        (
-            name,
-            what,
-            "not resolvable" if m.clean is None else _mm(m.clean),
-            _mm(m.sigma),
-            "" if m.low is None else f"{_mm(m.low)} to {_mm(m.high)}",
-            *(_mm(m.raw), _mm(m.resolvable)),
-            remark,
-        )
-        for (name, what, m), remark in zip(listed, remarks, strict=True)
-    ]
+    cells = list[tuple[str, ...]]()
+    for (name, what, m), remark in zip(listed, remarks, strict=True):
+        clean, interval = _mm(m.clean) or "not resolvable", m.low is not None and f"{_mm(m.low)} to {_mm(m.high)}"
+        cells.append((name, what, clean, _mm(m.sigma), interval or "", _mm(m.raw), _mm(m.resolvable), remark))
     title = (
         "Each metric without the noise, the interval that holds the true one 95 times in a hundred, and the metric as the "
         "standard computes it. What the noise could make as well is called not resolvable; the last column of lengths is "
@@ -240,9 +219,7 @@ def check_report(
     first = "metric without the instrument's noise, the interval that holds it to 95 %, as measured:"
     meant = [f"{name}: {meaning}." for name, meaning in MEANINGS.items() if name in {row.name for row in listed}]
     blocks: list[Block] = [
-        Text(
-            "\n".join([first, *(f"{line}  {remark}".rstrip() for line, remark in zip(printed, remarks, strict=True))])
-        ),
+        Text("\n".join([first, *(f"{a}  {b}".rstrip() for a, b in zip(printed, remarks, strict=True))])),
         Html(html_table(TextTable(title, head, tuple(cells))) + bullets(meant)),
         all_compared(outcomes),
     ]
@@ -259,11 +236,10 @@ def check_report(
     )
 
 
+_CORRECT = "armsight identify corrects what is the same each time"
 #: What a test says first of an arm: how far from the command, and how far from its own mean.
-_ACCURACY, _REPEATABILITY = (
-    ("AP", "mean error", "AT", "AD", "circularity"),
-    ("RP", "largest error", "RT", "RD", "hysteresis"),
-)
+_ACCURACY = ("AP", "mean error", "AT", "AD", "circularity")
+_REPEATABILITY = ("RP", "largest error", "RT", "RD", "hysteresis")
 _SYSTEMATIC = 3.0  # accuracy over repeatability; half: identify is named though it gains little, double: rarely named
 
 
@@ -280,9 +256,7 @@ def assess(lines: Sequence[MetricLine], outcomes: Sequence[LimitResult]) -> tupl
     if outcomes:
         return "good", f"Within its limits: {said}; repeat the test when the arm has changed."
     systematic = len(first) == 2 and first[0][1] > _SYSTEMATIC * first[1][1] and first[1][0] in ("RP", "RT")
-    after = (
-        "armsight identify corrects what is the same each time" if systematic else "--limit holds the arm to a figure"
-    )
+    after = _CORRECT if systematic else "--limit holds the arm to a figure"
     return "good", f"Well resolved: {said}; {after}."
 
 
@@ -299,19 +273,12 @@ def _against_limits(outcomes: Sequence[LimitResult]) -> tuple[Grade, str] | None
     if failed := [each for each in outcomes if not each.passed]:
         e, more = max(failed, key=lambda each: each.value_m / each.limit_m), len(failed) - 1
         others = f", and {more} more above theirs" if more else ""
-        scatters = e.metric.startswith("R")  # repeatability
-        then = (
-            "look for what is loose or slips" if scatters else "armsight identify corrects what is the same each time"
-        )
-        return "poor", (
-            f"Above its limits: {e.metric} of {e.of} is {1e3 * e.value_m:.2f} mm, limit {1e3 * e.limit_m:g}{others}; "
-            f"{then}."
-        )
+        then = "look for what is loose or slips" if e.metric.startswith("R") else _CORRECT  # R..: repeatability
+        above = f"{e.metric} of {e.of} is {1e3 * e.value_m:.2f} mm, limit {1e3 * e.limit_m:g}{others}"
+        return "poor", f"Above its limits: {above}; {then}."
     if unsure := [each for each in outcomes if each.certain is False]:
-        return "fair", (
-            f"Within its limits, but {unsure[0].metric} of {unsure[0].of} by less than its 95 % interval: repeat the test "
-            "with more cycles."
-        )
+        close = f"{unsure[0].metric} of {unsure[0].of} by less than its 95 % interval"
+        return "fair", f"Within its limits, but {close}: repeat the test with more cycles."
     return None
 
 

@@ -1,8 +1,7 @@
 """What a test shows: records whose fields are the keys of check.json (docs/howto/iso9283.md), SI units, their list, limits.
 
-``--limit AP=0.5mm`` says what an arm must hold, and every metric of that name passes or fails. The value that is compared
-is the metric without the instrument's noise; of a metric that cannot be resolved the upper end of its interval, as no more
-is known of it; without an interval the metric as measured.
+``--limit AP=0.5mm`` holds every metric of that name, without the instrument's noise; of a metric that cannot be resolved
+the upper end of its interval, as no more is known of it; without an interval the metric as measured.
 """
 
 from __future__ import annotations
@@ -56,7 +55,7 @@ class DriftResult:
 
 
 @dataclass(frozen=True)
-class JumpResult:
+class Jump:
     """Jump of the circle's radius where joints reverse."""
 
     joints: tuple[int, ...]  #: numbers of the joints, 1 to 6
@@ -71,7 +70,7 @@ class CircleResult:
 
     axes: Array  #: (2, 3) unit vectors of the circle's plane, base
     metrics: CircleMetrics  #: circularity, hysteresis, backlash and the curves
-    reversals: Sequence[JumpResult]  #: jumps of the radius where joints reverse
+    reversals: Sequence[Jump]  #: jumps of the radius where joints reverse
 
 
 @dataclass(frozen=True)
@@ -181,14 +180,7 @@ class LimitResult:
 
 
 def read_limits(texts: Iterable[str]) -> dict[str, float]:
-    """Read NAME=LENGTH texts, such as AP=0.5mm.
-
-    Returns:
-        Name of each metric -> its limit, m.
-
-    Raises:
-        InputError: an unknown name, a name given twice, or no positive length with a unit.
-    """
+    """Read NAME=LENGTH texts, such as AP=0.5mm: name of each metric -> limit, m; an InputError says what is wrong."""
     limits: dict[str, float] = {}
     for given in texts:
         name, _, length = given.partition("=")

@@ -68,10 +68,7 @@ class Attained(NamedTuple):
 
 
 def read_rows(file: Path, columns: str | None = None) -> list[Row]:
-    """Read a CSV.
-
-    ``columns``: what its columns are called there, as the option --columns has it; None where they have our names.
-    """
+    """Read a CSV; ``columns``: what they are called there, as --columns has it; None where they have our names."""
     table = Columns.of_csv(file, read_columns(columns, _COLUMNS))
     if not table.at:
         raise InputError(f"{file}: empty; a first line of column names is needed")
@@ -102,19 +99,15 @@ def _require_sense(file: Path, rows: list[Row]) -> None:
     for row in rows:
         what = (row.test, row.pose, row.cycle, row.approach, row.t_s, *row.T[:3].ravel())
         if row.cycle and what in seen:
-            raise InputError(
-                f"{file}: pose {row.pose} stands there twice, in cycle {row.cycle} and to the last digit; once is enough"
-            )
+            raise InputError(f"{file}: pose {row.pose} stands there twice, in cycle {row.cycle}, to the last digit")
         seen.add(what)
         apart = row.T_command - sent.setdefault(row.pose, row.T_command) if row.test == "pose" else np.zeros(1)
         if np.abs(apart).max() > SAME_M:
             raise InputError(f"{file}: pose {row.pose} has several commands; give each position a name of its own")
     off_m = float(np.median([np.linalg.norm(row.T[:3, 3] - row.T_command[:3, 3]) for row in rows]))
     if off_m > _FAR_M:
-        raise InputError(
-            f"{file}: half of the rows are more than {1e3 * off_m:.0f} mm from their commands: both must be in m, in one "
-            "frame, and each column under its own name"
-        )
+        mend = "both must be in m, in one frame, and each column under its own name"
+        raise InputError(f"{file}: half of the rows are more than {1e3 * off_m:.0f} mm from their commands: {mend}")
 
 
 def _row(where: str, entries: dict[str, str], numbers: dict[str, float]) -> Row:

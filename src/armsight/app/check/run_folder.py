@@ -156,16 +156,11 @@ def require_known(folder: Path) -> None:
     require_version(summary, "run", found.get("version") if isinstance(found, dict) else None, VERSION)
 
 
-def _reference_file(folder: Path) -> Path:
-    """Return the file of the commanded poses: by its present name, unless the folder has it by that of version 1 alone."""
-    file, old = (folder / name for name in ("reference.csv", "wanted.csv"))
-    return old if old.is_file() and not file.is_file() else file
-
-
 def segments_of(folder: Path, closed: bool) -> list[PathSegment]:
     """Cut a run into its motions and rests, by time: those with the loop closed, or those without."""
     require_known(folder)
-    file, motions = _reference_file(folder), folder / "motion.toml"
+    file, old, motions = (folder / name for name in ("reference.csv", "wanted.csv", "motion.toml"))
+    file = old if old.is_file() and not file.is_file() else file  # its name in version 1
     for name in (file.name, "vision.csv", motions.name):
         if not (folder / name).is_file():
             if (folder / "summary.json").is_file():
@@ -228,18 +223,15 @@ def _rests(
         if len(Ts) >= _REST_SHOTS:
             seen = Row("pose", name, str(times[name]), came, t_s, mean_pose(Ts), T, noise.own / len(Ts), noise.common)
             visits.setdefault((name, came), []).append(seen)
-    rare = _rare(visits)
+    often, attained = any(len(group) >= MIN_POSES for group in visits.values()), Counter[str]()
+    for (name, _), group in visits.items():
+        attained[name] += len(group)
+    rare = {at: len(group) for at, group in visits.items() if often and len(group) < MIN_POSES <= attained[at[0]]}
     rows = [row for at, group in visits.items() if at not in rare for row in group]
     said = [f"left out: {name} approached from {came}, too seldom ({n})" for (name, came), n in rare.items()]
     notes = [f"{unseen} rests were not seen, and are left out"] if unseen else []
     notes += first_few(said, "approaches, too seldom")
     return sorted(rows, key=lambda row: (natural_key(row.pose), row.t_s)), notes
-
-
-def _rare(visits: dict[tuple[str, str], list[Row]]) -> dict[tuple[str, str], int]:
-    attained = Counter(name for (name, _), group in visits.items() for _ in group)
-    often = any(len(group) >= MIN_POSES for group in visits.values())
-    return {at: len(rows) for at, rows in visits.items() if often and len(rows) < MIN_POSES <= attained[at[0]]}
 
 
 def _pose_names(rests: list[PathSegment]) -> list[tuple[Array, str]]:
@@ -306,10 +298,8 @@ def _path(name: str, group: list[PathSegment], noise: Noise, notes: list[str]) -
 
     cycles, commanded, widest = [], on(points), _GAP * float(points[1] - points[0])
     for cycle, segment in enumerate(group, start=1):
-        was, s = (
-            segment.seen.Ts_base_tool[:, :3, 3],
-            np.interp(segment.seen.t_s - segment.reference.t_s[0], since, gone),
-        )
+        was = segment.seen.Ts_base_tool[:, :3, 3]
+        s = np.interp(segment.seen.t_s - segment.reference.t_s[0], since, gone)
         for _ in range(4):  # to the foot of the perpendicular: the time of the shot has no effect
             ahead = on(s + _AHEAD_M) - on(s - _AHEAD_M)
             ahead /= np.maximum(np.linalg.norm(ahead, axis=1), 1e-12)[:, None]

@@ -1,13 +1,13 @@
 """The arm: joint readings beside what vision measures, the motions in open and closed loop, and a stop that always works.
 
-In: the arm's board, the session's cameras, rig and body. Out: an :class:`ArmState` at any time, and the folder of a run as
-``armsight run`` writes it. One thread drives the board: it reads the joints and runs the experiment. A stop goes to the
-board from its own thread (:class:`~armsight.robot.boards.stoppable.StoppableBoard`), and is answered with the state that
-the board itself reports. With ``poses:FILE`` nothing is driven: another program moves the arm, and logged its joint angles.
+In: the arm's board, the session's cameras, rig and body. Out: an :class:`ArmState`, and runs as ``armsight run`` writes
+them. One thread drives the board. A stop goes to it from its own thread, and is answered with the state that the board
+itself reports. With ``poses:FILE`` nothing is driven: another program moves the arm, and logged its joint angles.
 """
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from collections import deque
@@ -20,14 +20,7 @@ from typing import Any
 import numpy as np
 
 from armsight.app.board.command import not_homed
-from armsight.app.live.handeye import (
-    HandEyeGuide,
-    HandEyeState,
-    IdentifyState,
-    IdentifyStep,
-    go,
-    visit_poses,
-)
+from armsight.app.live.handeye import HandEyeGuide, HandEyeState, IdentifyState, IdentifyStep, go, visit_poses
 from armsight.app.live.measuring import MeasureStep
 from armsight.app.live.records import asked
 from armsight.app.live.step import PageStep, Shared, why
@@ -72,8 +65,7 @@ from armsight.vision.rig import StereoRig
 _IDLE_S, _ASK_S = 0.004, 0.002
 #: A pose of the hand-eye calibration is the mean of so long, s; joints, rad, and body, m, that move more do not rest.
 _REST_S, _REST_RAD, _REST_M = 0.6, float(np.radians(0.3)), 1.5e-3
-_FEWEST_SEEN = 2
-_HANDEYE_POSES, _CHART = {False: 30, True: 14}, 400
+_HANDEYE_POSES = {False: 30, True: 14}
 #: For a command of the loop, by whoever shows something, s; a loop that answered no shot for so long watches none, s.
 _PATIENCE_S, _WATCHES_S = 0.1, 1.0
 _SLOWLY = 0.25  # share of the arm's limits on the way to the start
@@ -118,11 +110,7 @@ class ArmState:
 
 
 class ArmStep(PageStep[ArmState]):
-    """The arm's board, in a thread of its own; runs go to ``run``, ``run-2``, ... in the folder of the session.
-
-    Attributes:
-        held: why the arm was held, until it is moved again; empty where it was not.
-    """
+    """The arm's board, in a thread of its own; runs go to ``run``, ``run-2``, ...; ``held``: why it was held."""
 
     def __init__(self, shared: Shared, measuring: MeasureStep, model: Arm) -> None:
         super().__init__(shared, ArmState())
@@ -142,7 +130,7 @@ class ArmStep(PageStep[ArmState]):
         self._loop: Loop | None = None
         self._answered, self._answered_s = threading.Event(), -np.inf  # a command has followed from a shot
         self._seen = 0
-        self._chart: deque[tuple[float, float, bool]] = deque(maxlen=_CHART)
+        self._chart: deque[tuple[float, float, bool]] = deque(maxlen=400)
         self._start: Array | None = None
 
     @property
@@ -177,9 +165,7 @@ class ArmStep(PageStep[ArmState]):
         if name.startswith(LOGGED):
             angles = read_angles(name.removeprefix(LOGGED), self.model)
             if angles.shots is None and angles.t_s is None:
-                raise InputError(
-                    f"{angles.path}: has neither a column shot nor t_s: which image does each row belong to?"
-                )
+                raise InputError(f"{angles.path}: has neither a column shot nor t_s: which image is each row of?")
             self._logged = angles
             return
         if self._simulated is not None:
@@ -222,7 +208,6 @@ class ArmStep(PageStep[ArmState]):
         self.open_arm()
 
     def _ports(self) -> list[str]:
-        """Return the ports that there are, until the session ends."""
         if self._closing.is_set():
             raise DeviceError("the session has ended")
         return list_ports()
@@ -271,7 +256,6 @@ class ArmStep(PageStep[ArmState]):
         self._move(self._to_start)
 
     def _move(self, work: Callable[[], None]) -> None:
-        """Have the thread of the board do something that moves the arm, if nothing is missing."""
         if missing := self._lacking():
             raise InputError(missing)
         if self.busy:
@@ -288,7 +272,7 @@ class ArmStep(PageStep[ArmState]):
             raise InputError("the arm takes its poses by itself now: hold it first")
         logged = self._logged
         seen = self._measuring.lately(_REST_S if logged is None else np.inf)
-        if len(seen) < (_FEWEST_SEEN if logged is None else 1):
+        if len(seen) < (2 if logged is None else 1):
             raise InputError(self._measuring.why_missed or "the body is not seen now")
         if logged is not None:
             seen, q = seen[-1:], self._logged_q()
@@ -330,10 +314,7 @@ class ArmStep(PageStep[ArmState]):
 
     @asked("arm", rest=True)
     def use_arm(self, arm: str) -> None:
-        """Use another model of the arm: a name, a TOML or a URDF file, such as the corrected one.
-
-        The hand-eye calibration is made anew from its poses; of an arm with other joints there are none.
-        """
+        """Use another arm: a name, a TOML or URDF file; hand and eye are calibrated anew from their poses."""
         model = slowed(open_arm(arm), self.shared.options.board or "")
         if self.connected:
             check_model(self.shared.options.board or "", arm)
@@ -389,7 +370,6 @@ class ArmStep(PageStep[ArmState]):
         return ""
 
     def _work(self, board: StoppableBoard) -> None:
-        """Read the board until the session ends, and do what is requested."""
         due, simulated = time.monotonic(), self._simulated
         try:
             while not self._closing.is_set():
@@ -431,25 +411,22 @@ class ArmStep(PageStep[ArmState]):
             if self.shown.running is not None:
                 raise
             return None
-        if shot is None:
-            return None
-        capture.offer(shot)
-        newest = capture.newest
-        return None if newest is None else newest.shot
+        if shot is not None:
+            capture.offer(shot)
+        return None if shot is None or capture.newest is None else capture.newest.shot
 
     def _run(self, closed: bool) -> None:
-        """Run the experiment, and write its folder in another thread."""
         handeye, follow, folder = self.handeye.run, self.shared.options.follow_rig, unused(self.folder / "run")
         self._chart.clear()
 
         def work(setup: Setup, rig: StereoRig, plan: MotionPlan, targets: Array) -> RunResult:
             if follow:
                 require_followed(rig, Path(self._measuring.rig_path or "rig.json"))
-            texts = (read_text(self.shared.motion), read_text(str(self._measuring.target_spec)))
-            files = dict(zip(("motion.toml", "body.toml"), texts, strict=True))
-            how: dict[str, Any] = {"progress": self._progress, "begun": self._begun, "close_loop": closed}
-            how |= {"handeye": handeye, "follow_rig": follow}
-            return run_in(folder, setup, rig, plan, targets, files, command="live", say=self.warn, **how)
+            body = read_text(str(self._measuring.target_spec))
+            files = {"motion.toml": read_text(self.shared.motion), "body.toml": body}
+            how: Any = {"close_loop": closed, "handeye": handeye, "follow_rig": follow, "begun": self._begun}
+            how |= {"command": "live", "say": self.warn, "progress": self._progress}
+            return run_in(folder, setup, rig, plan, targets, files, **how)
 
         outcome = self._moving("the run has ended early: {}; what was measured is being written", work)
         if outcome is not None:
@@ -468,7 +445,7 @@ class ArmStep(PageStep[ArmState]):
             self.handeye.clear()
             self.handeye.begin(np.vstack([plan.start, targets]), setup.board.soft_limits(), rig)
             visit = lambda loop: visit_poses(loop, self.handeye, plan.start, self._progress)  # noqa: E731
-            return run_visits(setup, rig, plan, visit, progress=self._progress, begun=self._begun)
+            return run_visits(RunResult(setup, rig, plan), visit, self._progress, self._begun)
 
         outcome = self._moving("the hand-eye calibration has ended early: {}", work)
         if outcome is not None and outcome.ended_text is None and (run := self.handeye.run) is not None:
@@ -484,7 +461,7 @@ class ArmStep(PageStep[ArmState]):
             way = point_to_point(slow, np.clip(here, slow.q_min, slow.q_max), plan.start)
             require_range(setup, passed(way))
             move = lambda loop: go(loop, way, self._progress)  # noqa: E731
-            return run_visits(setup, rig, plan, move, progress=self._progress, begun=self._begun, look=False)
+            return run_visits(RunResult(setup, rig, plan), move, self._progress, self._begun, look=False)
 
         self._moving("the way to the start has ended early: {}", work, at_start=False)
 
@@ -495,10 +472,9 @@ class ArmStep(PageStep[ArmState]):
         self.show(running="preparing")
         self._seen, self._requested = 0, None
         rig, spec = self._measuring.rig, self._measuring.target_spec
-        assert rig is not None
-        assert spec is not None
         try:
-            target = open_target(spec)
+            assert rig is not None
+            target = open_target(str(spec))
             assert isinstance(target, Composite)
             setup = self._setup(target)
             plan, targets = self._plan()
@@ -527,11 +503,9 @@ class ArmStep(PageStep[ArmState]):
 
     def _plan(self) -> tuple[MotionPlan, Array]:
         arm = self.model
-        plan = read_motions(arm, self.shared.motion)
-        ends = [plan.start, *(m.trajectory.at(m.trajectory.duration_s).q for m in plan.motions)]
-        if self._simulated is not None:
-            ends = list(np.vstack([arm.home, self._simulated.workcell.poses]))
-        return plan, handeye_poses(arm, np.array(ends), _HANDEYE_POSES[self._simulated is not None], 0)
+        plan, simulated = read_motions(arm, self.shared.motion), self._simulated
+        ends = plan.ends if simulated is None else np.vstack([arm.home, simulated.workcell.poses])
+        return plan, handeye_poses(arm, ends, _HANDEYE_POSES[simulated is not None], 0)
 
     def _progress(self, line: str) -> None:
         self.shown = replace(self.shown, running=line)  # the loop waits for no lock
@@ -563,10 +537,7 @@ class ArmStep(PageStep[ArmState]):
         self._answered.set()
 
     def between_shots(self) -> None:
-        """Wait, while a loop watches shots, until a command has followed from one, 0.1 s at most.
-
-        The loop shares the interpreter: what is computed until the next shot delays no image's command.
-        """
+        """Wait, while a loop watches shots, until a command followed from one, 0.1 s at most: it shares the process."""
         if self._loop is not None and time.monotonic() - self._answered_s < _WATCHES_S:
             self._answered.clear()
             self._answered.wait(_PATIENCE_S)
@@ -574,12 +545,10 @@ class ArmStep(PageStep[ArmState]):
     def _note_error(self, loop: Loop) -> None:
         """Append the distance of the tool, as the loop estimates it now, from its reference to the chart."""
         segment, now = loop.segment, loop.log.live[-1]
-        if segment is None or segment.trajectory is None or segment.phase == "calibration":
+        if segment is None or (way := segment.trajectory) is None or segment.phase == "calibration":
             return
-        way = segment.trajectory
         since = way.duration_s if segment.phase == "rest" else now.t_s - segment.begin_s
-        reference = self.model.forward(way.at(since).q)
-        away = now.T_base_tool[:3, 3] - reference[:3, 3]
+        away = (now.T_base_tool - self.model.forward(way.at(since).q))[:3, 3]
         self._chart.append((now.t_s, 1e3 * float(np.linalg.norm(away)), segment.closed))
 
     def _results(self, outcome: RunResult) -> tuple[str, ...]:
@@ -590,12 +559,9 @@ class ArmStep(PageStep[ArmState]):
         if outcome.delay_found:
             lines.append(f"delay of the images: {1e3 * outcome.delay.delay_s:.1f} ms")
         for name, closed in (("joint sensors alone", False), ("loop closed on vision", True)):
-            errors = [e for _, e, c in self._chart if c is closed]
-            if errors:
+            if errors := [e for _, e, c in self._chart if c is closed]:
                 rms = float(np.sqrt(np.mean(np.square(errors))))
-                lines.append(
-                    f"{name}: {rms:.2f} mm RMS from the reference, as the loop estimates at {len(errors)} shots"
-                )
+                lines.append(f"{name}: {rms:.2f} mm RMS from the reference, estimated at {len(errors)} shots")
         if len(outcome.log.latency_s):
             p50, p99 = 1e3 * np.percentile(outcome.log.latency_s.array(1), (50, 99))
             lines.append(f"image to command: p50 {p50:.1f} ms, p99 {p99:.1f} ms")
@@ -654,22 +620,16 @@ class ArmStep(PageStep[ArmState]):
         options, measuring = self.shared.options, self._measuring
         board = options.board or ("serial:PORT" if self._simulated is None else "emulated:")
         motion = f" --motion {self.shared.motion}{' --follow-rig' * options.follow_rig}" if self._logged is None else ""
-        return (
-            f"armsight run --source {self.shared.source} --board {board} --rig "
-            f"{measuring.rig_path or 'rig.json'} --target {measuring.target_spec or 'body.toml'} "
-            f"--arm {options.arm}{motion} -o run"
-        )
+        what = f"--rig {measuring.rig_path or 'rig.json'} --target {measuring.target_spec or 'body.toml'}"
+        return f"armsight run --source {self.shared.source} --board {board} {what} --arm {options.arm}{motion} -o run"
 
     def _logged_q(self) -> Array | None:
         """Return the joint angles (n,), rad, that were logged at the newest shot; None where no row belongs to it."""
         newest = self._measuring.newest
-        if newest is None or self._logged is None:
-            return None
-        shot = newest[0].shot
-        try:
-            return self._logged.at([shot.name], [shot.t_s])[0]
-        except InputError:
-            return None
+        with contextlib.suppress(InputError):
+            if newest is not None and self._logged is not None:
+                return self._logged.at([newest[0].shot.name], [newest[0].shot.t_s])[0]
+        return None
 
     def _vision(self, q: Array | None) -> tuple[tuple[float, ...], tuple[tuple[float, ...], ...]]:
         """Return vision's joint angles less the readings, degrees, and the arm's joints in the left camera's frame, m."""

@@ -31,10 +31,7 @@ _LOOK_S = 2.0  # between two searches for an unknown board; half: one core is bu
 
 
 class _Drawn(PageStep[S]):
-    """A step with a drawing."""
-
     def draw(self, target: str, name: str, paper: str) -> None:
-        """Draw a body or a board to NAME.pdf in the background."""
         self.later("the drawing cannot be made", self._draw, target, self.folder / f"{name}.pdf", paper)
 
     def _draw(self, target: str, path: Path, paper: str) -> None:
@@ -82,9 +79,7 @@ class BoardStep(_Drawn[BoardChoice]):
         """Use another calibration board; ``measured_mm`` is the length of the printed bar, 0 where nobody measured it."""
         board = open_board(spec)
         if measured_mm and not 0.8 * _BAR_MM < measured_mm < 1.2 * _BAR_MM:
-            raise InputError(
-                f"the bar on the print is {_BAR_MM:g} mm long by the drawing; {measured_mm:g} mm cannot be right"
-            )
+            raise InputError(f"the printed bar is {_BAR_MM:g} mm long as drawn; {measured_mm:g} mm cannot be right")
         self._named = True
         self._use(scaled_spec(spec, measured_mm / _BAR_MM) if measured_mm else spec)
         self.show(measured_mm=measured_mm or None)
@@ -97,22 +92,19 @@ class BoardStep(_Drawn[BoardChoice]):
 
     def look(self, live: LiveShot) -> None:
         """Find out which board both cameras show, and use it where nobody named one. Called from one thread."""
-        images = live.shot.left, live.shot.right
-        if images[0] is None or images[1] is None or live.arrived_s - self._looked_s < _LOOK_S:
+        left, right = live.shot.left, live.shot.right
+        if left is None or right is None or live.arrived_s - self._looked_s < _LOOK_S:
             return
-        found = {
-            board and board.body.name for board in (board_in_view(grey(image)) for image in images if image is not None)
-        }
+        boards = [board_in_view(grey(image)) for image in (left, right)]
         self._looked_s = time.monotonic()
-        seen = (found.pop() if len(found) == 1 else "") or ""
-        again, self._last = seen == self._last, seen
-        if not again:
+        names = {"" if board is None else board.body.name for board in boards}
+        seen, before = names.pop() if len(names) == 1 else "", self._last
+        self._last = seen
+        if seen != before:
             return
         if seen and not self._named and not _alike(seen, self.calibration.board.body.name):
             self._use(seen)
-            self.say(
-                "hint", f"{seen} is in view and used; its lengths cannot be seen: measure a square, and correct them"
-            )
+            self.say("hint", f"{seen} is in view and used; its lengths cannot be seen: measure and correct them")
         self.show(seen=seen, used=_alike(seen, self.calibration.board.body.name))
 
     @asked("board")

@@ -56,8 +56,6 @@ _QUICK_MODELS = ("brown5",)
 CELLS = (8, 5)
 #: Longest side of the images in which a board is looked for quickly, and how often it is searched thoroughly, s.
 _QUICK_SIDE_PX, _QUICKER_SIDE_PX, _THOROUGH_S = 640, 360, 2.0
-_DRAWN_STILL = 0.15
-_GONE_S = 1.0
 _SHOW, _GOOD = "Hold the board so that both cameras see all of it.", "Good."
 _ASKS = "Good enough. Finish, or go on?"
 Sizes = tuple[tuple[int, int], tuple[int, int]]
@@ -125,11 +123,7 @@ class CalibrationStep(Guided[CalibrationState]):
     """The guided calibration with one board: shots in ``calibration``, then ``rig.json``, given to ``changed``."""
 
     def __init__(
-        self,
-        shared: Shared,
-        spec: str,
-        aim: CalibrationAim,
-        changed: Callable[[StereoRig, Path], None] = lambda rig, path: None,
+        self, shared: Shared, spec: str, aim: CalibrationAim, changed: Callable[[StereoRig, Path], None]
     ) -> None:
         super().__init__(shared, CalibrationState(board=spec))
         self.spec, self.aim, self._changed = spec, aim, changed
@@ -176,9 +170,7 @@ class CalibrationStep(Guided[CalibrationState]):
     def set_aim(self, error_mm: float, distance_m: float) -> None:
         """Say what the calibration is to be good for; ``error_mm`` 0: for errors as small as a point's own noise."""
         if not (0.0 <= error_mm < 1e3 and 0.05 <= distance_m <= 20.0):
-            raise InputError(
-                "the aim must be an error in mm, 0 for that of the images' noise, and a distance from 0.05 to 20 m"
-            )
+            raise InputError("the aim is an error in mm, 0 for the images' noise, and a distance from 0.05 to 20 m")
         with self.lock:
             self.aim, self._ended = CalibrationAim(1e-3 * error_mm, distance_m), False
             if self._result is not None:
@@ -199,9 +191,7 @@ class CalibrationStep(Guided[CalibrationState]):
         """Choose the lens model by held-out errors, and write rig.json, in the background."""
         with self.lock:
             if len(self._shots) < FIRST_FIT:
-                raise InputError(
-                    f"{len(self._shots)} shots are too few to calibrate; {LEAST_SHOTS} or more are advised"
-                )
+                raise InputError(f"{len(self._shots)} shots are too few; {LEAST_SHOTS} or more are advised")
             self.show(running=False, fitting="choosing the lens model by held-out errors")
             if self.shared.simulated is not None:
                 self.shared.simulated.person.holds = False
@@ -296,12 +286,10 @@ class CalibrationStep(Guided[CalibrationState]):
         return found[0][0] if found else None
 
     def _know(self, pair: Pair) -> None:
-        """Add to what is known what a shot will determine."""
         if self._knowledge is not None and (T := self._pose(pair)) is not None:
             self._knowledge = self._knowledge.after(T)
 
     def _take(self, shot: Shot, pair: Pair) -> None:
-        """Store a shot, and go on to the next pose."""
         name = f"{len(self._shots) + len(self._left_out) + 1:02d}"
         try:
             if self._writer is None:
@@ -338,9 +326,7 @@ class CalibrationStep(Guided[CalibrationState]):
         with self.lock:
             pairs, sizes = list(self._shots.values()), self._sizes
         assert sizes is not None
-        how: dict[str, Any] = (
-            {"models": _QUICK_MODELS, "folds": min(_FOLDS, len(pairs))} if quick else {"models": MODELS}
-        )
+        how: Any = {"models": _QUICK_MODELS, "folds": min(_FOLDS, len(pairs))} if quick else {"models": MODELS}
         result = calibrate_boards(self.board, pairs, sizes, **how)
         require_order(result)
         return result, {pair.name for pair in pairs}
@@ -383,10 +369,10 @@ class CalibrationStep(Guided[CalibrationState]):
         self.show(missing=missing, good=not missing, goal_mm=1e3 * self._knowledge.goal_m)
 
     def _lacking(self, result: Calibration, error_m: float, goal_m: float) -> tuple[str, ...]:
-        """Return what is missing until the calibration is good enough, line by line."""
         lines = []
         if len(result.pairs) < LEAST_SHOTS:
-            lines.append(f"{_more(LEAST_SHOTS - len(result.pairs))}, so that the held-out errors mean something")
+            more = LEAST_SHOTS - len(result.pairs)
+            lines.append(f"{more} more shot{'s' * (more > 1)}, so that the held-out errors mean something")
         if error_m > goal_m:
             why = "is the aim" if self.aim.error_m else "a point has by the images' noise"
             lines.append(f"predicted error {1e3 * error_m:.2g} mm, {1e3 * goal_m:.2g} mm {why}: more shots")
@@ -394,7 +380,6 @@ class CalibrationStep(Guided[CalibrationState]):
         return tuple(lines)
 
     def _finished(self) -> None:
-        """Fit with all lens models and write the rig, in the thread."""
         path = self.folder / "rig.json"
         try:
             result, _ = self._fitted(quick=False)
@@ -411,17 +396,14 @@ class CalibrationStep(Guided[CalibrationState]):
         self._changed(rig, path)
 
     def _command(self) -> str:
-        """Return the command line that does the same with the stored shots."""
-        folder = self.folder / "calibration" if self._writer is None else self._writer.folder
-        out = self.folder / "rig.json"
-        return (
-            f"armsight calibrate --source 'pairs:{folder}/left*.png,{folder}/right*.png' --target {self.spec} -o {out}"
-        )
+        at = self.folder / "calibration" if self._writer is None else self._writer.folder
+        rig = self.folder / "rig.json"
+        return f"armsight calibrate --source 'pairs:{at}/left*.png,{at}/right*.png' --target {self.spec} -o {rig}"
 
     def now(self) -> CalibrationState:
         """Return what is shown, with how the board stands now."""
         newest_s, newest = self._recent[-1] if self._recent else (0.0, None)
-        if time.monotonic() - newest_s > _GONE_S:
+        if time.monotonic() - newest_s > 1.0:
             newest = None
         still = 0.0 if newest is None else self._stillness()
         return replace(
@@ -434,7 +416,7 @@ class CalibrationStep(Guided[CalibrationState]):
             aim_mm=1e3 * self.aim.error_m,
             distance_m=self.aim.distance_m,
             command=self._command(),
-            drawn=self._drawings(newest if still > _DRAWN_STILL else None) if self.shown.running else (),
+            drawn=self._drawings(newest if still > 0.15 else None) if self.shown.running else (),
         )
 
     def _coverage(self, sizes: Sizes) -> tuple[tuple[tuple[int, ...], ...], ...]:
@@ -454,21 +436,14 @@ class CalibrationStep(Guided[CalibrationState]):
         if self._next is not None and self._rig is not None:
             corners = np.vstack([self._guide.outline, self.board.body.points[:1]])
             views = self._rig.project(transform(self._next.T_left_board, corners))
-            drawn += [
-                Drawn(side, "next", (polyline(uv[:-1], closed=True), polyline(uv[-1:])))
-                for side, uv in enumerate(views)
-            ]
+            lines = [(polyline(uv[:-1], closed=True), polyline(uv[-1:])) for uv in views]
+            drawn += [Drawn(side, "next", both) for side, both in enumerate(lines)]
         if seen is not None:
             shown = zip(dots("seen", (seen.left.uv, seen.right.uv)), _sees(seen), strict=True)
             drawn += [each for each, there in shown if there]
         return tuple(drawn)
 
 
-def _more(count: int) -> str:
-    return "1 more shot" if count == 1 else f"{count} more shots"
-
-
 def _cropped(image: np.ndarray, found: Detections) -> np.ndarray:
-    """Return the part of an image that a board covers."""
     (left, top), (right, bottom) = found.uv.min(axis=0).astype(int), found.uv.max(axis=0).astype(int) + 1
     return image[max(top, 0) : bottom, max(left, 0) : right]

@@ -39,20 +39,12 @@ _SLOW = 0.8  # share of the requested rate below which cameras are slow
 def quality_notes(quality: ImageQuality) -> tuple[Note, ...]:
     """Return what is wrong with an image, in words."""
     edge_px, white = quality.edge_px or 0.0, 100 * quality.saturated
-    wide = f"edges are {edge_px:.1f} px wide"
+    wide, lower, longer = f"edges are {edge_px:.1f} px wide", "lower exposure or gain", "more light, or longer exposure"
     found: tuple[tuple[bool, Level, str], ...] = (
         (edge_px > BLURRED_PX, "error", f"out of focus: {wide}; focus until below {SHARP_PX:g}"),
         (SHARP_PX < edge_px <= BLURRED_PX, "hint", f"a little soft: {wide}; {SHARP_PX:g} or less is sharp"),
-        (
-            quality.saturated > SATURATED_SHARE,
-            "warn",
-            f"saturated: {white:.0f}% of the pixels are white; lower exposure or gain",
-        ),
-        (
-            quality.mean < DARK_MEAN,
-            "warn",
-            f"too dark: mean grey level {quality.mean:.0f} of 255; more light, or longer exposure",
-        ),
+        (quality.saturated > SATURATED_SHARE, "warn", f"saturated: {white:.0f}% of the pixels are white; {lower}"),
+        (quality.mean < DARK_MEAN, "warn", f"too dark: mean grey level {quality.mean:.0f} of 255; {longer}"),
     )
     return tuple(Note(level, text) for there, level, text in found if there)
 
@@ -64,10 +56,7 @@ def flicker_note(watch: FlickerWatch) -> Note | None:
         return None
     amplitude, hz = found
     exposure = "10 or 20 ms" if hz == 100.0 else "8.3 or 16.7 ms"
-    return Note(
-        "warn",
-        f"flicker: lamps at {hz:.0f} Hz change the brightness by {100 * amplitude:.1f}%; expose for {exposure}",
-    )
+    return Note("warn", f"flicker: lamps at {hz:.0f} Hz, the light varies by {100 * amplitude:.1f}%; expose {exposure}")
 
 
 @dataclass(frozen=True)
@@ -236,9 +225,7 @@ class CamerasStep(PageStep[CamerasState]):
         if not shared.source:
             name = f" ({self._found[0].name})" if len(self._found) == 1 else ""
             have = f"one camera is attached{name}" if len(self._found) == 1 else "no camera is attached"
-            raise DeviceError(
-                f"{have}; two are needed. Plug them in: they are looked for again. `armsight cameras` lists them"
-            )
+            raise DeviceError(f"{have}; two are needed: plug them in. `armsight cameras` lists them")
         return open_source(shared.source)
 
 

@@ -20,7 +20,6 @@ from armsight.vision.sources import Source
 
 #: How long after a failure a source is opened again, s.
 AGAIN_S = 2.0
-_INTERVALS = 30
 _UNTIMED_S, _LONGEST_PAUSE_S = 0.1, 1.0  # between shots of a recording without times; at most
 
 
@@ -49,7 +48,7 @@ class CameraCapture:
         self.problem: str | None = None  # why there are no images now
         self._changed = threading.Condition()
         self._polled = 0
-        self._intervals: deque[float] = deque(maxlen=_INTERVALS)
+        self._intervals: deque[float] = deque(maxlen=30)
         self._ended, self._paused, self._idle = threading.Event(), threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._run, name="capture", daemon=True)
 
@@ -126,7 +125,6 @@ class CameraCapture:
                 self._failed(problem)
 
     def _read(self, source: Source) -> None:
-        """Read until the source ends."""
         before: Shot | None = None
         while not self._ended.is_set():
             if self._paused.is_set():
@@ -152,7 +150,6 @@ class CameraCapture:
         self._ended.wait(min(max(newest.arrived_s + apart_s - now, 0.0), _LONGEST_PAUSE_S))
 
     def _failed(self, problem: str) -> None:
-        """Note why there are no images, and wait."""
         if problem != self.problem:
             self._say(problem)
         self.problem = problem

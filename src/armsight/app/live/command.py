@@ -22,15 +22,12 @@ if TYPE_CHECKING:
 class LiveOptions:
     """The options that a session has (:class:`~armsight.app.live.step.SessionOptions`)."""
 
-    source: str | None = option(
-        "The cameras, such as usb:0,1 (see armsight record -h); sim: is the simulated workcell."
-    )
+    source: str | None = option("The cameras, such as usb:0,1 (armsight record -h); sim: is the simulated workcell.")
     rig: Path | None = option("A calibrated rig; begins with measuring.", metavar="RIG.json")
     target: str | None = option("The body that is measured: a body file or a board.", metavar="SPEC|BODY")
     calibration_board: str | None = option("The calibration board, such as chessboard:9x6:25mm.", metavar="SPEC")
     board: str | None = option(
-        "The arm's controller: serial:PORT, feetech:PORT,LEROBOT.json, ar4:PORT; poses:FILE where another program moves "
-        "it."
+        "The arm's controller: serial:PORT, feetech:PORT,LEROBOT.json, ar4:PORT; poses:FILE where another moves it."
     )
     arm: str = ARM
     servo_calibration: Path | None = option(
@@ -47,9 +44,7 @@ class LiveOptions:
 @declared
 def command(
     given: LiveOptions,
-    sync_ms: float = option(
-        "Sigma of the time between the two exposures of a shot, ms.", min=0.0, max=1000.0, default=1.0
-    ),
+    sync_ms: float = option("Sigma of the time between a shot's exposures, ms.", min=0.0, max=1000.0, default=1.0),
     http: str = option(
         "Where the page is; 0.0.0.0:8722 for other computers, too; port 0 takes a free one.",
         default="127.0.0.1:8722",
@@ -92,9 +87,7 @@ def command(
             server.start()
             session.start()
             answer = {"address": server.address, "directory": str(session.folder)}
-            line = (
-                f"open {server.address} in a browser; everything is stored in {session.folder}; Ctrl-C ends the session"
-            )
+            line = f"open {server.address} in a browser; all is stored in {session.folder}; Ctrl-C ends the session"
             print_answer(as_json, answer, line)
             shown = 0
             while True:

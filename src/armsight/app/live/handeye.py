@@ -260,10 +260,7 @@ def _errors_after_m(run: HandEyeRun, Ts_base_flange: Array) -> Array:
 
 
 def visit_poses(loop: Loop, guide: HandEyeGuide, start: Array, progress: Callable[[str], None]) -> None:
-    """Move an arm from pose to pose, each chosen by those before, until the calibration is good; and back to the start.
-
-    ``start``: (n,) joint angles at which it stands, rad; ``progress`` is called with a line about what is being done.
-    """
+    """Move an arm from ``start`` (n,), rad, to poses, each chosen by those before, until it is calibrated, and back."""
     q = start
     for number in range(1, MOST_POSES + 1):
         goal = guide.next_q
@@ -320,11 +317,9 @@ class IdentifyStep(PageStep[IdentifyState]):
             write_results(run, report, out)
         finally:
             self.show(working=None)
-        lines = (
-            *(f"note: {note}" for note in run.notes),
-            *(line for line in report.text().splitlines() if line != report.headline),
-        )
-        self.show(headline=report.headline, lines=lines, corrected=str(out / "corrected.toml"))
+        lines = [*(f"note: {note}" for note in run.notes), *report.text().splitlines()]
+        shown = tuple(line for line in lines if line != report.headline)
+        self.show(headline=report.headline, lines=shown, corrected=str(out / "corrected.toml"))
         self.later("the report was not drawn", self._draw, report, out)  # what was found is shown before
 
     def _draw(self, report: Report, out: Path) -> None:

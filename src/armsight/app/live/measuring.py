@@ -39,11 +39,7 @@ from armsight.vision.rig import StereoRig
 
 #: Health is asked for once a second; so many times as long as it took it is not.
 _HEALTH_REST = 20.0
-#: Poses of the path and of the chart that are kept, and latencies for the percentiles.
-_TRAIL, _LATENCIES = 240, 600
 _AXIS_M = 0.05
-#: Newest poses that are kept for a mean.
-_RECENT = 12
 
 
 @dataclass(frozen=True)
@@ -182,11 +178,11 @@ class MeasureStep(PageStep[MeasureState]):
         self._clear()
 
     def _clear(self) -> None:
-        self._trail: deque[Array] = deque(maxlen=_TRAIL)
+        self._trail: deque[Array] = deque(maxlen=240)
         self._times: deque[float] = deque(maxlen=30)
-        self._latency: deque[float] = deque(maxlen=_LATENCIES)
+        self._latency: deque[float] = deque(maxlen=600)
         self._missed: Counter[str] = Counter()
-        self._recent: deque[tuple[float, PoseEstimate]] = deque(maxlen=_RECENT)
+        self._recent: deque[tuple[float, PoseEstimate]] = deque(maxlen=12)  # for a mean
         self._health_s = 0.0
         self._notes = HealthNotes()
         self.show(measured=0, health=())
@@ -350,7 +346,6 @@ class MeasureStep(PageStep[MeasureState]):
                 self._recording = _PoseFile(self.folder, self.rig, self._body.target.body, self.warn)
 
     def _write(self, live: LiveShot, result: PoseEstimate | Missed) -> None:
-        """Write a row, whole; a full disk ends the recording."""
         if (recording := self._recording) is None:
             return
         try:
@@ -432,7 +427,6 @@ class MeasureStep(PageStep[MeasureState]):
         return _length_mm(away, cov + left_axes(pose.T_left_body, pose.cov_noise)[:3, :3])
 
     def _tip_now(self, pose: PoseEstimate) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
-        """Return where the tip is, and one sigma of it, mm."""
         if self._tip is None:
             return None
         p, R = self._tip.p_body, pose.T_left_body[:3, :3]
@@ -448,7 +442,6 @@ class MeasureStep(PageStep[MeasureState]):
         return Scene(T, (0.5 * width / float(fx), 0.5 * height / float(fy)), p, way)
 
     def _drawings(self, rig: StereoRig, live: LiveShot, pose: PoseEstimate) -> tuple[Drawn, ...]:
-        """Return the points and axes of the body, and the points of the second one, as both cameras see them."""
         assert self._body is not None
         T, second = pose.T_left_body, self._second
         drawn = dots("body", rig.project(transform(T, self._body.target.body.points[pose.points.seen.ids])))
@@ -461,7 +454,6 @@ class MeasureStep(PageStep[MeasureState]):
         return (*drawn, *dots("second", rig.project(second.points(second.newest[1])))) if near else drawn
 
     def _relative(self, rig: StereoRig, first: tuple[LiveShot, PoseEstimate | Missed]) -> RelativeShown | None:
-        """Return the second body relative to the first one; None without."""
         if self._second is None:
             return None
         (live, pose), spec, newest = first, self._second.spec, self._second.newest
@@ -530,7 +522,5 @@ def _pivoting(Ts: list[Array]) -> str:
     R = np.array(Ts).reshape(-1, 4, 4)[:, :3, :3]
     cosines = (np.einsum("ij,nij->n", R[0], R) - 1.0) / 2.0 if len(R) else np.ones(1)
     far = np.degrees(np.arccos(np.clip(cosines.min(), -1.0, 1.0)))
-    return (
-        f"{len(R)} poses, rotated by up to {far:.0f} degrees: keep the tip where it is, and rotate the body about it by 30 "
-        "degrees, all ways"
-    )
+    how = "keep the tip where it is, and rotate the body about it by 30 degrees, all ways"
+    return f"{len(R)} poses, rotated by up to {far:.0f} degrees: {how}"

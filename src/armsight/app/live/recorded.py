@@ -89,11 +89,8 @@ class RecordedStep(PageStep[RecordedState]):
 
     def _open(self, file: str) -> None:
         head, *rows = _table(self.folder / file) or [[]]
-        fields = tuple(
-            name
-            for k, name in enumerate(head)
-            if any(_number(row, k) is not None for row in rows) and name not in TIMES
-        )
+        numeric = [any(_number(row, k) is not None for row in rows) for k in range(len(head))]
+        fields = tuple(name for name, holds in zip(head, numeric, strict=True) if holds and name not in TIMES)
         with self.lock:
             self._head, self._rows = head, rows
             drawn = self.shown.field if self.shown.field in fields else (*fields, "")[0]

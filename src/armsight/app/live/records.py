@@ -122,7 +122,6 @@ def command_of(text: str) -> PageCommand:
 
 
 def _value(name: str, key: str, kind: str, value: object) -> Any:  # noqa: ANN401 - of the field's type
-    """Return a field's value, checked."""
     if kind == "float" and isinstance(value, int) and not isinstance(value, bool):
         value = float(value)
     if type(value) is not _KINDS[kind] or (isinstance(value, float) and not math.isfinite(value)):

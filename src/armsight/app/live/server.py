@@ -1,20 +1,17 @@
 """The server of ``armsight live``: it carries states, events, images and commands between a session and pages.
 
-In: a :class:`~armsight.app.live.session.LiveSession`. Out: one HTML file over HTTP, and two WebSockets for each page:
-``/live`` for everything, and ``/stop`` for the stop alone, so that no image and no state is ever before it in a queue.
+Out: one HTML file, and two WebSockets for each page: ``/live`` for everything, and ``/stop`` for the stop alone, so that no
+image and no state is ever before it in a queue.
 
-- Text to a page is ``{"section": NAME, "state": {...}}``, ``{"event": {...}}``, ``{"you": {...}}`` or ``{"rejected":
-  TEXT}``.
-- An image is binary: one byte side, four bytes number, JPEG. The next image of a side is sent when the page has said that
-  it showed the last one (``{"shown": [SIDE, NUMBER]}``), and it is the newest then: a slow page misses images, and stores
-  none.
-- While a loop moves the arm, states and images are made in the time between the command that followed from a shot and the
-  next shot: the loop shares the interpreter with this server, and an image must not wait for a page.
-- One page commands; the others look on and can stop. A page that commands and is silent while the arm moves is gone: the
-  arm is held.
+- Text to a page is ``{"section": NAME, "state": {...}}``, ``{"event": {}}``, ``{"you": {}}`` or ``{"rejected": TEXT}``.
+- An image is binary: one byte side, four bytes number, JPEG. The next image of a side, the newest then, is sent when the
+  page has said that it showed the last one (``{"shown": [SIDE, NUMBER]}``).
+- While a loop moves the arm, states and images are made between the command that followed from a shot and the next shot:
+  the loop shares the interpreter, and an image must not wait for a page.
+- One page commands; the others look on and can stop. Where it is silent while the arm moves, the arm is held.
 
-Everything is bound to 127.0.0.1 unless a host is given; then the address needs a token. A WebSocket is opened for pages of
-this server alone (their Origin), whatever else the browser shows.
+All is bound to 127.0.0.1 unless a host is given; then the address needs a token. Only pages of this server (their Origin)
+open a WebSocket.
 """
 
 from __future__ import annotations
@@ -58,7 +55,6 @@ _STATE_S, _POLL_S = 0.1, 0.01
 _JPEG, _SIDE_PX = 72, 1280
 #: A page that commands and says nothing for so long is gone, s; pages say something twice a second.
 SILENT_S = 1.5
-_MALFORMED = 200  # messages from a page that end its connection
 _MALFORMED_BEGIN = ("a command ", "no command ")
 _HEADER = struct.Struct("<BI")
 _CSP = (
@@ -85,7 +81,6 @@ class _Client:
     wake: asyncio.Event = field(default_factory=asyncio.Event)
 
     def send(self, text: str) -> None:
-        """Send in the background; a page that is gone is noticed elsewhere."""
         task = asyncio.ensure_future(self.socket.send(text))
         task.add_done_callback(lambda done: done.exception() if not done.cancelled() else None)
 
@@ -163,7 +158,6 @@ class LiveServer:
             await asyncio.wait_for(server.wait_closed(), 2.0)
 
     def _request(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Answer plain HTTP, and check who opens a WebSocket."""
         url, host = urlsplit(request.path), request.headers.get("Host", "")
         rejected: tuple[HTTPStatus, str] | None = None
         if not self._named(host):
@@ -206,7 +200,6 @@ class LiveServer:
         return _answer(connection, self._page.replace("NONCE", nonce).encode(), headers)
 
     async def _connected(self, socket: ServerConnection) -> None:
-        """Serve one WebSocket until it closes."""
         from websockets.exceptions import ConnectionClosed
 
         assert socket.request is not None
@@ -264,7 +257,7 @@ class LiveServer:
             await asyncio.get_running_loop().run_in_executor(self._work, self.session.execute, command)
         except Exception as error:  # noqa: BLE001 - a mistake of ours is said, and does not look like a page that left
             client.malformed += isinstance(error, InputError) and str(error).startswith(_MALFORMED_BEGIN)
-            if client.malformed > _MALFORMED:
+            if client.malformed > 200:
                 client.socket.transport.abort()
                 return False
             client.send(json.dumps({"rejected": why(error)}))
@@ -292,7 +285,6 @@ class LiveServer:
                 raise InputError("a command is an object with the key command")
 
     async def _images(self, client: _Client) -> None:
-        """Send a page the newest images, as fast as it shows them."""
         from websockets.exceptions import ConnectionClosed
 
         with contextlib.suppress(ConnectionClosed):
@@ -386,11 +378,8 @@ def _answer(connection: ServerConnection, body: bytes, headers: dict[str, str]) 
 
 
 def _bind_error(error: OSError, host: str, port: int) -> ArmsightError:
-    """Return why an address cannot be bound, and what to do."""
     if error.errno == errno.EADDRINUSE:
-        return InputError(
-            f"port {port} is in use, perhaps by another armsight live: give another one, --http {host}:PORT"
-        )
+        return InputError(f"port {port} is in use, perhaps by another armsight live: give another, --http {host}:PORT")
     if error.errno == errno.EACCES:
         return InputError(f"port {port} needs rights that you do not have: give one above 1023, --http {host}:PORT")
     return DeviceError(f"{host}:{port} cannot be bound: {error.strerror or error}; is it an address of this computer?")

@@ -1,7 +1,6 @@
 """A session of ``armsight live``: the cameras, the steps, and what a person wants of them; it knows nothing of a page.
 
-CameraCapture, what looks at the images, and the arm have a thread each; none waits for another, nor for who shows the
-state.
+Capture, looking at images, and the arm have a thread each; none waits for another, nor for who shows the state.
 """
 
 from __future__ import annotations
@@ -40,7 +39,6 @@ from armsight.vision.rig import StereoRig
 #: The workcell's cameras where ``sim:`` names none, and its arm.
 _SIM_CAMERAS, _SIM_ARM, _EMULATOR = "1280x720@15", "worn", "unicorn"
 _DEFAULT_BOARD = "chessboard:9x6:20mm"
-_EVENTS = 200
 #: All that was said, in the folder of the session.
 LOG = "session.log"
 #: What was chosen, by name, in the folder of the session; its version, and the longest name, characters.
@@ -82,7 +80,7 @@ class LiveSession:
     def __init__(self, options: SessionOptions) -> None:
         self.folder = check_folder(options.folder, problem="the session cannot be written here").absolute()
         self._settings = self._kept()
-        self._number, self._events, self._lock = 0, deque[Event](maxlen=_EVENTS), threading.Lock()
+        self._number, self._events, self._lock = 0, deque[Event](maxlen=200), threading.Lock()
         self.shared = shared = Shared(options, self.folder, self.say, hold=lambda why: self.arm.hold_for(why))
         self.cameras = CamerasStep(shared)
         model, simulated = open_arm(options.arm), shared.source.startswith(SIM)
@@ -262,11 +260,7 @@ class LiveSession:
             return tuple(event for event in self._events if event.number > after)
 
     def execute(self, command: PageCommand) -> None:
-        """Carry out a command; what takes long is done in the background, and events say how it ended.
-
-        Raises:
-            ArmsightError: it cannot be done now; nothing has changed.
-        """
+        """Carry out a command, in the background what takes long; after an ArmsightError nothing has changed."""
         if command.rest and self.arm.busy:
             raise InputError("the arm moves: hold it first")
         step = getattr(self, command.at) if command.at else self
@@ -290,7 +284,6 @@ class LiveSession:
         self.calibration.start()
 
     def _see(self) -> None:
-        """Look at every newest image, in a thread of its own."""
         number, capture = 0, self.capture
         while not self._closing.is_set():
             if capture is not self.capture:
@@ -338,10 +331,8 @@ class LiveSession:
         if problem is not None:
             notes.append(Note("error", problem))
         if latency is not None and rate is not None and latency[0] > _BEHIND * 1e3 / rate:
-            text = (
-                f"a pose takes {latency[0]:.0f} ms, a shot comes every {1e3 / rate:.0f} ms: this computer is too busy"
-            )
-            notes.append(Note("warn", f"{text}, or the images are too large"))
+            text = f"a pose takes {latency[0]:.0f} ms, a shot comes every {1e3 / rate:.0f} ms: "
+            notes.append(Note("warn", f"{text}this computer is too busy, or the images are too large"))
         command = measure.command
         if (run := self.arm.shown.folder) is not None:
             command = f"armsight check {run}; armsight rig update {run} -o rig2.json"

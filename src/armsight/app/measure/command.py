@@ -16,32 +16,21 @@ class MeasureOptions:
     """The options of ``armsight measure``, by their names; what each means is in its help."""
 
     rig: Path = argument("RIG.json")
-    target: str = option(
-        "A board such as chessboard:9x6:25mm, a body file, or calibrate's .board.toml.", metavar="SPEC|BODY"
-    )
+    target: str = option("A board such as chessboard:9x6:25mm, a body file, or a .board.toml.", metavar="SPEC|BODY")
     source: str = option(
         "A folder, 'pairs:L*.png,R*.png', a video, stream or pair of cameras (see armsight record -h); or "
         "detections:D.csv, detections:bag:FILE for tags in a bag.",
         metavar="SOURCE",
     )
     fixed: tuple[str, ...] = FIXED
-    skew: str | None = option(
-        "The right camera exposes later by this, such as 5ms, or find (recordings).", metavar="TIME"
-    )
-    readout: str | None = option(
-        "Rolling shutters: from the first row to the last, such as 14ms, or find.", metavar="TIME"
-    )
+    skew: str | None = option("How much later the right camera exposes: 5ms, or find (recordings).", metavar="TIME")
+    readout: str | None = option("Rolling shutters: from first row to last, such as 14ms, or find.", metavar="TIME")
     save_rig: Path | None = out(
-        "RIG2.json",
-        "Write the rig with the skew and readout found, and the noise of a moved body's discs.",
-        "--save-rig",
-        kind=IS_RIG,
+        "RIG2.json", "Write the rig with skew, readout and noise of a moved body's discs.", "--save-rig", kind=IS_RIG
     )
     output: Path | None = out("POSES.csv", "Write the poses as CSV.", kind="^shot,status,")
     stream: tuple[str, ...] = STREAM
-    board: str | None = option(
-        "Publish this board's joint readings, too: serial:, feetech: or ar4:PORT, emulated:.", metavar="BOARD"
-    )
+    board: str | None = option("Publish a board's joints too: serial:, feetech:, ar4:PORT, emulated:.", metavar="BOARD")
     view_dir: Path | None = out("DIR", "Write annotated pictures.", "--view")
     as_json: bool = option("Print one JSON object per shot.", "--json")
 

@@ -1,7 +1,6 @@
 """Measure a recording of a moving body with cameras that do not expose at one time: two passes.
 
-In: the shots of a recording with their times. Out: what :func:`~armsight.app.measure.run.measure_shots` prints of each. The
-first pass detects and measures as if all were simultaneous, with a wide gate; from it the skew and the readout time are
+The first detects and measures as if all were simultaneous, with a wide gate; from it the skew and the readout time are
 found where they are not given; the second moves every detection to its shot's time.
 """
 
@@ -46,7 +45,6 @@ def requested_shutters(skew: str | None, readout: str | None) -> Requested | Non
 
 
 def _seconds(option: str, text: str) -> float | None:
-    """Return a time with its unit in s; None for ``find``."""
     if text.strip() == "find":
         return None
     match = re.fullmatch(r"([+-]?\d*\.?\d+)\s*(s|ms|us)", text.strip())
@@ -61,19 +59,13 @@ def moved_results(
     first: Sequence[tuple[float | None, PoseEstimate | Missed]],
     requested: Requested | Shutters,
 ) -> tuple[list[tuple[PoseEstimate | Missed, bool]], Shutters]:
-    """Measure again with every detection moved to its shot's time.
+    """Return the result of every shot with its detections moved to its time, and whether they were; and the shutters.
 
-    ``body``: what moves. ``first``: time, s, and result of every shot as measured at first. ``requested``: the
-    shutters, or which of them are to be found.
-
-    Returns:
-        Of every shot the result and whether it was moved; the shutters.
+    ``first``: time, s, and result of every shot as measured; ``requested``: shutters, or which are to be found.
     """
     if any(t_s is None and isinstance(result, PoseEstimate) for t_s, result in first):
-        raise InputError(
-            "these shots have no times, so nothing is known of the body's motion between two exposures: record them with "
-            "`armsight record`, or give a video"
-        )
+        why = "these shots have no times, so nothing is known of the body's motion between two exposures"
+        raise InputError(f"{why}: record them with `armsight record`, or give a video")
     shots = _timed(first)
     shutters = requested if isinstance(requested, Shutters) else _shutters(rig, body, shots, requested)
     moved = iter(measure_moving(rig, body, shots, shutters))
@@ -81,7 +73,6 @@ def moved_results(
 
 
 def _timed(first: Sequence[tuple[float | None, PoseEstimate | Missed]]) -> list[TimedShot]:
-    """Return the measured shots that have a time."""
     measured = [(t_s, r) for t_s, r in first if t_s is not None and isinstance(r, PoseEstimate)]
     return [TimedShot(t_s, r.points.seen, r.T_left_body) for t_s, r in measured]
 

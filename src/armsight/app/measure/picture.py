@@ -1,8 +1,7 @@
 """One shot as a picture: what was measured, both images side by side, and below them the points enlarged.
 
-A disc is shown by its image ellipse. A measurement corrects the detected centre for the perspective bias; here the bias is
-added again, so that the detection lies in its ellipse. The residual is the same either way. OpenCV's letters are ASCII on
-some versions: other characters are spelt out, or become a question mark.
+A disc is shown by its image ellipse. A measurement corrects the detected centre for the perspective bias; here it is added
+again, so that the detection lies in its ellipse. Text is ASCII: other characters are spelt out, or a question mark.
 """
 
 from __future__ import annotations
@@ -113,7 +112,6 @@ def marks_of(rig: StereoRig, body: Body, discs: DiscTarget | None, estimate: Pos
 
 
 def _sides(reasons: list[str]) -> list[bool]:
-    """Return in which images a point was dropped: those its reasons name, both where they name none."""
     named = [[bool(re.search(rf"\b{side}\b", reason)) for side in SIDES] for reason in reasons]
     return [any(sides[side] or not any(sides) for sides in named) for side in (0, 1)]
 
@@ -202,12 +200,10 @@ def outline(canvas: Canvas, points: Array, colour: Colour, width: int = 1) -> No
 def arrow(canvas: Canvas, a: Array, b: Array, colour: Colour, width: int = 1) -> None:
     """Draw an arrow from a to b (2,), px, its head never longer than itself."""
     outline(canvas, np.array([a, b]), colour, width)
-    length = float(np.linalg.norm(b - a))
-    if length > 1.0:
+    if (length := float(np.linalg.norm(b - a))) > 1.0:
         along = (b - a) / length * min(9.0, 0.5 * length)
-        for side in (1, -1):
-            wing = b - along + side * 0.45 * np.array([-along[1], along[0]])
-            outline(canvas, np.array([b, wing]), colour, width)
+        for side in (0.45, -0.45):
+            outline(canvas, np.array([b, b - along + side * np.array([-along[1], along[0]])]), colour, width)
 
 
 def header(shot: ShotPose) -> list[str]:
@@ -230,7 +226,6 @@ def header(shot: ShotPose) -> list[str]:
 
 
 def _pairs(names: tuple[str, ...], values: Array, sigmas: Array) -> str:
-    """Format values with their sigmas; one that is not determined has none."""
     return ", ".join(
         f"{name} {value:.3f}" + (f" +- {sigma:.3f}" if np.isfinite(sigma) else "")
         for name, value, sigma in zip(names, values, sigmas, strict=True)
@@ -303,7 +298,6 @@ class _Panel:
             write(self.canvas, text, (left, round(float(at[1])) + 5), colour, 0.5, rim=INK)
 
     def titled(self) -> Canvas:
-        """Return the image with the name of its side in the corner."""
         write(self.canvas, self.title, (8, 20), PAPER, 0.55, rim=INK)
         return self.canvas
 
@@ -324,7 +318,6 @@ def _factor(lengths: Array, reach: float) -> float:
 
 
 def _details(marks: Marks, shown: list[int], panels: list[_Panel], in_images: float) -> list[Canvas]:
-    """Return the enlarged details, row by row, and the legend below them."""
     if not shown:
         return []
     wide = float(np.sqrt(np.nan_to_num(marks.shape[shown][..., [0, 2]]).max()))
@@ -356,13 +349,11 @@ def _block(marks: Marks, i: int, panels: list[_Panel], zoom: float, factor: floa
 
 
 def _legend(marks: Marks, zoom: float, factor: float, in_images: float) -> Canvas:
-    discs, centre = (
-        bool(np.isfinite(marks.shape).any()),
-        "centre of its ellipse (the position used plus the perspective bias)",
-    )
+    discs = bool(np.isfinite(marks.shape).any())
+    found = "centre of its ellipse (the position used plus the perspective bias)" if discs else "position"
     entries: list[tuple[Colour, str]] = [
         *([(_RIM, "predicted rim of a disc at the measured pose")] if discs else []),
-        (_CROSS, f"detected {centre if discs else 'position'}"),
+        (_CROSS, f"detected {found}"),
         (_ARROW, f"residual, from the pose's projection to the detection, {factor:g}x; in the images {in_images:g}x"),
         (_SIGMA, f"1 sigma of the detection, {factor:g}x"),
         *([(RED, "dropped")] if marks.dropped.any() else []),

@@ -16,7 +16,7 @@ import numpy as np
 from armsight.app.measure.command import MeasureOptions
 from armsight.app.measure.moving import Requested, requested_shutters
 from armsight.app.measure.picture import SINGULAR
-from armsight.app.measure.shots import DetectedShots, ImageShots, NamedShots, Result, open_shots
+from armsight.app.measure.shots import DetectedShots, ImageShots, NamedShots, Result
 from armsight.app.measure.view import CHART, PictureFolder, view_folder
 from armsight.app.options import DETECTIONS
 from armsight.app.progress import bar
@@ -69,7 +69,9 @@ def measure_shots(options: MeasureOptions) -> tuple[HealthFinding, ...]:
         note(f"{options.rig} has no covariance: every ± is the share of the pixel noise alone")
     started = time.perf_counter()
     with contextlib.ExitStack() as stack:
-        shots = stack.enter_context(contextlib.closing(open_shots(options, rig, requested, folder is not None)))
+        draws, given = folder is not None, options.detections
+        opened = DetectedShots(options, rig) if given is not None else ImageShots(options, rig, requested, draws)
+        shots = stack.enter_context(contextlib.closing(opened))
         view = None if folder is None else PictureFolder(folder, rig, shots.body, shots.discs, shots.total)
         run = MeasureRun(options, rig, shots, view, HealthMonitor(rig, shots.body, _SYNC_S, printed=shots.printed))
         # What was measured is written whatever ends the run; where one of the two cannot be written the other is.
@@ -106,7 +108,6 @@ def measure_shots(options: MeasureOptions) -> tuple[HealthFinding, ...]:
 
 
 def _checked_outputs(options: MeasureOptions) -> Path | None:
-    """Check that what is written can be; return the folder of the pictures, None without any."""
     if options.save_rig is not None:
         check_writable(options.save_rig, apart_from=(options.rig, options.target), outputs=(options.output,))
     folder = None if options.view_dir is None else view_folder(options.view_dir)
@@ -247,30 +248,25 @@ class MeasureRun:
             raise ArmsightError("the source ended without a single shot")
         total, measured, output = self.total, self.measured, self.options.output
         missed = f", {total - measured} missed (their lines have the reasons)" if total > measured else ""
-        said = [f"measured {measured} of {total} shots in {seconds:.1f} s{missed}"]
-        said.append(self._ways())
+        said = [f"measured {measured} of {total} shots in {seconds:.1f} s{missed}", self._ways()]
         if self.jumped.count:
             said.append(f"jumped in {self.jumped}")
         if self.contradicted.count:
-            said.append(
-                f"in {self.contradicted} most points contradict each other: do not use it; the body moved between the two "
-                "exposures, or the images do not belong together"
-            )
+            why = "the body moved between the two exposures, or the images do not belong together"
+            said.append(f"in {self.contradicted} most points contradict each other: do not use it; {why}")
         if odd := self.misfit.count:
             which = f" ({self.misfit})" if odd <= NAMED else ""
-            worse = f"{odd} fit the body worse than the noise allows{which}"
-            said.append(f"{worse} (misfit in their lines; their sigma includes it)")
+            said.append(f"{odd} fit the body worse than the noise allows{which} (misfit in their lines and sigma)")
             # The board as the rig's calibration found it, where it is measured by its drawing.
             given, board = self.rig.provenance.get("target"), self.rig.provenance.get("board")
             if given == self.options.target and isinstance(board, str) and (self.options.rig.parent / board).exists():
-                board_file = self.options.rig.parent / board
-                said.append(f"the rig's calibration found the shape of this board: measure with --target {board_file}")
+                file = self.options.rig.parent / board
+                said.append(f"the rig's calibration found the shape of this board: measure with --target {file}")
         said.append(self.view.summary() if self.view is not None else "")
         said.append(f"written to {output}" if output is not None else "")
         return "; ".join(filter(None, said))
 
     def _ways(self) -> str:
-        """Return how often a followed body was found which way, and how long that took."""
         took: dict[str, list[float]] = {}
         for record in self.records:
             if record.way is not None and record.took_ms is not None:
@@ -281,17 +277,12 @@ class MeasureRun:
         )
 
     def keep_noise(self) -> bool:
-        """Say how noisy the cameras' discs were, and write the rig with that and with the shutters that were found.
-
-        Returns False where a rig was to be written and the shots showed nothing to write.
-        """
+        """Say how noisy the discs were, and write the rig with that and its shutters; False: there was nothing to."""
         rig, shots, save_rig = self.rig, self.shots, self.options.save_rig
         found = None if shots.noise is None or shots.skewed else shots.noise.found()
         if found is not None:
             left, right = found
-            kept = (
-                "" if save_rig is not None or rig.disc_noise is not None else "; --save-rig keeps it for single shots"
-            )
+            kept = "" if save_rig or rig.disc_noise else "; --save-rig keeps it for single shots"
             note(f"discs' centres vary {left} (left) and {right} (right) times as much as single images say{kept}")
         if save_rig is not None and found is None and self.shutters is None:
             few = "too few shots, or the body moved too little, to know the discs' noise"
@@ -305,10 +296,9 @@ class MeasureRun:
     def concluded(self, contradicted: HealthFinding | None) -> tuple[HealthFinding, ...]:
         """Say and return why the poses must not be trusted: findings of the run, and what all its shots show better."""
         shots = self.shots
-        health = tuple(
-            replace(each, advice=_RECORDED) if each.cause == "host" and shots.recorded else each
-            for each in self.monitor.findings()
-        )
+        recorded = {"host"} if shots.recorded else set()
+        found = self.monitor.findings()
+        health = tuple(replace(each, advice=_RECORDED) if each.cause in recorded else each for each in found)
         note(*unseen_lines(self.monitor.fixed_never_seen))
         if contradicted is not None:
             health = (contradicted, *(each for each in health if each.cause not in ("rig", "body", "lens")))
@@ -336,7 +326,6 @@ class _Contradicting:
         self._missed = self._tried = self._measured = self._few = 0
 
     def keeping(self, results: Iterator[Result]) -> Iterator[Result]:
-        """Yield the results; keep what those that were missed show."""
         for result in results:
             shot, measured = result[:2]
             few = isinstance(measured, PoseEstimate) and _contradicts(measured.dropped, len(measured.points.ids))
@@ -354,7 +343,6 @@ class _Contradicting:
             yield result
 
     def finding(self) -> HealthFinding | None:
-        """Return what explains them, where they are more than those that were measured; None elsewhere."""
         count = round(len(self._found) / max(self._tried, 1) * self._missed)
         if self._found and count > self._measured:
             from armsight.loop.health.update import contradiction
@@ -385,8 +373,7 @@ def _streams(specs: Sequence[str], rig: StereoRig, body: Body) -> Publisher:
         return Fanout()
     from armsight.app.stream.streams import open_streams
 
-    published = Published(rig, body, properties={"command": "measure"})
-    return open_streams(specs, published, say)
+    return open_streams(specs, Published(rig, body, properties={"command": "measure"}), say)
 
 
 def _line(record: ShotPose, width: int) -> str:
@@ -395,14 +382,9 @@ def _line(record: ShotPose, width: int) -> str:
         return f"{record.shot}: missed: {record.reason}"
     sigma = np.sqrt(np.diag(record.cov_left))
     each = [1e3 * v for pair in zip(record.position_m, sigma[:3], strict=True) for v in pair]
-    values = [
-        *each,
-        *record.euler_zyx_deg,
-        np.degrees(np.linalg.norm(sigma[3:])),
-        1e3 * record.position_sigmas_m[1],
-        len(record.points_m),
-    ]
-    row = "".join(f"{value:>{wide}.{digits}f}" for value, (_, wide, digits) in zip(values, _TABLE, strict=True))
+    each += [*record.euler_zyx_deg, np.degrees(np.linalg.norm(sigma[3:])), 1e3 * record.position_sigmas_m[1]]
+    cells = zip([*each, len(record.points_m)], _TABLE, strict=True)
+    row = "".join(f"{value:>{wide}.{digits}f}" for value, (_, wide, digits) in cells)
     dropped = len(record.dropped)
     notes = (
         f"{dropped} point{'' if dropped == 1 else 's'} dropped" if dropped else "",

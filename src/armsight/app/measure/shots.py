@@ -97,17 +97,15 @@ class ImageShots:
         self.body, self.discs, self.printed = self._target.body, self._target.discs, is_print(self._target)
         self.noise = None if self.discs is None else DiscNoise(rig, self._target)  #: what gathers the noise of discs
         if self.noise is None and options.save_rig is not None and requested is None:
-            raise InputError(
-                "--save-rig writes skew, readout and the noise of discs: give --skew find, or a body of discs"
-            )
-        say(board_notes(options, rig, self._target))
+            raise InputError("--save-rig writes skew, readout and discs' noise: give --skew find, or a body of discs")
+        note(*board_notes(options, rig, self._target))
         self.skewed: list[HealthFinding] = []  #: filled at the end: that the cameras do not expose at one time
         self._missed: list[Shot] = []  # the first with both images
         self._again: Source | None = None
         self._source = source = open_source(options.source)
         try:
             self._said = notes_of(source)
-            say(self._said)
+            note(*self._said)
             if options.output is not None and isinstance(source, StoredSource):
                 indices = {file.parent / INDEX for file in source.files}
                 check_writable(options.output, apart_from=(*source.files, *indices))
@@ -184,13 +182,13 @@ class ImageShots:
     def finish(self, records: Collection[ShotPose]) -> None:
         """Say what only the images showed."""
         source, target = self._source, self._target
-        say(note for note in notes_of(source) if note not in self._said)
+        note(*(line for line in notes_of(source) if line not in self._said))
         if self._options.as_json and (odd := getattr(source, "odd_frames", None)):
             click.echo(json.dumps({"odd_frames": odd}))
-        say(reversed_notes(target, records))
+        note(*reversed_notes(target, records))
         rank = {name: k for k, name in enumerate(self.body.point_names)}
         of_shots = [[rank[name] for name in r.points_m if name in rank] for r in records if r.ok]
-        say(unseen_row(target, [np.array(ids, np.int64) for ids in of_shots]))
+        note(*unseen_row(target, [np.array(ids, np.int64) for ids in of_shots]))
 
     def mistake(self) -> str:
         """Return what was done to the images where a missed shot can be measured once it is undone; empty otherwise."""
@@ -224,9 +222,7 @@ def board_notes(options: MeasureOptions, rig: StereoRig, target: Target | Body) 
     given, board = (rig.provenance.get(key) for key in ("target", "board"))
     kind, counts, rest = (*str(given).split(":", 2), "", "")[:3]
     if isinstance(given, str) and given != options.target == f"{kind}:{'x'.join(counts.split('x')[::-1])}:{rest}":
-        return [
-            f"the rig was calibrated with {given}: {options.target} has its counts exchanged: another origin, other axes"
-        ]
+        return [f"the rig was calibrated with {given}: {options.target} has its counts exchanged, and so other axes"]
     if isinstance(target, EstimatedBoard) and isinstance(board, str) and (own := options.rig.parent / board).is_file():
         found = load_board_file(own)
         if found.drawing.body.name == target.drawing.body.name and not np.array_equal(found.points, target.points):
@@ -242,15 +238,6 @@ def _board(body: Body) -> tuple[str, str]:
     return kind, "x".join(ordered)
 
 
-def open_shots(
-    options: MeasureOptions, rig: StereoRig, requested: Requested | Shutters | None, draws: bool
-) -> DetectedShots | ImageShots:
-    """Open the shots that options name; ``draws``: whether their images are drawn afterwards."""
-    if options.detections is not None:
-        return DetectedShots(options, rig)
-    return ImageShots(options, rig, requested, draws)
-
-
 def _detected(detections: str, target: str) -> tuple[Body, list[SeenShot], bool]:
     """Return the body, and what was detected of it, in a table or a recording of tags (bag:FILE); whether it is a print."""
     opened = open_body(target) if target.lower().endswith(".csv") else open_target(target)
@@ -260,13 +247,8 @@ def _detected(detections: str, target: str) -> tuple[Body, list[SeenShot], bool]
     from armsight.vision.sources.bag.tags import read_tags
 
     shots, notes = read_tags(detections, opened)
-    say(notes)
-    return body, shots, printed
-
-
-def say(notes: Iterable[str]) -> None:
-    """Print notes on stderr."""
     note(*notes)
+    return body, shots, printed
 
 
 @dataclass
@@ -326,9 +308,9 @@ def reversed_notes(target: Target, records: Iterable[ShotPose]) -> list[str]:
     names = [record.shot for record, angle in zip(measured[1:], angles, strict=True) if angle > least]
     if not names:
         return []
-    which = NamedShots(len(names), names[:NAMED])
     return [
-        f"{which}: rotated by {least + _ROTATED_SPARE_DEG:.0f} degrees or so against the shot before; this board "
+        f"{NamedShots(len(names), names[:NAMED])}: rotated by {least + _ROTATED_SPARE_DEG:.0f} degrees or so against the "
+        "shot before; this board "
         "looks the same then, and its origin is the corner most to the upper left in the image: codes, rings, or one even "
         "and one odd count of a chessboard distinguish its ends"
     ]

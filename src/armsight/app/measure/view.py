@@ -1,8 +1,7 @@
 """``armsight measure --view``: a folder of annotated pictures, one a shot, and the strip chart of all shots.
 
-Each picture is written completely as soon as its shot is measured; of a shot only its record is kept, by the caller. A long
-run gets a picture of every shot that was missed, searched for or jumped, and of every few others. The chart (:func:`chart`)
-shows how each was found, the pose, its sigmas and the residuals, one above the other.
+A long run gets a picture of every shot that was missed, searched for or jumped, and of every few others. The chart
+(:func:`chart`) shows how each was found, the pose, its sigmas and the residuals, one above the other.
 """
 
 from __future__ import annotations
@@ -19,10 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.app.measure.picture import draw_shot, header, marks_of
+from armsight.app.show.messages import require
 from armsight.app.show.plotting import BLUE, INK, MUTED, ORANGE, RED, drawing, new_figure, png, require_matplotlib
 from armsight.data import Array, Body, Missed, PoseEstimate, Record, Shot
-from armsight.errors import InputError
-from armsight.files import as_input_error, check_folder, replacing
+from armsight.files import check_folder, replacing
 from armsight.vision.markers.discs import DiscTarget
 from armsight.vision.pose.shot_pose import ANGLES, ShotPose
 from armsight.vision.rig import StereoRig
@@ -152,9 +151,7 @@ def _band(axes: Axes, run: ChartData) -> None:
         bars = [(begin, end - begin) for begin, end, w in _intervals(run) if w == way]
         rare = 0.8 if count < len(run.way) / 2 else 0.0
         axes.broken_barh(bars, (0.0, 1.0), facecolor=_WAYS[way], edgecolor=_WAYS[way], linewidth=rare, clip_on=False)
-    handles: list[Any] = [
-        Patch(color=colour, label=f"{counts[way]} {way}") for way, colour in _WAYS.items() if counts[way]
-    ]
+    handles: list[Any] = [Patch(color=colour, label=f"{counts[w]} {w}") for w, colour in _WAYS.items() if counts[w]]
     if run.jumped.any():
         style: Any = {"marker": "v", "color": _PURPLE, "linestyle": "none", "clip_on": False}
         axes.plot(run.along[run.jumped], np.full(int(run.jumped.sum()), 1.25), **style)
@@ -171,7 +168,6 @@ def _band(axes: Axes, run: ChartData) -> None:
 
 
 def _line(axes: Axes, run: ChartData, values: Array, colour: str, width: float = 0.9, label: str | None = None) -> None:
-    """Plot values as a line that is interrupted where shots were missed; single shots as dots."""
     good = np.isfinite(values)
     linked = good[1:] & good[:-1] & ~_gaps(run.along)
     beside = np.append(linked, False) | np.append(False, linked)
@@ -194,13 +190,11 @@ def _strip(axes: Axes, run: ChartData, values: Array, sigma: Array, name: str) -
 
 
 def _from_zero(axes: Axes, values: Array) -> None:
-    """Let the vertical axis reach from zero to above all values."""
     if len(values) and values.max() > 0:
         axes.set_ylim(0.0, 1.12 * float(values.max()))
 
 
 def _sigmas(axes: Axes, run: ChartData, sigma: Array, name: str) -> None:
-    """Plot three sigmas, on a logarithmic scale where they differ much."""
     # The wider line beneath the narrower: where they coincide both can be seen.
     for k, (letter, colour, width) in enumerate(zip("xyz", (BLUE, ORANGE, _GREEN), (2.2, 1.3, 0.7), strict=True)):
         _line(axes, run, sigma[:, k], colour, width, letter)
@@ -216,15 +210,12 @@ def _sigmas(axes: Axes, run: ChartData, sigma: Array, name: str) -> None:
 CHART, PREFIX = "run.png", "view-"
 #: A run of more shots than this does not get a picture of each; nor of each odd one where so many are odd.
 EACH_UP_TO, ODD_UP_TO = 60, 500
-_LONGEST_NAME = 50  # a file system's 255 bytes hold that many letters of any script
 
 
 def view_folder(directory: str | Path) -> Path:
     """Check that pictures can be written, before anything is measured."""
-    with as_input_error(
-        '--view plots a chart with matplotlib, which is not installed: pip install "armsight[report]"', InputError
-    ):
-        require_matplotlib()
+    require("--view", "report", "matplotlib.figure")
+    require_matplotlib()
     return check_folder(directory, problem="no pictures can be written here")
 
 
@@ -270,16 +261,14 @@ class PictureFolder:
         text = f"{CHART} and pictures of {pictures} of {self._shots} shots are in {self.folder}"
         if pictures < self._shots:
             kind = "every one" if self._odd <= ODD_UP_TO else "many"
-            often = (
-                f"one in {self._every} of the others" if self._every else "fewer and fewer of the others as it went on"
-            )
+            often = f"one in {self._every} of the others" if self._every else "ever fewer of the others as it went on"
             text += f": {kind} that was missed, searched or jumped, and {often}"
         old = len((self._earlier or set()) - self._written)
         return text + (f"; of an earlier run there are left: {old}" if old else "")
 
     def _file_name(self, shot: str) -> str:
         """Return a unique name for a shot's picture, of characters that any file system accepts."""
-        stem = PREFIX + re.sub(r"[^\w.-]", "_", shot)[-_LONGEST_NAME:]
+        stem = PREFIX + re.sub(r"[^\w.-]", "_", shot)[-50:]  # a file system's 255 bytes hold that many of any script
         name, again = f"{stem}.png", 1
         while name in self._written:
             again += 1

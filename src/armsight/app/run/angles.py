@@ -1,9 +1,8 @@
 """Joint angles that another program logged: ``--board poses:FILE``, for an arm that armsight does not move.
 
-In: any file that :mod:`armsight.tables` reads, with a column a joint, ``q1_rad`` or ``q1_deg`` and so on, and a column that
-says where each row belongs: ``shot`` (or ``image``, ``name``) or ``t_s`` (on the clock of the images; rows between are
-interpolated). Without either the rows belong to the shots in their order, one a shot. Out: :class:`LoggedAngles`, and the
-angles at each shot.
+In: a file that :mod:`armsight.tables` reads, with a column a joint, ``q1_rad`` or ``q1_deg`` and so on, and ``shot`` (or
+``image``, ``name``) or ``t_s`` (the clock of the images; rows between are interpolated); without either a row a shot, in
+their order. Out: :class:`LoggedAngles`, and the angles at each shot.
 """
 
 from __future__ import annotations
@@ -39,27 +38,21 @@ class LoggedAngles(Record):
         if self.shots is not None:
             rows = dict(zip(self.shots, self.q, strict=True))
             if not any(name in rows for name in names):
-                raise InputError(
-                    f"{self.path}: no row is of one of the shots: the first row's shot is {self.shots[0]!r}, the first shot"
-                    f" {names[0]!r}"
-                )
+                first = f"the first row's shot is {self.shots[0]!r}, the first shot {names[0]!r}"
+                raise InputError(f"{self.path}: no row is of one of the shots: {first}")
             return [rows.get(name) for name in names]
         if self.t_s is not None:
             return self._interpolated(times_s)
         if len(names) != len(self.q):
-            raise InputError(
-                f"{self.path}: {len(self.q)} rows, but {len(names)} shots: give a column shot or t_s, or"
-                " a row for each shot"
-            )
+            give = "give a column shot or t_s, or a row for each shot"
+            raise InputError(f"{self.path}: {len(self.q)} rows, but {len(names)} shots: {give}")
         return [q if np.isfinite(q).all() else None for q in self.q]
 
     def _interpolated(self, times_s: Sequence[float | None]) -> list[Array | None]:
         assert self.t_s is not None
         known = [t for t in times_s if t is not None]
         if not known:
-            raise InputError(
-                f"{self.path}: t_s says when the rows are, but the shots have no times: give a column shot"
-            )
+            raise InputError(f"{self.path}: t_s says when rows are, but the shots have no times: give a column shot")
         found: list[Array | None] = []
         for t in times_s:
             k = int(np.searchsorted(self.t_s, -np.inf if t is None else t))
@@ -71,21 +64,13 @@ class LoggedAngles(Record):
                 share = (t - self.t_s[k - 1]) / (self.t_s[k] - self.t_s[k - 1])
                 found.append(self.q[k - 1] + share * (self.q[k] - self.q[k - 1]))
         if all(each is None for each in found):
-            raise InputError(
-                f"{self.path}: no shot was taken while angles were logged: rows from {self.t_s[0]:.3f} to"
-                f" {self.t_s[-1]:.3f} s,"
-                f" shots from {min(known):.3f} to {max(known):.3f} s: both need the same clock"
-            )
+            when = f"rows from {self.t_s[0]:.3f} to {self.t_s[-1]:.3f} s, shots from {min(known):.3f} to {max(known):.3f} s"
+            raise InputError(f"{self.path}: no shot was taken while angles were logged: {when}: they need one clock")
         return found
 
 
 def read_angles(path: str | Path, arm: Arm) -> LoggedAngles:
-    """Read the logged joint angles of an arm.
-
-    Raises:
-        InputError: unreadable, a joint is missing or too many, a field is no number, degrees came as radians, or times
-            fall.
-    """
+    """Read the logged joint angles of an arm; an InputError says what is wrong with them."""
     kept = read_pose_table(Path(path), arm=arm, only_joints=True, keep_missed=True)
     table = kept.without_missed()
     assert kept.q is not None

@@ -50,9 +50,7 @@ def command(
         default=0.1,
     ),
     stream: tuple[str, ...] = STREAM,
-    sync_led: bool = option(
-        "The board's sync LED (docs/howto/board.md) is in view of both cameras: it gives delay and skew."
-    ),
+    sync_led: bool = option("The board's sync LED (docs/howto/board.md) is in view of both cameras."),
     references: Path | None = REFERENCES,
     open_loop: bool = option("Control by the joint sensors alone; do not close the loop on vision."),
     follow_rig: bool = FOLLOW_RIG,
@@ -69,13 +67,9 @@ def command(
     """
     if board_spec.startswith(LOGGED):
         if motion is not None or open_loop or fixed or follow_rig or sync_led or references is not None:
-            raise InputError(
-                f"--board {board_spec} commands no motion: leave out --motion, --open-loop, --fixed, --follow-rig, "
-                "--references and --sync-led"
-            )
-        _run_logged(
-            source_spec, Path(board_spec.removeprefix(LOGGED)), rig_path, target_spec, arm_spec, output, as_json
-        )
+            those = "--motion, --open-loop, --fixed, --follow-rig, --references and --sync-led"
+            raise InputError(f"--board {board_spec} commands no motion: leave out {those}")
+        _run_logged(source_spec, board_spec, rig_path, target_spec, arm_spec, output, as_json)
         return
 
     from armsight.app.run.devices import Devices, open_devices, planned_for
@@ -98,9 +92,7 @@ def command(
         require_followed(rig, rig_path)
     fixed_targets = open_fixed(fixed, target_spec)
     if not follows(target):
-        raise InputError(
-            f"{target_spec}: {target.body.name} cannot be followed: a body of three discs or more is needed"
-        )
+        raise InputError(f"{target_spec}: {target.body.name} cannot be followed: give a body of three discs or more")
     text = read_text(motion) if motion is not None else _motion_text(arm, simulated=source_spec.startswith(SIM))
     with tempfile.TemporaryDirectory() as name:
         if motion is None:
@@ -133,7 +125,7 @@ def command(
 
 
 def _run_logged(
-    source_spec: str, path: Path, rig_path: Path, target_spec: str, arm_spec: str, output: Path, as_json: bool
+    source_spec: str, board_spec: str, rig_path: Path, target_spec: str, arm_spec: str, output: Path, as_json: bool
 ) -> None:
     """Calibrate hand and eye from a recording and the joint angles that were logged beside it."""
     import contextlib
@@ -149,12 +141,12 @@ def _run_logged(
 
     require_matplotlib()
     arm, rig, target = open_arm(arm_spec), StereoRig.load_trusted(rig_path), open_target(target_spec)
-    angles = read_angles(path, arm)
+    angles = read_angles(board_spec.removeprefix(LOGGED), arm)
     note(*angles.notes)
     with open_folder(output), contextlib.closing(open_source(source_spec)) as source, steps() as progress:
         result = run_logged(source, rig, target, arm, angles, progress)
         progress("writing and plotting")
-        summary = write_logged(output, result, {"arm": arm_spec, "board": f"{LOGGED}{path}"})
+        summary = write_logged(output, result, {"arm": arm_spec, "board": board_spec})
     print_answer(as_json, summary, *summary_lines(summary, output))
     warn(*result.weak)
     if result.weak:
@@ -166,15 +158,15 @@ def _motion_text(arm: Arm, *, simulated: bool) -> str:
     import numpy as np
 
     from armsight.app.check.plan import plan_test
-    from armsight.app.run.motion_file import motion_of
+    from armsight.app.run.motion_file import motion_of, motion_text
 
     if (kept := motion_of(arm.name, simulated=simulated)) is not None:
         return read_text(kept)
     if simulated:
         from armsight.sim.workcell.workcell import workcell_poses
 
-        motion = '[[motion]]\nkind = "joints"\nname = "P{} cycle {}"\nq_deg = {}\n'
-        poses = np.degrees(workcell_poses(arm, default=False)).round(2).tolist()
-        there = [motion.format(n, cycle, q) for cycle in range(1, _CYCLES + 1) for n, q in enumerate(poses, start=1)]
-        return "\n".join([f"start_deg = {np.degrees(arm.home).round(4).tolist()}", *there])
+        poses = list(enumerate(np.degrees(workcell_poses(arm, default=False)).round(2), start=1))
+        there = [(f"P{n} cycle {cycle}", q) for cycle in range(1, _CYCLES + 1) for n, q in poses]
+        motions = [motion_text("joints", name, {"q_deg": q}) for name, q in there]
+        return f"start_deg = {np.degrees(arm.home).round(4).tolist()}\n" + "".join(motions)
     return plan_test(arm, "poses", _CYCLES, None, _SPEED_M_S, None).motions

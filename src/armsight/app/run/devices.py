@@ -12,12 +12,12 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from armsight.app.options import SIM
-from armsight.app.show.messages import note
+from armsight.app.show.messages import note, require
 from armsight.data import Array
 from armsight.errors import DeviceError, InputError
 from armsight.loop.references.distance import Distance
@@ -87,12 +87,9 @@ class LiveReadings:
             self.close()
             if self._problem:
                 raise InputError(f"{self._where}: {self._problem}")
-            raise DeviceError(
-                f"{self._where}: nothing came from {entry.live} within {FIRST_S:g} s; is it sending there?"
-            )
+            raise DeviceError(f"{self._where}: nothing came from {entry.live} within {FIRST_S:g} s; is it sending?")
 
     def _opened(self, spec: str) -> Callable[[], bytes]:
-        """Return what reads some lines, empty where none came in time."""
         if match := re.fullmatch(r"udp:(?:(.+):)?(\d{1,5})", spec):
             receiver = self._closing.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
             receiver.settimeout(_WAIT_S)
@@ -102,10 +99,9 @@ class LiveReadings:
                 raise DeviceError(f"{self._where}: {spec} cannot be opened: {error}") from None
             return lambda: receiver.recv(_LINES_BYTES) + b"\n"
         if match := re.fullmatch(r"serial:([^,]+)(?:,(\d+))?", spec):
-            try:
-                import serial
-            except ImportError:
-                raise InputError(f"{self._where}: {spec} needs pyserial: pip install 'armsight[board]'") from None
+            require(f"{self._where}: {spec}", "board", "serial")
+            import serial
+
             try:
                 port = self._closing.enter_context(serial.Serial(match[1], int(match[2] or BAUD), timeout=_WAIT_S))
             except (OSError, ValueError) as error:
@@ -184,18 +180,11 @@ class LiveReadings:
 
 def setup_of(workcell: Workcell) -> Setup:
     """Return the setup of a workcell: the interface that real devices have as well."""
-    timing = workcell.timing
+    w, timing = workcell, workcell.timing
     sync_s = float(np.hypot(timing.sync_s / np.sqrt(3), timing.skew_s))
-    return Setup(
-        workcell.model,
-        workcell.board,
-        workcell.poll,
-        workcell.target,
-        workcell.gravity_duty,
-        timing.rate_hz,
-        sync_s,
-        sync_led_bit_s=sync_led_bit_s(workcell.board, "the workcell") if workcell.source.shows_led else None,
-    )
+    bit_s = sync_led_bit_s(w.board, "the workcell") if w.source.shows_led else None
+    devices = w.model, w.board, w.poll, w.target, w.gravity_duty
+    return Setup(*devices, timing.rate_hz, sync_s, sync_led_bit_s=bit_s)
 
 
 def simulated_unit(workcell: Workcell, entry: Entry, seed: int) -> Fused:
@@ -216,10 +205,8 @@ def sync_led_bit_s(board: MotionBoard, name: str) -> float:
         raise InputError(f"--sync-led: {name} keeps its own controller, which drives no LED on its clock")
     config = board.configuration()
     if not config["sync_led_pin"]:
-        raise InputError(
-            f"--sync-led: {name} drives no LED: choose its pin with armsight board config set arm.sync_led_pin=PB13,"
-            " and start the board anew"
-        )
+        how = "choose its pin with armsight board config set arm.sync_led_pin=PB13, and start the board anew"
+        raise InputError(f"--sync-led: {name} drives no LED: {how}")
     return int(config["sync_led_ticks"]) / board.welcome.ticks_per_s
 
 
@@ -240,10 +227,8 @@ def require_joints(board: MotionBoard, name: str, arm: Arm) -> None:
     """Close a board that drives another number of joints than the arm has, and raise an InputError."""
     if board.abilities.joints != len(arm.a):
         board.close()
-        raise InputError(
-            f"--board {name} has {board.abilities.joints} joints, --arm {arm.name} {len(arm.a)}: give the arm that is at"
-            " the board (armsight arm list)"
-        )
+        other = f"--arm {arm.name} {len(arm.a)}: give the arm that is at the board (armsight arm list)"
+        raise InputError(f"--board {name} has {board.abilities.joints} joints, {other}")
 
 
 def planned_for(arm: Arm, board: str) -> Arm:
@@ -261,22 +246,15 @@ def open_devices(devices: Devices) -> Iterator[Setup]:
     """Open the devices, or the workcell instead of them, and close them at the end of the block."""
     source, board = devices.source, devices.board
     if source.startswith(SIM) != board.startswith(EMULATED):
-        raise InputError(
-            f"--source {source} --board {board}: {SIM} and {EMULATED} are one workcell and go together; real ones are "
-            "usb:0,1 and serial:/dev/ttyACM0, feetech:PORT or ar4:PORT"
-        )
+        real = "real ones are usb:0,1 and serial:/dev/ttyACM0, feetech:PORT or ar4:PORT"
+        raise InputError(f"--source {source} --board {board}: {SIM} and {EMULATED} go together; {real}")
     with contextlib.ExitStack() as stack:
         if source.startswith(SIM):
             from armsight.sim.workcell.workcell import Workcell
 
-            opened = Workcell.open(
-                arm=_SIM_ARM,
-                cameras=source.removeprefix(SIM) or _SIM_CAMERAS,
-                emulator=emulator_name(board),
-                model=devices.arm,
-                sync_led=devices.sync_led,
-                target=devices.target,
-            )
+            cameras = source.removeprefix(SIM) or _SIM_CAMERAS
+            how: Any = {"model": devices.arm, "sync_led": devices.sync_led, "target": devices.target}
+            opened = Workcell.open(arm=_SIM_ARM, cameras=cameras, emulator=emulator_name(board), **how)
             workcell = stack.enter_context(opened)
             beside = None if devices.reference is None else simulated_unit(workcell, devices.reference, 0)
             yield replace(setup_of(workcell), target=devices.target, beside=beside)
@@ -297,15 +275,5 @@ def open_devices(devices: Devices) -> Iterator[Setup]:
             readings = LiveReadings(devices.reference, clock)
             stack.callback(readings.close)
             beside = fused(devices.reference, readings, readings.losses)
-        yield Setup(
-            devices.arm,
-            controller,
-            shots.poll,
-            devices.target,
-            np.zeros_like,
-            rate_hz or _RATE_HZ,
-            devices.sync_s,
-            clock,
-            sync_led_bit_s=bit_s,
-            beside=beside,
-        )
+        has = devices.arm, controller, shots.poll, devices.target, np.zeros_like, rate_hz or _RATE_HZ
+        yield Setup(*has, devices.sync_s, clock, sync_led_bit_s=bit_s, beside=beside)

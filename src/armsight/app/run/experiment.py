@@ -42,7 +42,6 @@ _START_RAD, _START_ALONE_RAD = float(np.radians(2.0)), float(np.radians(5.0))
 #: How long to wait for a board that is stopping its arm, s.
 _SLOWS_S = 3.0
 _STEP_S = 0.05
-_CHECKED = 200  # joint angles along a motion that are checked
 #: Delay of the cameras and its sigma before it is measured, s.
 _UNKNOWN_DELAY = Delay(0.02, 0.02)
 #: Number of shots that are kept as images: a recording to try the stages on.
@@ -51,7 +50,6 @@ KEPT_SHOTS = 12
 PRIOR = Prior(creep_rad=float(np.deg2rad(0.05)))
 #: Time from an image's arrival to its command, s: computing time, and the mean wait for the next iteration.
 _OWN_S = 0.002 + PERIOD_S / 2
-_STALE_S = 0.05
 #: Longest rest in open loop, s, beyond what the board lags: there is no correction that has to settle.
 OPEN_REST_S = 0.5
 #: Makes a controller from a trajectory, the time at which it begins, board's clock, s, and how long the arm then rests, s.
@@ -69,10 +67,8 @@ def enable(board: MotionBoard) -> None:
         board.confirm(board.command(Command.CLEAR_FAULTS))
     elif faults or board.status.state is BoardState.STOPPED:
         found = "; ".join(str(fault) for fault in faults) or "the emergency stop was pressed"
-        raise DeviceError(
-            f"the board is not ready: {STATE_TEXTS[board.status.state]} ({found}): remove the cause, and switch the board "
-            "off and on again"
-        )
+        mend = "remove the cause, and switch the board off and on again"
+        raise DeviceError(f"the board is not ready: {STATE_TEXTS[board.status.state]} ({found}): {mend}")
     if board.status.state is not BoardState.ENABLED:  # a held arm is taken over without releasing it
         board.enable()
 
@@ -102,15 +98,15 @@ def require_start(setup: Setup, plan: MotionPlan, targets: Array) -> None:
 def require_followed(rig: StereoRig, path: Path) -> None:
     """Reject a rig that cannot be followed, as its file does not say how well it is known."""
     if not rig.cov.any():
+        mend = "calibrate it (armsight calibrate), or leave out --follow-rig"
         raise InputError(
-            f"--follow-rig: {path} has no covariance, so that a rig that moved cannot be distinguished from one that was "
-            "never well known: calibrate it (armsight calibrate), or leave out --follow-rig"
+            f"--follow-rig: {path} has no covariance: a rig that moved looks like one poorly known: {mend}"
         )
 
 
 def passed(way: Trajectory) -> Array:
     """Return joint angles (N, n) that a motion passes, rad."""
-    return way.at(np.linspace(0.0, way.duration_s, _CHECKED)).q
+    return way.at(np.linspace(0.0, way.duration_s, 200)).q
 
 
 def require_range(setup: Setup, q: Array) -> None:
@@ -204,41 +200,27 @@ def run_experiment(
         _prepare(loop, result, targets, progress)
         _passes(loop, result, progress, cover, close_loop)
 
-    return _run(result, progress, begun, publisher or Fanout(), work)
+    return run_visits(result, work, progress, begun, publisher)
 
 
 def run_visits(
-    setup: Setup,
-    rig: StereoRig,
-    plan: MotionPlan,
-    work: Callable[[Loop], None],
-    *,
-    progress: Progress,
-    begun: Callable[[Loop], None] = lambda loop: None,
-    look: bool = True,
-) -> RunResult:
-    """Move the arm from a plan's start by ``work`` alone, which is given the loop; else as :func:`run_experiment`."""
-    return _run(RunResult(setup, rig, plan), progress, begun, Fanout(), work, look=look)
-
-
-def _run(
     result: RunResult,
+    work: Callable[[Loop], None],
     progress: Progress,
     begun: Callable[[Loop], None],
-    publisher: Publisher,
-    work: Callable[[Loop], None],
+    publisher: Publisher | None = None,
     *,
     look: bool = True,
 ) -> RunResult:
     """Switch the drives on, look, and do the work; what ends it early is stored in the result, and the arm is stopped."""
     loop: Loop | None = None
-    setup = result.setup
+    setup, publisher = result.setup, publisher or Fanout()
     with steady(in_time=setup.clock is not None):
         try:
             progress("preparing to follow the body")
             follower = Follower(result.rig, setup.target, setup.sync_s)
             if setup.clock is not None:
-                setup.board.receive(_STALE_S)  # what arrived in the port's buffer meanwhile
+                setup.board.receive(0.05)  # what arrived in the port's buffer meanwhile
             first = KalmanEstimator(setup.arm, prior=prior_of(setup.board), delay=_UNKNOWN_DELAY)
             publisher.put(EventDatum(0.0, estimator_event(first, anew=False)))
             loop = Loop.open(setup, follower, result.log, first, publisher)
@@ -281,10 +263,8 @@ def _require_seen(loop: Loop, plan: MotionPlan) -> None:
     if not results:
         raise DeviceError("no shot came while the arm stood: are the cameras running?")
     missed = next(result for result in results if isinstance(result, Missed))
-    raise ArmsightError(
-        f"the body {setup.target.body.name} is not seen where the arm stands ({missed.reason}): bring it into the view "
-        "of both cameras before the run"
-    )
+    mend = "bring it into the view of both cameras before the run"
+    raise ArmsightError(f"the body {setup.target.body.name} is not seen where the arm stands ({missed.reason}): {mend}")
 
 
 def _prepare(loop: Loop, result: RunResult, targets: Array, progress: Progress) -> None:
@@ -306,11 +286,7 @@ def _prepare(loop: Loop, result: RunResult, targets: Array, progress: Progress) 
 
 
 def _passes(
-    loop: Loop,
-    result: RunResult,
-    progress: Progress,
-    cover: Callable[[float, float], None] | None,
-    close_loop: bool,
+    loop: Loop, result: RunResult, progress: Progress, cover: Callable[[float, float], None] | None, close_loop: bool
 ) -> None:
     setup, plan = loop.setup, result.plan
 

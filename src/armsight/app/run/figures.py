@@ -87,9 +87,7 @@ def errors_figure(run: Part) -> Figure | None:
             plot.set_ylabel(f"{name}, {unit}")
     for plot in plots:
         _shade(plot, run, named=plot is plots[-1])  # the one without a title
-    plots[1].set_title(
-        "vision and fused; shaded: at least 95% of the fused estimate's errors should lie below", fontsize=9
-    )
+    plots[1].set_title("vision and fused; shaded: at least 95% of the fused errors should lie below", fontsize=9)
     plots[1].legend(fontsize=7, ncols=3, loc="upper right")
     plots[3].set_xlabel("time, s")
     return figure
@@ -234,7 +232,6 @@ def studies_figure(studies: Sequence[Study]) -> Figure | None:
 
 
 def _decades(values: np.ndarray) -> list[float]:
-    """Return ticks 1, 2, 5 times powers of ten over the values."""
     good = values[np.isfinite(values) & (values > 0)]
     low, high = (float(np.log10(bound)) for bound in (good.min(), good.max()))
     steps = (1.0, 2.0, 5.0) if high - low < 1.5 else (1.0, 3.0) if high - low < 2.5 else (1.0,)

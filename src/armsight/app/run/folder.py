@@ -1,8 +1,7 @@
 """The folder of a run: :func:`finish` writes all that a run measured, and raises what ended the run early.
 
 In: a :class:`~armsight.app.run.experiment.RunResult`. Out: tracks and joints as CSV, the hand-eye calibration, kept shots,
-summary.json, run.log, the report and its figures. Each file is complete or not there at all; a run that ended early has
-everything that was measured until then. :func:`open_folder` and :func:`make_room` prepare a folder before the run.
+summary.json, run.log, the report and its figures. Each file is complete or not there at all.
 """
 
 from __future__ import annotations
@@ -114,18 +113,10 @@ def finish(
     studies: Sequence[Study] = (),
     workcell: Callable[[], Image] | None = None,
 ) -> Report:
-    """Write everything a run measured, and raise what ended it early.
+    """Write everything a run measured, and raise what ended it early: an ArmsightError, or a KeyboardInterrupt.
 
-    Args:
-        result: what was measured.
-        folder: of the run.
-        truth: times (N,), s, and poses (N, 4, 4) of the tool in the base frame; None for a real arm.
-        studies: made after it.
-        workcell: returns an image (H, W, 3) BGR of the workcell from aside; None for a real arm.
-
-    Raises:
-        ArmsightError: what ended the run early, or that not all files could be written; those that were are complete.
-        KeyboardInterrupt: the keyboard interrupted the run, or the writing.
+    ``truth``: times (N,), s, and poses (N, 4, 4) of the tool in the base frame; ``workcell``: returns an image (H, W, 3)
+    BGR from aside; both None for a real arm. If a file could not be written, those that were are complete.
     """
     ended = f"{result.ended_text}; the arm was stopped" if result.ended_text is not None else ""
     tracks, handeye = None, result.handeye
@@ -159,7 +150,6 @@ def finish(
 
 
 def _write_measured(result: RunResult, tracks: Tracks | None, folder: Path, keep: Callable[..., None]) -> None:
-    """Have everything but the summary and the page written."""
     log, handeye = result.log, result.handeye
     keep(_write_poses, folder / "poses.csv", result)
     if drawn := log.detections():
@@ -222,18 +212,11 @@ def write_handeye(folder: Path, run: HandEyeRun, corrected: Sequence[tuple[float
     """
     found, (position, angle) = run.found, run.found.held_out.rms()
     newest = corrected[-1][1] if corrected else run.mounting
-    calibration: dict[str, Any] = {
-        "T_base_rig": newest.T_base_rig.tolist(),
-        "T_tool_body": newest.T_tool_body.tolist(),
-        "cov": (found.cov + newest.cov - run.mounting.cov).tolist(),
-        "held_out_position_rms_m": position,
-        "held_out_angle_rms_rad": angle,
-        "sigma_flange_m": found.sigma_flange[0],
-        "sigma_flange_rad": found.sigma_flange[1],
-        "structure": found.structure,
-        "poses": len(run.q),
-        "missed": list(run.missed),
-    }
+    calibration = {name: getattr(newest, name).tolist() for name in ("T_base_rig", "T_tool_body")}
+    calibration |= {"cov": (found.cov + newest.cov - run.mounting.cov).tolist()}
+    calibration |= {"held_out_position_rms_m": position, "held_out_angle_rms_rad": angle}
+    calibration |= zip(("sigma_flange_m", "sigma_flange_rad"), found.sigma_flange, strict=True)
+    calibration |= {"structure": found.structure, "poses": len(run.q), "missed": list(run.missed)}
     if corrected:
         calibration |= {"since_s": corrected[-1][0], "T_base_rig_before": run.mounting.T_base_rig.tolist()}
     write_text(folder / "handeye.json", json.dumps(calibration, indent=1) + "\n")
@@ -275,10 +258,7 @@ def write_shots(folder: Path, shots: Sequence[Shot]) -> None:
 
 @contextlib.contextmanager
 def open_folder(folder: Path, *, simulated: bool = False) -> Iterator[None]:
-    """Keep a folder to one run, and check that it can be written there, before the long work begins.
-
-    ``simulated``: what a run that was killed left there, beside its lock, may be written over.
-    """
+    """Keep a folder, checked before the long work, to one run; ``simulated``: a killed run's files are written over."""
     holding = (*_names(), "rig.json", "body.toml", "motion.toml", REFERENCES)
     signs = (PAGE, "summary.json", *["in_use.lock"] * simulated)
     check_folder(folder, holding=holding, signs=signs, problem="no run can be written here")
@@ -292,7 +272,6 @@ def open_folder(folder: Path, *, simulated: bool = False) -> Iterator[None]:
 
 
 def _names() -> list[str]:
-    """Return which files a run writes; of the others its inputs are copies."""
     names = [f"{name}.png" for name in (*_FIGURES, "pose", "workcell", "cell")]
     names += [f"{name}.{kind}" for name in _TABLES for kind in ("csv", "parquet")]
     return [*names, PAGE, "run.log", "poses.csv", DETECTIONS, _FOLLOWED, "handeye.json", "handeye_poses.csv", RUN_MCAP]

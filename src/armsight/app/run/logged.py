@@ -68,21 +68,15 @@ class LoggedRun(Record):
     def to_json(self) -> dict[str, Any]:
         """Return what summary.json has."""
         found, (position, angle) = self.run.found, self.run.found.held_out.rms()
-        return {
-            "shots": self.shots,
-            "poses": len(self.names),
-            "missed": list(self.run.missed),
-            "without_angles": list(self.unpaired),
-            "outliers": [name for name, used in zip(self.names, found.used, strict=True) if not used],
-            "held_out_position_rms_mm": round(1e3 * position, 4),
-            "held_out_angle_rms_deg": round(float(np.degrees(angle)), 5),
-            "held_out_position_max_mm": round(1e3 * found.held_out.most()[0], 4),
-            "sigma_flange_mm": round(1e3 * found.sigma_flange[0], 4),
-            "sigma_flange_deg": round(float(np.degrees(found.sigma_flange[1])), 5),
-            "share": found.structure,
-            "rows_shifted_by": self.shift,
-            "weak": list(self.weak),
-        }
+        outliers = [name for name, used in zip(self.names, found.used, strict=True) if not used]
+        shown: dict[str, Any] = {"shots": self.shots, "poses": len(self.names), "missed": list(self.run.missed)}
+        shown |= {"without_angles": list(self.unpaired), "outliers": outliers}
+        lengths_m = {"held_out_position_rms": position, "held_out_position_max": found.held_out.most()[0]}
+        lengths_m["sigma_flange"] = found.sigma_flange[0]
+        shown |= {f"{name}_mm": round(1e3 * each, 4) for name, each in lengths_m.items()}
+        angles = {"held_out_angle_rms": angle, "sigma_flange": found.sigma_flange[1]}
+        shown |= {f"{name}_deg": round(float(np.degrees(each)), 5) for name, each in angles.items()}
+        return shown | {"share": found.structure, "rows_shifted_by": self.shift, "weak": list(self.weak)}
 
 
 def run_logged(
@@ -95,10 +89,8 @@ def run_logged(
     missed = tuple(f"{name}: {r.reason}" for name, r, _ in rows if isinstance(r, Missed))
     good = [(name, r, q) for name, r, q in rows if isinstance(r, PoseEstimate) and q is not None]
     if len(good) < MIN_POSES:
-        first = f": {missed[0]}" if missed else ""
-        raise CalibrationError(
-            f"{len(good)} of {len(names)} shots show the body and have joint angles; {MIN_POSES} at least are needed{first}"
-        )
+        few = f"{len(good)} of {len(names)} shots show the body and have joint angles; {MIN_POSES} at least are needed"
+        raise CalibrationError(": ".join([few, *missed[:1]]))
     q = np.array([angles_of for _, _, angles_of in good])
     Ts, covs = np.array([pose.T_left_body for _, pose, _ in good]), np.array([pose.cov for _, pose, _ in good])
     progress("hand-eye: calibrating")
@@ -177,9 +169,8 @@ def write_logged(folder: Path, result: LoggedRun, properties: dict[str, str]) ->
     summary = {**properties, **result.to_json()}
     write_handeye(folder, result.run)
     names = ["shot", *(f"q{k + 1}_deg" for k in range(result.run.q.shape[1])), "error_mm", "error_deg", "used"]
-    each = zip(
-        result.names, np.degrees(result.run.q), result.error_mm, result.error_deg, result.run.found.used, strict=True
-    )
+    run = result.run
+    each = zip(result.names, np.degrees(run.q), result.error_mm, result.error_deg, run.found.used, strict=True)
     rows = ([name, *np.round(q, 4), _rounded(mm), _rounded(deg), int(used)] for name, q, mm, deg, used in each)
     files = {"errors.csv": table_text(names, rows), "summary.json": json.dumps(summary, indent=1) + "\n"}
     _report(result, summary).write(folder, files)

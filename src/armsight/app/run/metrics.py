@@ -1,8 +1,7 @@
 """Metrics of a run: the error of each track against the truth, and what closing the loop gained. SI units.
 
-In: the tracks of a run. Out: records of numbers, as summary.json has them. Distances are of the tool's origin, angles those
-of the whole rotation between two orientations. Without a truth (a real arm) the fused track stands in for it where motions
-are evaluated, and nothing is said about the errors of the tracks themselves.
+Distances are of the tool's origin, angles of the whole rotation between two orientations. Without a truth (a real arm) the
+fused track stands in for it where motions are evaluated, and nothing is said about the errors of the tracks themselves.
 """
 
 from __future__ import annotations

@@ -6,6 +6,7 @@ joints, home, line or circle; ``_KINDS`` lists the keys of each. Lengths are in 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -88,6 +89,15 @@ def read_motions(arm: Arm, path: str | Path = DEFAULT_MOTION) -> MotionPlan:
         motions.append(_motion(where, arm, q, entry, [m.name for m in motions], number))
         q = motions[-1].trajectory.at(motions[-1].trajectory.duration_s).q
     return MotionPlan(q_start, tuple(motions))
+
+
+def motion_text(kind: str, name: str, keys: Mapping[str, Any]) -> str:
+    """Return a motion as a file has it."""
+    text = f'\n[[motion]]\nkind = "{kind}"\nname = "{name}"\n'
+    for key, value in keys.items():
+        number = f"{value:.{1 if key == 'angle_deg' else 4}f}" if np.ndim(value) == 0 else ""
+        text += f"{key} = {number or '[' + ', '.join(f'{v:.6f}' for v in value) + ']'}\n"
+    return text
 
 
 def _motion(where: str, arm: Arm, q: Array, entry: dict[str, Any], names: list[str], number: int) -> PlannedMotion:

@@ -11,19 +11,9 @@ from typing import Any
 import click
 import numpy as np
 
-from armsight.app.run import figures
+from armsight.app.run import figures, metrics
 from armsight.app.run.experiment import RunResult
-from armsight.app.run.metrics import (
-    PassErrors,
-    Study,
-    TrackMetrics,
-    against_truth,
-    hidden,
-    partly_uncorrected,
-    pass_errors,
-    spread,
-    track_metrics,
-)
+from armsight.app.run.metrics import PassErrors, Study, TrackMetrics
 from armsight.app.run.tracks import Part, Tracks
 from armsight.app.show.messages import UNTRUSTED, Level, Note, note, warn
 from armsight.app.show.page import PAGE
@@ -51,22 +41,10 @@ _POINTS = 4000  # of a line in a figure: more cannot be seen
 _FIGURES = {
     "pose": ("images", "Images", "The left camera's image with the measured pose."),
     "workcell": ("images", "Images", "The workcell from aside."),
-    "joints": (
-        "motion",
-        "Joint angles and tool path",
-        "The joint angles over time, by their sensors, and reference; shaded: the arm rests.",
-    ),
+    "joints": ("motion", "Joint angles and tool path", "Joint angles by their sensors, and reference; shaded: rests."),
     "path": ("motion", "", "The tool's path: from the joint sensors, from vision, from both fused, and the truth."),
-    "errors": (
-        "errors",
-        "Errors against the truth",
-        "The error of each track over time, and the 95% band that the fused estimate claims.",
-    ),
-    "loop": (
-        "loop",
-        "Open loop and closed loop",
-        "The same motions with the joint sensors alone and with vision in the loop.",
-    ),
+    "errors": ("errors", "Errors against the truth", "Each track's error over time; the fused one's claimed 95% band."),
+    "loop": ("loop", "Open loop and closed loop", "The same motions without and with vision in the loop."),
     "latency": (
         "latency",
         "Latency",
@@ -99,14 +77,9 @@ def report_of(
     picture: Image | None = None,
     workcell: Callable[[], Image] | None = None,
 ) -> Report:
-    """Return the report of a run.
+    """Return the report of a run; ``tracks``: None where it ended before the hand-eye calibration.
 
-    Args:
-        result: what was measured.
-        tracks: its tracks; None where the run ended before the hand-eye calibration.
-        studies: made after it.
-        picture: (H, W, 3) BGR, the left image with the measured pose overlaid; None without.
-        workcell: returns (H, W, 3) BGR, the workcell from aside; None on a real arm.
+    ``picture``: (H, W, 3) BGR, the left image with the measured pose; ``workcell``: returns one from aside.
     """
     led = None if result.led is None else result.led.to_json()
     values: dict[str, Any] = {"version": VERSION}
@@ -116,13 +89,13 @@ def report_of(
     if tracks is not None:
         passes = _passes(result, tracks)
         before = None if result.open_s is None else tracks.between(*result.open_s)
-        found = {} if before is None else against_truth(before, result.covered_s)
-        values |= {name: _known(vars(metrics)) for name, metrics in found.items()}
+        found = {} if before is None else metrics.against_truth(before, result.covered_s)
+        values |= {name: _known(vars(each)) for name, each in found.items()}
         if before is not None and (occlusion := _occlusion(before, result.covered_s)) is not None:
             values["occlusion"] = occlusion
+            most = f"{1e3 * occlusion['fused_position_max_m']:.2f} mm at most"
             lines.append(
-                f"body hidden for {occlusion['duration_s']:g} s in motion: the fused estimate was wrong by at most "
-                f"{1e3 * occlusion['fused_position_max_m']:.2f} mm"
+                f"body hidden for {occlusion['duration_s']:g} s in motion: the fused estimate was off by {most}"
             )
         if result.open_s is not None and (alone := _odometry(tracks.between(*result.open_s, most=_MOST), tracks.arm)):
             values["odometry"] = alone._asdict()
@@ -134,14 +107,9 @@ def report_of(
         sections = _figures(result, tracks, passes, studies, picture, workcell)
     elif led is not None:
         values["sync_led"] = led
-    values |= {
-        "health": [each.to_json() for each in result.health],
-        "fixed_unseen": list(result.fixed_unseen),
-        "rig_corrections": [each.to_json() for each in result.log.corrections],
-        "rig_not_corrected": result.not_corrected,
-        **result.properties,
-        "ended_by": result.ended_text,
-    }
+    values |= {"health": [each.to_json() for each in result.health], "fixed_unseen": list(result.fixed_unseen)}
+    values |= {"rig_corrections": [each.to_json() for each in result.log.corrections]}
+    values |= {"rig_not_corrected": result.not_corrected, **result.properties, "ended_by": result.ended_text}
     notes = [] if tracks is None else notes_of(result)
     shown: list[Block] = list(filter(None, tables))
     sections = {
@@ -150,9 +118,7 @@ def report_of(
         **sections,
     }
     about, name = result.properties, result.setup.arm.name
-    simulated = (
-        f"simulated, {about.get('arm')} · {about.get('cameras')} · seed {about['seed']}" if "seed" in about else ""
-    )
+    simulated = "simulated, {arm} · {cameras} · seed {seed}".format(**about) if "seed" in about else ""
     return Report(
         "run",
         f"A {'simulated ' if simulated else ''}run of the arm {name}, measured",
@@ -198,11 +164,8 @@ def assess(result: RunResult, passes: tuple[PassErrors, PassErrors] | None) -> t
     said = f"the hand-eye calibration is off by {1e3 * result.handeye.found.held_out.rms()[0]:.2f} mm"
     said = f"with the loop closed the tool {' and '.join(parts)}" if parts else said
     if result.health or share < _FEW:
-        why = (
-            result.health[0].line()
-            if result.health
-            else f"only {100 * share:.0f} % of the shots were measured: see run.log"
-        )
+        few = f"only {100 * share:.0f} % of the shots were measured: see run.log"
+        why = result.health[0].line() if result.health else few
         return "fair", f"Usable with care: {said}; {why}."
     if not gained:
         return "fair", f"Usable, but the closed loop is not better in all: {said}; armsight check shows where."
@@ -244,27 +207,20 @@ def _measured(result: RunResult, values: dict[str, Any], led: Any, studies: Sequ
     log, lines = result.log, list[str]()
     assert result.handeye is not None
     if len(log.latency_s):
-        t = spread(log.latency_s.array(1))
+        t = metrics.spread(log.latency_s.array(1))
         values["latency_s"] = vars(t)
-        lines.append(
-            f"image to command: p50 {1e3 * t.p50:.2f} ms, p99 {1e3 * t.p99:.2f} ms, p99.9 {1e3 * t.p999:.2f} ms, "
-            f"longest {1e3 * t.max:.1f} ms while the body is followed"
-        )
+        shares = f"p50 {1e3 * t.p50:.2f} ms, p99 {1e3 * t.p99:.2f} ms, p99.9 {1e3 * t.p999:.2f} ms"
+        lines.append(f"image to command: {shares}, longest {1e3 * t.max:.1f} ms while the body is followed")
     if len(log.search_s):
-        t = spread(log.search_s.array(1))
+        t = metrics.spread(log.search_s.array(1))
         values["search_s"] = vars(t)
-        lines.append(
-            f"search of the body: median {1e3 * t.p50:.0f} ms, longest {1e3 * t.max:.0f} ms; commands continue meanwhile"
-        )
+        lines.append(f"search of the body: median {1e3 * t.p50:.0f} ms, longest {1e3 * t.max:.0f} ms")
     if result.setup.beside is not None:
         values["reference"], line = _beside(result.setup.beside, log)
         lines.append(line)
     position, angle = result.handeye.found.held_out.rms()
-    values["handeye"] = {
-        "held_out_position_rms_m": position,
-        "held_out_angle_rms_rad": angle,
-        "poses": len(result.handeye.q),
-    }
+    heldout = {"held_out_position_rms_m": position, "held_out_angle_rms_rad": angle}
+    values["handeye"] = heldout | {"poses": len(result.handeye.q)}
     values["camera_delay_s"] = {"value": result.delay.delay_s, "sigma": result.delay.sigma_s}
     if result.shutters is not None:
         values["shutters"] = result.shutters.to_json()
@@ -286,9 +242,8 @@ def _beside(beside: Fused, log: Log) -> tuple[dict[str, Any] | None, str]:
 
 
 def _shots_line(result: RunResult) -> str:
-    return "{measured} shots measured, {missed} missed, {rejected} rejected by the estimator".format(
-        **result.log.counts()
-    )
+    line = "{measured} shots measured, {missed} missed, {rejected} rejected by the estimator"
+    return line.format(**result.log.counts())
 
 
 def _occlusion(before: Part, covered_s: tuple[float, float] | None) -> dict[str, float] | None:
@@ -297,8 +252,8 @@ def _occlusion(before: Part, covered_s: tuple[float, float] | None) -> dict[str,
         return None
     found = {"duration_s": float(np.ptp(covered_s))}
     for name, track in (("fused", before.fused), ("live", before.live)):
-        metrics = track_metrics(track[hidden(track, covered_s)], before.truth)
-        found |= {f"{name}_{key}": getattr(metrics, key) for key in ("position_rms_m", "position_max_m")}
+        errors = metrics.track_metrics(track[metrics.hidden(track, covered_s)], before.truth)
+        found |= {f"{name}_{key}": getattr(errors, key) for key in ("position_rms_m", "position_max_m")}
     return found
 
 
@@ -307,8 +262,9 @@ def _passes(result: RunResult, tracks: Tracks) -> tuple[PassErrors, PassErrors] 
     if result.open_s is None or result.closed_s is None:
         return None
     goals = {m.name: m.trajectory.at(m.trajectory.duration_s).q for m in result.plan.motions}
-    singular = [name for name, q in goals.items() if partly_uncorrected(tracks.arm, q)]
-    return pass_errors(tracks, result.open_s, singular), pass_errors(tracks, result.closed_s, singular)
+    singular = [name for name, q in goals.items() if metrics.partly_uncorrected(tracks.arm, q)]
+    alone, closed = (metrics.pass_errors(tracks, span_s, singular) for span_s in (result.open_s, result.closed_s))
+    return alone, closed
 
 
 def _passes_json(before: PassErrors, after: PassErrors) -> dict[str, Any]:
@@ -326,34 +282,28 @@ def _passes_json(before: PassErrors, after: PassErrors) -> dict[str, Any]:
 
 
 def _track_table(found: Mapping[str, TrackMetrics]) -> TextTable | None:
-    """Return the table of the tracks' errors in motion; None without a truth."""
+    keys = [f"position_{kind}_m" for kind in ("rms", "max")] + ["rest_position_rms_m"]
+    keys += [f"orientation_{kind}_rad" for kind in ("rms", "max")]
+    keys += ["position_sigma_rms_m", "orientation_sigma_rms_rad", "inside_95_share"]
     columns = ("", "RMS, mm", "max, mm", "at rest, mm", "RMS, deg", "max, deg", "sigma, mm", "sigma, deg", "inside 95%")
     rows = [
-        (
-            shown,
-            *(
-                "–" if value is None else f"{factor * value:.3f}"
-                for factor, value in (
-                    (1e3, t.position_rms_m),
-                    (1e3, t.position_max_m),
-                    (1e3, t.rest_position_rms_m),
-                    (_DEG, t.orientation_rms_rad),
-                    (_DEG, t.orientation_max_rad),
-                    (1e3, t.position_sigma_rms_m),
-                    (_DEG, t.orientation_sigma_rms_rad),
-                )
-            ),
-            "–" if t.inside_95_share is None else f"{100 * t.inside_95_share:.0f}%",
-        )
+        (shown, *(_cell(key, getattr(found[name], key)) for key in keys))
         for name, shown in TRACKS.items()
-        if (t := found.get(name)) is not None
+        if name in found
     ]
     title = "Error of the tool pose in motion, against the truth; sigma as claimed (RMS)"
     return TextTable(title, columns, tuple(rows)) if rows else None
 
 
+def _cell(key: str, value: float | None) -> str:
+    if value is None:
+        return "–"
+    if key.endswith("_share"):
+        return f"{100 * value:.0f}%"
+    return f"{(1e3 if key.endswith('_m') else _DEG) * value:.3f}"
+
+
 def _loop_table(passes: tuple[PassErrors, PassErrors] | None) -> TextTable | None:
-    """Return the table of what closing the loop gained; None where not both passes were made."""
     if passes is None:
         return None
     rows = [
@@ -373,6 +323,7 @@ def notes_of(result: RunResult) -> list[str]:
     log, handeye, delay = result.log, result.handeye, result.delay
     assert handeye is not None
     position, angle = handeye.found.held_out.rms()
+    moved = "detections were moved to one time by the motion of the arm"
     modes = Counter({_BASED.get(mode, f"on {mode}"): count for mode, count in log.modes.items()})
     return [
         *health_lines(result.health),
@@ -386,11 +337,7 @@ def notes_of(result: RunResult) -> list[str]:
         f" {1e3 * delay.delay_s:.2f} ms, sigma {1e3 * delay.sigma_s:.2f} ms"
         if result.delay_found
         else f"the delay of the images was not measured: {1e3 * delay.delay_s:g} ms assumed",
-        *(
-            []
-            if result.shutters is None
-            else [f"exposures: {result.shutters}; detections were moved to one time by the motion of the arm"]
-        ),
+        *([] if result.shutters is None else [f"exposures: {result.shutters}; {moved}"]),
         *([] if result.led is None else [str(result.led)]),
         _shots_line(result),
         *(f"{count} missed: {reason}" for reason, count in log.missed.most_common(5)),

@@ -1,11 +1,8 @@
 """The tracks of a run: the tool's pose over time, from sensors, vision and estimates, part by part; and their CSV files.
 
-In: a log and what the run found. Out: :class:`Tracks`, from which tables, metrics and figures are made. A :class:`Part` is
-what they are between two times, so that no run of hours is in memory as a whole.
-
-Columns of a track's file: ``t_s, x_m, y_m, z_m, qw, qx, qy, qz``, the pose of the tool in the base frame (quaternion
-wxyz); where the track has a covariance, ``sigma_x_m .. sigma_z_m`` along the base's axes and ``sigma_rx_rad ..
-sigma_rz_rad`` about them; ``phase`` and ``motion``.
+In: a log and what the run found. Out: :class:`Tracks`; a :class:`Part` is what they are between two times, so that no run
+of hours is in memory as a whole. Columns of a file: ``t_s, x_m, y_m, z_m, qw, qx, qy, qz``, the pose of the tool in the
+base; with a covariance ``sigma_x_m ..`` along the base's axes and ``sigma_rx_rad ..`` about them; ``phase, motion``.
 """
 
 from __future__ import annotations
@@ -119,12 +116,7 @@ class Tracks:
 
 
 class Part:
-    """The tracks of a run between two times, each made when it is asked for.
-
-    Attributes:
-        begin_s: begin, which is not included, s.
-        end_s: end, s.
-    """
+    """The tracks of a run between two times, s, the begin not included, each made when it is asked for."""
 
     def __init__(self, tracks: Tracks, begin_s: float, end_s: float, most: int | None) -> None:
         self._of, self.begin_s, self.end_s, self._most = tracks, begin_s, end_s, most
@@ -286,13 +278,8 @@ def write_columns(folder: Path, name: str, parts: Iterable[dict[str, NDArray[Any
             writer.close()
 
 
-def write_track(folder: Path, name: str, track: ToolTrack) -> None:
-    """Write a track as NAME.csv; errors as :func:`write_columns`."""
-    write_columns(folder, name, [columns(track)])
-
-
 def read_track(file: Path, more: tuple[str, ...] = ()) -> tuple[ToolTrack, Array]:
-    """Read the CSV of a track, as :func:`write_track` writes it, without its covariances; and more columns (N, k)."""
+    """Read the CSV of a track, as :func:`write_columns` writes it, without its covariances; and more columns (N, k)."""
     table = Columns.of_csv(file)
     for name in ("phase", "motion"):
         table.require(name)

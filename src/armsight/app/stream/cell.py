@@ -2,8 +2,7 @@
 
 The keys are ``armsight/SITE/CELL/...`` (docs/howto/cells.md): ``alive`` a liveliness token; ``about``, ``image``,
 ``shots`` and ``hold`` are answered; ``state`` is put; ``events`` are asked to be stored, until the hub answers up to
-which number they are. The cell never waits for the hub: all of it happens in threads of its own, and without a hub only
-the events are kept.
+which number they are. The cell never waits for the hub; without one only the events are kept.
 """
 
 from __future__ import annotations
@@ -18,7 +17,6 @@ from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import click
@@ -31,9 +29,9 @@ from armsight.app.stream.cell_file import (
     LONGEST,
     STATE_S,
     Cell,
-    certificate,
     hold_bytes,
     read_cell,
+    signed_by,
     zenoh_config,
 )
 from armsight.app.stream.datum import Published, json_text
@@ -97,22 +95,11 @@ def _mean(values: Array, unit: float, *, root: bool = False) -> float | None:
     return float(f"{unit * (math.sqrt(mean) if root else mean):.6g}")
 
 
-def _hottest(temperatures_c: Callable[[], Array | None] | None) -> float | None:
-    celsius = None if temperatures_c is None else temperatures_c()
-    return None if celsius is None else round(float(celsius.max()), 1)
-
-
 def tilt_and_size(rig: StereoRig, points: Array, pose: PoseEstimate) -> tuple[float, float]:
-    """Say what one pose shows of its rig: a rotation of one camera changes one of the two.
+    """Return what one pose shows of its rig: a rotation of one camera changes one of the two.
 
-    Args:
-        rig: the calibrated pair.
-        points: (M, 3) of the body, m.
-        pose: measured in a shot.
-
-    Returns:
-        The mean signed angle of the left rays out of the plane of baseline and right ray, rad, and the size of the
-        triangulated body over its drawing, less one.
+    The mean signed angle of the left rays out of the plane of baseline and right ray, rad, and the size of the
+    triangulated body over its drawing ``points`` (M, 3), m, less one.
     """
     seen = pose.points.seen
     uv = seen.uv[seen.paired]
@@ -200,14 +187,15 @@ class CellSink(Sink):
             self._put_state()
 
     def _put_state(self) -> None:
-        now, window = time.monotonic(), self._window
+        now, window, motors = time.monotonic(), self._window, self._published.temperatures_c
+        celsius = None if motors is None else motors()
         state = {
             "t": round(time.time(), 3),
             "mode": self._mode,
             "rate_hz": round(window.shots / max(now - self._state_at, 1e-3), 2),
             "shots": self._shots,
             **window.state(),
-            "temperature_c": _hottest(self._published.temperatures_c),
+            "temperature_c": None if celsius is None else round(float(celsius.max()), 1),
             "health": [each[:300] for each in self._findings[:_FINDINGS]],
         }
         self._window, self._state_at = _Window(), now
@@ -264,7 +252,6 @@ class CellSink(Sink):
         }
 
     def _posting(self) -> None:
-        """Reach the hub, again and again, and have events stored; in a thread of its own."""
         unheard_s, notes = math.inf, set[str]()
 
         def note(text: str) -> None:
@@ -328,7 +315,6 @@ class CellSink(Sink):
                 return True
 
     def _image(self) -> bytes:
-        """Return the newest left image, small, as JPEG; nothing where there is none."""
         shot = self._newest
         return b"" if shot is None or shot.left is None else jpeg(shot.left, _SIDE_PX, _JPEG)
 
@@ -341,7 +327,6 @@ class CellSink(Sink):
         return b"[" + b",".join(shots) + b"]"
 
     def _hold(self, query: Any) -> bytes:  # noqa: ANN401 - of the library
-        """Answer a request to hold: done, or why not; both are events."""
         try:
             text = self._checked_hold(query.payload.to_bytes() if query.payload is not None else b"")
             assert self._published.hold is not None
@@ -369,21 +354,6 @@ class CellSink(Sink):
             raise InputError("it was done before")
         self._held.add(t)
         return text[:200]
-
-
-def signed_by(ca: Path, signature: bytes, data: bytes) -> bool:
-    """Whether the key of a site's certificate signed bytes."""
-    from cryptography.exceptions import InvalidSignature
-    from cryptography.hazmat.primitives import hashes
-    from cryptography.hazmat.primitives.asymmetric import ec
-
-    public = certificate(ca, ended=True).public_key()
-    try:
-        assert isinstance(public, ec.EllipticCurvePublicKey)
-        public.verify(signature, data, ec.ECDSA(hashes.SHA256()))
-    except InvalidSignature:
-        return False
-    return True
 
 
 def open_cell(rest: str, published: Published) -> CellSink:

@@ -55,18 +55,12 @@ class Cell:
 
 
 def read_cell(spec: str) -> Cell:
-    """Read ``NAME[@ROUTER]`` or the path of a cell.toml.
-
-    Raises:
-        InputError: a name that cannot be part of a key, no endpoint, a file without the keys it needs, a certificate
-            that has ended, or another computer's router without TLS.
-    """
+    """Read ``NAME[@ROUTER]`` or the path of a cell.toml; an InputError says what is wrong with it."""
     if spec.endswith(".toml"):
         return _from_file(Path(spec).expanduser())
     name, _, router = spec.partition("@")
-    return _checked(
-        Cell(name, router=endpoint(router, f"--stream cell:{spec}") if router else ROUTER), f"--stream cell:{spec}"
-    )
+    where = f"--stream cell:{spec}"
+    return _checked(Cell(name, router=endpoint(router, where) if router else ROUTER), where)
 
 
 def _from_file(path: Path) -> Cell:
@@ -76,9 +70,8 @@ def _from_file(path: Path) -> Cell:
         raise InputError(f"{path}: unknown key {unknown[0]!r}; known are {', '.join(sorted({*texts, 'holds'}))}")
     for key, kind in [*((key, str) for key in sorted(texts)), ("holds", bool)]:
         if key in given and not isinstance(given[key], kind):
-            raise InputError(
-                f"{path}: {key} is {given[key]!r}: expected {'true or false' if kind is bool else 'a text'}"
-            )
+            expected = "true or false" if kind is bool else "a text"
+            raise InputError(f"{path}: {key} is {given[key]!r}: expected {expected}")
     if "name" not in given:
         raise InputError(f"{path}: the key name is missing: what is this cell called?")
     for key in _FILES:
@@ -96,9 +89,8 @@ def _checked(cell: Cell, where: str) -> Cell:
         check_name(name, f"{where}: the {what}'s name")
     if cell.router.startswith("tls/"):
         if cell.ca is None or cell.certificate is None or cell.key is None:
-            raise InputError(
-                f"{where}: {cell.router} needs ca, certificate and key in a cell.toml; `armsight hub keys` makes it"
-            )
+            needed = "ca, certificate and key in a cell.toml; `armsight hub keys` makes it"
+            raise InputError(f"{where}: {cell.router} needs {needed}")
         for path in (cell.ca, cell.certificate):
             certificate(path)
     require_here(cell.router, where)
@@ -112,11 +104,7 @@ def check_name(name: str, what: str) -> None:
 
 
 def endpoint(text: str, where: str) -> str:
-    """Return ``[tcp/|tls/]HOST:PORT`` as zenoh writes it.
-
-    Raises:
-        InputError: it is none.
-    """
+    """Return ``[tcp/|tls/]HOST:PORT`` as zenoh writes it, or raise an InputError."""
     match = _ENDPOINT.fullmatch(text)
     if match is None or not 0 < int(match[3]) <= 65535:
         raise InputError(f"{where}: {text!r} is no address of a hub: expected HOST:PORT or tls/HOST:PORT")
@@ -126,17 +114,12 @@ def endpoint(text: str, where: str) -> str:
 def require_here(router: str, where: str) -> None:
     """Raise an InputError where data would leave this computer without TLS."""
     if router.startswith("tcp/") and router.removeprefix("tcp/").rpartition(":")[0] not in _HERE:
-        raise InputError(
-            f"{where}: {router} is another computer, and tcp is readable by all between: use tls/ (armsight hub keys)"
-        )
+        readable = "tcp is readable by all between: use tls/ (armsight hub keys)"
+        raise InputError(f"{where}: {router} is another computer, and {readable}")
 
 
 def certificate(path: Path, *, ended: bool = False) -> x509.Certificate:
-    """Return the certificate in a PEM file; with ``ended`` one that has ended, too.
-
-    Raises:
-        InputError: none is in it, it is not valid by this computer's date, or cryptography is not installed.
-    """
+    """Return the certificate in a PEM file; an InputError: there is none, or it is not valid; ``ended``: has ended."""
     require("a cell with keys", "cells", "cryptography")
     from cryptography import x509
 
@@ -150,21 +133,30 @@ def certificate(path: Path, *, ended: bool = False) -> x509.Certificate:
     return found
 
 
+def signed_by(ca: Path, signature: bytes, data: bytes) -> bool:
+    """Whether the key of a site's certificate signed bytes."""
+    from cryptography.exceptions import InvalidSignature
+    from cryptography.hazmat.primitives import hashes
+    from cryptography.hazmat.primitives.asymmetric import ec
+
+    public = certificate(ca, ended=True).public_key()
+    try:
+        assert isinstance(public, ec.EllipticCurvePublicKey)
+        public.verify(signature, data, ec.ECDSA(hashes.SHA256()))
+    except InvalidSignature:
+        return False
+    return True
+
+
 def hold_bytes(site: str, cell: str, t: float, text: str) -> bytes:
     """Return what is signed in a request to hold."""
     return json.dumps(["armsight hold", site, cell, t, text]).encode()
 
 
 def zenoh_config(mode: str, end: str, keys: Sequence[Path | None] = (None,)) -> Any:  # noqa: ANN401 - of the library
-    """Return the configuration of a zenoh session that looks for nobody by itself.
+    """Return the configuration of a zenoh client, which connects within a second, or router; it seeks nobody by itself.
 
-    Args:
-        mode: client, which connects within a second, or router, which listens.
-        end: endpoint of the router.
-        keys: files of the site's certificate, the own one and its key; without TLS the first is None.
-
-    Raises:
-        InputError: zenoh is not installed.
+    ``keys``: files of the site's certificate, the own one and its key; without TLS the first is None.
     """
     require("a cell", "cells", "zenoh")
     import zenoh

@@ -16,7 +16,6 @@ import numpy as np
 
 from armsight.app.stream.datum import Published
 from armsight.data import SIDES, Array, Image, Missed, PoseEstimate, Shot
-from armsight.errors import InputError
 from armsight.geometry.pose import left_axes
 from armsight.loop.running.data import EventDatum, JointsDatum, NoteDatum, ShotDatum, quaternion
 from armsight.vision.rigfiles.rigfile import rectification
@@ -32,18 +31,9 @@ _SIGMAS, _LEAST_M = 3.0, 2e-4
 _NS = 1_000_000_000
 _GREEN, _RED, _YELLOW = (0.1, 0.8, 0.2, 1.0), (0.9, 0.2, 0.1, 1.0), (1.0, 0.8, 0.1, 0.4)
 _LEVELS = {"info": 2, "warning": 3, "error": 4}
+#: What must be there to make messages.
+SCHEMAS = ("mcap_protobuf.schema", "foxglove_schemas_protobuf.Log_pb2")
 _MODELS = {"fisheye": "kannala_brandt", "brown8": "rational_polynomial"}
-
-
-def require_foxglove(what: str, extra: str) -> None:
-    """Raise an InputError with what to install unless the schemas and mcap can be imported."""
-    try:
-        import foxglove_schemas_protobuf.Log_pb2  # noqa: F401 - only whether it is there
-        import mcap_protobuf.schema  # noqa: F401 - as above
-    except ImportError:
-        raise InputError(
-            f'{what} needs mcap-protobuf-support and foxglove-schemas-protobuf: pip install "armsight[{extra}]"'
-        ) from None
 
 
 @functools.cache
@@ -83,19 +73,16 @@ class Messages:
 
     def of(self, datum: ShotDatum | JointsDatum | NoteDatum | EventDatum) -> Iterator[tuple[str, Message]]:
         """Yield the topic and the message of all that a datum says."""
-        stamp = self._stamp(datum.time_s)
+        from google.protobuf.timestamp_pb2 import Timestamp
+
+        seconds, nanos = divmod(nanoseconds(datum.time_s), _NS)
+        stamp = Timestamp(seconds=seconds, nanos=nanos)
         if isinstance(datum, ShotDatum):
             yield from self._of_shot(datum, stamp)
         elif isinstance(datum, JointsDatum):
             yield from self._of_joints(datum, stamp)
         elif isinstance(datum, NoteDatum):
             yield "/log", _log(stamp, datum.level, datum.text)
-
-    def _stamp(self, t_s: float) -> Message:
-        from google.protobuf.timestamp_pb2 import Timestamp
-
-        seconds, nanos = divmod(nanoseconds(t_s), _NS)
-        return Timestamp(seconds=seconds, nanos=nanos)
 
     def _of_shot(self, datum: ShotDatum, stamp: Message) -> Iterator[tuple[str, Message]]:
         if not self._calibrated:
@@ -135,36 +122,24 @@ class Messages:
             return
         R1, R2, P1, P2, _ = rectification(rig)
         for side, camera, R, P in zip(SIDES, rig.cameras, (R1, R2), (P1, P2), strict=True):
-            d = camera.distortion.tolist()
+            d, model = camera.distortion.tolist(), _MODELS.get(camera.model, "plumb_bob")
             if camera.model in ("none", "brown4"):
                 d += [0.0] * (5 - len(d))
-            yield (
-                f"/{side}/calibration",
-                _made(
-                    "CameraCalibration",
-                    timestamp=stamp,
-                    frame_id=side,
-                    width=camera.image_size_px[0],
-                    height=camera.image_size_px[1],
-                    distortion_model=_MODELS.get(camera.model, "plumb_bob"),
-                    D=d,
-                    K=camera.matrix.ravel().tolist(),
-                    R=R.ravel().tolist(),
-                    P=P.ravel().tolist(),
-                ),
-            )
+            matrices = {k: M.ravel().tolist() for k, M in (("K", camera.matrix), ("R", R), ("P", P))}
+            known = dict(zip(("width", "height"), camera.image_size_px, strict=True), distortion_model=model, D=d)
+            made = _made("CameraCalibration", timestamp=stamp, frame_id=side, **known, **matrices)
+            yield f"/{side}/calibration", made
 
     def _transforms(self, stamp: Message, result: PoseEstimate | Missed | None) -> Message:
-        found = _made("FrameTransforms")
-        frames: list[tuple[str, str, Array]] = [("rig", "left", np.eye(4))]
-        if self._published.rig is not None:
-            frames.append(("rig", "right", self._published.rig.T_left_right))
-        if self._T_base_rig is not None:
-            frames.insert(0, ("base", "rig", self._T_base_rig))
-        if isinstance(result, PoseEstimate):
-            frames.append(("left", "body", result.T_left_body))
-        for parent, child, T in frames:
-            self._add_transform(found, stamp, parent, child, T)
+        found, rig = _made("FrameTransforms"), self._published.rig
+        for parent, child, T in (
+            ("base", "rig", self._T_base_rig),
+            ("rig", "left", np.eye(4)),
+            ("rig", "right", None if rig is None else rig.T_left_right),
+            ("left", "body", result.T_left_body if isinstance(result, PoseEstimate) else None),
+        ):
+            if T is not None:
+                self._add_transform(found, stamp, parent, child, T)
         return found
 
     def _add_transform(self, found: Message, stamp: Message, parent: str, child: str, T: Array) -> None:
@@ -234,7 +209,6 @@ class Messages:
             yield "/arm", self._arm(stamp, q)
 
     def _arm(self, stamp: Message, q: Array) -> Message:
-        """Return the arm as a line through the origins of its links."""
         arm = self._published.arm
         assert arm is not None
         scene = _made("SceneUpdate")
@@ -261,7 +235,6 @@ def schema_of(message: Message) -> tuple[str, str, bytes]:
 
 
 def _jpeg(image: Image) -> bytes:
-    """Return an image to look at: 8 bits, JPEG."""
     shown = image if image.dtype == np.uint8 else (image >> 8).astype(np.uint8)
     return bytes(cv2.imencode(".jpg", shown, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes())
 

@@ -1,12 +1,10 @@
 """OpenIGTLink, for 3D Slicer and other programs of image-guided surgery: TRANSFORM, POSITION and STATUS.
 
-``igtl:PORT`` listens (18944 is the usual port). Of each measured shot the readers are sent the pose of the body in the
-left camera's frame as TRANSFORM (``armsight_body``) and as POSITION (``armsight_position``), and whether it was measured,
-or why not, as STATUS (``armsight_status``); of joints the tool's pose in the base (``armsight_tool``). Each has a name of
-its own: some readers keep the newest message of a name. Lengths are in mm, as the protocol has them.
+``igtl:PORT`` listens (18944 is usual). Of each shot the pose of the body in the left camera's frame is sent as TRANSFORM
+(``armsight_body``) and POSITION (``armsight_position``), and whether or why not it was measured as STATUS
+(``armsight_status``); of joints the tool's pose in the base (``armsight_tool``). Lengths are in mm.
 
-The messages are those of version 1 of the protocol: openigtlink.org, "Header", "TRANSFORM", "POSITION", "STATUS". All
-numbers are big endian. The checksum is CRC-64 of ECMA-182.
+Version 1 of the protocol: openigtlink.org, "Header", "TRANSFORM", "POSITION", "STATUS"; big endian, CRC-64 of ECMA-182.
 """
 
 from __future__ import annotations

@@ -22,8 +22,9 @@ from typing import IO, Any, TypeAlias
 import numpy as np
 
 from armsight import __version__
+from armsight.app.show.messages import require
 from armsight.app.stream.datum import Published, json_text
-from armsight.app.stream.foxglove import LookedAt, Messages, nanoseconds, require_foxglove, schema_of
+from armsight.app.stream.foxglove import SCHEMAS, LookedAt, Messages, nanoseconds, schema_of
 from armsight.app.stream.ros import READINGS, reading_messages
 from armsight.app.stream.sink import Sink
 from armsight.data import Shot
@@ -63,7 +64,7 @@ class McapSink(Sink):
     """Writes run.mcap, which must not exist; the properties of what is published become metadata."""
 
     def __init__(self, path: Path, published: Published) -> None:
-        require_foxglove("run.mcap", "record")
+        require("run.mcap", "record", *SCHEMAS)
         super().__init__(wakes=_WAKES)
         self.path = path
         self._published, self._messages = published, Messages(published)
@@ -77,10 +78,9 @@ class McapSink(Sink):
 
     def write(self, datum: Datum) -> None:
         """Write a datum: its Foxglove messages, and itself as JSON."""
-        log_ns = nanoseconds(datum.time_s)
+        log_ns = stamp_ns = nanoseconds(datum.time_s)
         if isinstance(datum, ShotDatum) and datum.arrival_s is not None:
             log_ns = nanoseconds(datum.arrival_s)
-        stamp_ns = nanoseconds(datum.time_s)
         for topic, message in self._messages.of(datum):
             channel = self._channel(topic, "protobuf", partial(schema_of, message))
             self._writer.add_message(channel, log_ns, stamp_ns, message.SerializeToString())
@@ -125,7 +125,7 @@ class McapBeside(Sink):
     """Writes run.mcap as :class:`McapSink` does, in its own process; what is wrong with the file is its ``problem``."""
 
     def __init__(self, path: Path, published: Published) -> None:
-        require_foxglove("run.mcap", "record")
+        require("run.mcap", "record", *SCHEMAS)
         super().__init__(_WAITING, _WAKES, _BEGUN_S)
         self._process, self._looked_at = Process(_written, path, published), LookedAt()
         self._batch: list[Datum] = []
@@ -201,7 +201,7 @@ class LazyMcap:
         if not self._began:
             self._began = True
             try:
-                require_foxglove("run.mcap", "record")
+                require("run.mcap", "record", *SCHEMAS)
             except InputError as error:
                 self._say(f"note: no run.mcap is written: {error}")
                 return
@@ -256,17 +256,13 @@ def properties(rig: StereoRig | None, body_text: str | None, arm: Arm | None = N
 
 def arm_of(text: str) -> Arm:
     """Return the arm of a run's metadata."""
-    values: dict[str, Any] = json.loads(text)
+    values: Any = json.loads(text)
     names = tuple(values.pop("joint_names"))
-    arrays: dict[str, Any] = {
-        name: np.array(value, float) if isinstance(value, list) else value for name, value in values.items()
-    }
+    arrays: Any = {k: np.array(v, float) if isinstance(v, list) else v for k, v in values.items()}
     return Arm(joint_names=names, **arrays)
 
 
 class _Chunk:
-    """A chunk that is being filled."""
-
     def __init__(self, compression: str) -> None:
         self.compression = compression
         self.clear()
@@ -312,10 +308,8 @@ class McapWriter:
     def register_channel(self, topic: str, encoding: str, schema: int, *, images: bool = False) -> int:
         """Add a channel; return its number; ``images``: its messages are compressed already."""
         number = len(self._channels) + 1
-        channel = self._records.Channel(
-            id=number, topic=topic, message_encoding=encoding, schema_id=schema, metadata={}
-        )
-        self._channels.append(channel)
+        how = {"topic": topic, "message_encoding": encoding, "schema_id": schema, "metadata": {}}
+        self._channels.append(channel := self._records.Channel(id=number, **how))
         chunk = self._chunk_of[number] = self._chunks["" if images else "lz4"]
         # The schema stands in the chunk of each of its channels: every chunk before can be missing.
         chunk.append(self._bytes(self._schemas[schema - 1]) + self._bytes(channel))
@@ -345,8 +339,7 @@ class McapWriter:
 
     def finish(self) -> None:
         """Write what was added, and the index."""
-        for chunk in self._chunks.values():
-            self._finish_chunk(chunk)
+        self.flush()
         self._write(self._bytes(self._records.DataEnd(data_section_crc=0)))
         begin, offsets = self._at, []
         groups = (
@@ -383,19 +376,10 @@ class McapWriter:
             offsets[channel] = at + len(record) + len(indexes)
             indexes += self._bytes(self._records.MessageIndex(channel_id=channel, records=rows))
             self._counts[channel] += len(rows)
-        self._chunk_indexes.append(
-            self._records.ChunkIndex(
-                chunk_start_offset=at,
-                chunk_length=len(record),
-                message_index_offsets=offsets,
-                message_index_length=len(indexes),
-                compressed_size=len(stored),
-                **times,
-                **sizes,
-            )
-        )
-        self._write(record)
-        self._write(indexes)
+        lengths = {"chunk_length": len(record), "message_index_length": len(indexes), "compressed_size": len(stored)}
+        where = {"chunk_start_offset": at, "message_index_offsets": offsets}
+        self._chunk_indexes.append(self._records.ChunkIndex(**where, **lengths, **times, **sizes))
+        self._write(record + indexes)
         chunk.clear()
 
     def _statistics(self) -> _Record:

@@ -7,13 +7,11 @@ datagram a datum. A TCP reader that is too slow is not waited for: of what waits
 from __future__ import annotations
 
 import json
-import re
 import socket
 from collections import deque
 
 from armsight.app.stream.datum import Published, json_text
 from armsight.app.stream.sink import Sink
-from armsight.errors import InputError
 from armsight.files import as_input_error
 from armsight.loop.running.data import Datum, EventDatum, JointsDatum, NoteDatum, ShotDatum
 
@@ -30,17 +28,7 @@ def json_line(datum: Datum, published: Published) -> bytes:
     return json_text(found | datum.to_json(published.body)) + b"\n"
 
 
-def host_and_port(spec: str, what: str) -> tuple[str, int]:
-    """Read ``[HOST:]PORT``; port 0 is any that is free."""
-    match = re.fullmatch(r"(?:(.+):)?(\d{1,5})", spec)
-    if match is None or int(match[2]) > 65535:
-        raise InputError(f"--stream {what}:{spec}: expected {what}:[HOST:]PORT, such as {what}:8766")
-    return match[1] or "127.0.0.1", int(match[2])
-
-
 class _Connected:
-    """One that has connected: its socket, and the bytes that wait for it."""
-
     def __init__(self, connection: socket.socket) -> None:
         connection.setblocking(False)
         self.connection = connection

@@ -27,19 +27,14 @@ def state_folder() -> Path:
 
 
 class Outbox:
-    """The events of one cell; one thread at a time may use it.
-
-    Attributes:
-        name: which numbering this is: a new disk begins at 1 again, under another name.
-    """
+    """The events of one cell, for one thread at a time; ``name``: which numbering it is, as a new disk begins at 1."""
 
     def __init__(self, folder: Path, cell: str) -> None:
         with ExitStack() as opened:
             try:
                 folder.mkdir(parents=True, exist_ok=True)
-                self._db = sqlite3.connect(
-                    folder / "events.sqlite", timeout=0.2, check_same_thread=False, isolation_level=None
-                )
+                how: Any = {"timeout": 0.2, "check_same_thread": False, "isolation_level": None}
+                self._db = sqlite3.connect(folder / "events.sqlite", **how)
                 opened.callback(self._db.close)
                 self._db.execute("PRAGMA locking_mode = EXCLUSIVE")
                 self._db.execute("CREATE TABLE IF NOT EXISTS waiting (n INTEGER PRIMARY KEY AUTOINCREMENT, event TEXT)")
@@ -49,12 +44,8 @@ class Outbox:
                 self._db.execute("DELETE FROM outbox")  # a write: it takes the lock even where nothing is new
                 self._db.execute("INSERT INTO outbox VALUES (?)", (self.name,))
             except (sqlite3.Error, OSError) as error:
-                why = (
-                    "another command of this cell runs on this computer, or a push: each command needs a name of its own"
-                    if "locked" in str(error)
-                    else error
-                )
-                raise InputError(f"cell {cell}: {folder}: {why}") from None
+                other = "another command of this cell runs on this computer, or a push: each needs a name of its own"
+                raise InputError(f"cell {cell}: {folder}: {other if 'locked' in str(error) else error}") from None
             opened.pop_all()
         self._left = _BURST
         self._at = time.monotonic()

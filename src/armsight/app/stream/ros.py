@@ -1,8 +1,7 @@
 """Foxglove's messages as ROS 2's: for a bag (``app/export/bags.py``), and for a ROS 2 system (``zenoh.py``).
 
-In: a decoded message of a Foxglove type. Out: the ROS type and a message of it, made with the classes of rosbags.
-CompressedImage, CameraInfo, Odometry and PoseStamped, JointState, TFMessage, and Log as rcl_interfaces/Log. Annotations and
-scenes have no counterpart. And readings of an inertial unit as ``sensor_msgs/msg/Imu``: schema, and bytes in CDR.
+In: a decoded message of a Foxglove type. Out: the ROS type and a message of it, made with the classes of rosbags;
+annotations and scenes have no counterpart. And readings of an inertial unit as ``sensor_msgs/msg/Imu`` in CDR.
 """
 
 from __future__ import annotations
@@ -89,10 +88,11 @@ def _tf(types: _Types, m: Decoded) -> _Made:
     kind = "tf2_msgs/msg/TFMessage"
     found = []
     for each in m.transforms:
-        transform = types["geometry_msgs/msg/Transform"](
-            _vector(types, "Vector3", each.translation), _rotation(types, each.rotation)
+        way, rotation = _vector(types, "Vector3", each.translation), _rotation(types, each.rotation)
+        transform, header = (
+            types["geometry_msgs/msg/Transform"](way, rotation),
+            _header(types, each, each.parent_frame_id),
         )
-        header = _header(types, each, each.parent_frame_id)
         found.append(types["geometry_msgs/msg/TransformStamped"](header, each.child_frame_id, transform))
     return kind, types[kind](found)
 

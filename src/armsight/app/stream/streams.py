@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+from armsight.app.show.http import host_and_port
 from armsight.app.stream.cell import open_cell
 from armsight.app.stream.datum import Published
 from armsight.app.stream.igtl import IgtlSink
-from armsight.app.stream.network import TcpSink, UdpSink, host_and_port
+from armsight.app.stream.network import TcpSink, UdpSink
 from armsight.app.stream.sink import Sink
 from armsight.app.stream.websocket import FoxgloveSink
 from armsight.app.stream.zenoh import Ros2Sink
 from armsight.errors import InputError
-from armsight.loop.running.data import Datum
+from armsight.files import as_input_error
+from armsight.loop.running.data import Fanout
 
 #: Kind -> the sink of ``KIND:[HOST:]PORT``; another kind is one line here. ``cell:`` is opened by itself.
 STREAMS: dict[str, Callable[[Published, str, int], Sink]] = {
@@ -31,34 +33,22 @@ def open_stream(spec: str, published: Published) -> Sink:
         return open_cell(rest, published)
     if kind not in STREAMS:
         raise InputError(f"--stream {spec}: unknown kind {kind!r}; known are {', '.join((*STREAMS, 'cell'))}")
-    return STREAMS[kind](published, *host_and_port(rest, kind))
+    with as_input_error(f"--stream {spec}: expected {kind}:[HOST:]PORT, such as {kind}:8766", InputError):
+        address = host_and_port(rest if ":" in rest else f"127.0.0.1:{rest}", "--stream")
+    return STREAMS[kind](published, *address)
 
 
-class Streams:
+class Streams(Fanout):
     """Publishes to several streams; with none it does nothing."""
 
     def __init__(self, sinks: dict[str, Sink], say: Callable[[str], None]) -> None:
-        self._sinks, self._say = sinks, say
-
-    def put(self, datum: Datum) -> None:
-        """Hand a datum to every stream."""
-        for sink in self._sinks.values():
-            sink.put(datum)
-
-    def pause(self) -> None:
-        """Pause every stream."""
-        for sink in self._sinks.values():
-            sink.pause()
-
-    def resume(self) -> None:
-        """Resume every stream."""
-        for sink in self._sinks.values():
-            sink.resume()
+        super().__init__(sinks.values())
+        self._named, self._say = sinks, say
 
     def close(self) -> None:
         """Close every stream; a second call has no effect."""
-        sinks, self._sinks = self._sinks, {}
-        for name, sink in sinks.items():
+        named, self._named, self.sinks = self._named, {}, ()
+        for name, sink in named.items():
             sink.close()
             if sink.problem is not None:
                 self._say(f"note: --stream {name} ended early: {sink.problem}")

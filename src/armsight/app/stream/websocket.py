@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from typing import Any
 
+from armsight.app.show.messages import require
 from armsight.app.stream.datum import Published, json_text
-from armsight.app.stream.foxglove import Messages, nanoseconds, require_foxglove, schema_of
+from armsight.app.stream.foxglove import SCHEMAS, Messages, nanoseconds, schema_of
 from armsight.app.stream.mcap_file import TOPICS
 from armsight.app.stream.sink import Sink
-from armsight.errors import InputError
 from armsight.files import as_input_error
 from armsight.loop.running.data import Datum, NoteDatum
 
@@ -21,13 +21,9 @@ class FoxgloveSink(Sink):
     """Publishes to everybody who is connected."""
 
     def __init__(self, published: Published, host: str, port: int) -> None:
-        try:
-            import foxglove
-        except ImportError:
-            raise InputError(
-                '--stream foxglove needs foxglove-sdk, which is not installed: pip install "armsight[stream]"'
-            ) from None
-        require_foxglove("--stream foxglove", "stream")
+        require("--stream foxglove", "stream", "foxglove", *SCHEMAS)
+        import foxglove
+
         super().__init__()
         self._published, self._messages = published, Messages(published)
         self._context = foxglove.Context()
@@ -48,9 +44,8 @@ class FoxgloveSink(Sink):
             if topic not in self._channels:
                 name, encoding, data = schema_of(message)
                 schema = self._foxglove.Schema(name=name, encoding=encoding, data=data)
-                self._channels[topic] = self._foxglove.Channel(
-                    topic, message_encoding="protobuf", schema=schema, context=self._context
-                )
+                how = {"message_encoding": "protobuf", "schema": schema, "context": self._context}
+                self._channels[topic] = self._foxglove.Channel(topic, **how)
             self._channels[topic].log(message.SerializeToString(), log_time=log_ns)
         if isinstance(datum, NoteDatum):
             return

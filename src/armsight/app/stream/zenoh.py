@@ -1,12 +1,10 @@
 """ROS 2 messages over zenoh, as ROS 2 nodes with ``RMW_IMPLEMENTATION=rmw_zenoh_cpp`` receive them; ROS is not needed here.
 
 ``ros2:[HOST:]PORT`` connects to the zenoh router of a ROS 2 of Jazzy or later (``ros2 run rmw_zenoh_cpp rmw_zenohd``,
-port 7447); ``ROS_DOMAIN_ID`` is the domain. Messages are those of ``ros.py``, and the data themselves as JSON in
-std_msgs/String.
+port 7447); ``ROS_DOMAIN_ID`` is the domain. Messages are those of ``ros.py``, and the data as JSON in std_msgs/String.
 
-Keys, tokens and attachments as rmw_zenoh's design page defines them: a message is put to
-``DOMAIN/TOPIC/TYPE/HASH`` as CDR, with its sequence number, time stamp and the publisher's identity; tokens
-``@ros2_lv/...`` make node and topics visible to ``ros2 topic list``.
+As rmw_zenoh's design page has it, a message is put to ``DOMAIN/TOPIC/TYPE/HASH`` as CDR, with its number, time stamp and
+the publisher's identity; tokens ``@ros2_lv/...`` make node and topics visible to ``ros2 topic list``.
 """
 
 from __future__ import annotations
@@ -18,9 +16,10 @@ import struct
 from itertools import count
 from typing import Any
 
+from armsight.app.show.messages import require
 from armsight.app.stream.cell_file import zenoh_config
 from armsight.app.stream.datum import Published, json_text
-from armsight.app.stream.foxglove import Messages, nanoseconds, require_foxglove
+from armsight.app.stream.foxglove import SCHEMAS, Messages, nanoseconds
 from armsight.app.stream.mcap_file import TOPICS
 from armsight.app.stream.ros import TO_ROS, ros_name
 from armsight.app.stream.sink import Sink
@@ -35,38 +34,22 @@ _QOS = "::,10:,:,:,,"
 _ATTACHMENT = struct.Struct("<qqB16s")
 
 
-class _RosPublisher:
-    """One topic: a zenoh publisher, its token, and what goes with each message."""
-
-    def __init__(self, publisher: Any, token: Any, key: str) -> None:  # noqa: ANN401 - of the library
-        self._publisher, self._token, self._numbers = publisher, token, count(1)
-        self._identity = hashlib.blake2b(key.encode(), digest_size=16).digest()
-
-    def put(self, data: bytes, stamp_ns: int) -> None:
-        """Publish the CDR of a message."""
-        attachment = _ATTACHMENT.pack(next(self._numbers), stamp_ns, len(self._identity), self._identity)
-        self._publisher.put(data, attachment=attachment)
-
-
 class Ros2Sink(Sink):
     """Publishes to a ROS 2 system."""
 
     def __init__(self, published: Published, host: str, port: int) -> None:
-        try:
-            import zenoh
-            from rosbags.typesys import Stores, get_typestore
-        except ImportError as error:
-            raise InputError(
-                f'--stream ros2 needs {error.name}, which is not installed: pip install "armsight[stream]"'
-            ) from None
-        require_foxglove("--stream ros2", "stream")
+        require("--stream ros2", "stream", "zenoh", "rosbags.typesys", *SCHEMAS)
+        import zenoh
+        from rosbags.typesys import Stores, get_typestore
+
         super().__init__()
         domain = os.environ.get("ROS_DOMAIN_ID") or "0"
         if not re.fullmatch(r"\d{1,3}", domain):
             raise InputError(f"ROS_DOMAIN_ID={domain}: expected a number, 0 to 232")
         self._published, self._messages = published, Messages(published)
         self._store = get_typestore(Stores.ROS2_JAZZY)
-        self._publishers: dict[str, _RosPublisher] = {}
+        #: Of each topic: zenoh's publisher and its token, the numbers of its messages, its identity.
+        self._publishers: dict[str, tuple[Any, Any, count[int], bytes]] = {}
         self._infos: dict[str, Any] = {}
         with as_input_error(
             f"--stream ros2:{host}:{port}: no zenoh router answers there; start it: ros2 run rmw_zenoh_cpp rmw_zenohd",
@@ -88,8 +71,11 @@ class Ros2Sink(Sink):
             key = "/".join([self._domain, topic.strip("/"), mangled, hashed])
             number = str(len(self._publishers) + 1)
             token = self._token(number, "MP", topic.replace("/", "%"), mangled, hashed, _QOS)
-            self._publishers[topic] = _RosPublisher(self._session.declare_publisher(key), token, key)
-        self._publishers[topic].put(bytes(self._store.serialize_cdr(message, kind)), stamp_ns)
+            identity = hashlib.blake2b(key.encode(), digest_size=16).digest()
+            self._publishers[topic] = self._session.declare_publisher(key), token, count(1), identity
+        publisher, _, numbers, identity = self._publishers[topic]
+        attachment = _ATTACHMENT.pack(next(numbers), stamp_ns, len(identity), identity)
+        publisher.put(bytes(self._store.serialize_cdr(message, kind)), attachment=attachment)
 
     def write(self, datum: Datum) -> None:
         """Publish the messages of a datum, and the datum itself as JSON."""
