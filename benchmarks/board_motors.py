@@ -18,7 +18,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from board_arms import NAMED_TICKS, PERIOD_TICKS, Arm, c, drawn_model, opened
+from board_arms import NAMED_TICKS, PERIOD_TICKS, SUPPLY_V, Arm, c, drawn_model, opened
 
 BRAKE_N_M = 6.0
 SPEED, ASLEEP_MS = 1.1, 60  # what a stuck bridge may do: of the limit, or until the drives sleep
@@ -90,7 +90,7 @@ def warming(library, seed, table, *, seconds, share, moving, load=0.6):
 
 def enabled_warm(library, seed, table):
     """An arm that became warm, is disabled while something holds it, and enabled again."""
-    arm = drawn_arm(library, seed)
+    arm = drawn_arm(library, seed, warm=1.4 * 14.0 / SUPPLY_V)  # of 14 V a board puts out the nominal ones
     share = arm.rng.choice([0.8, 1.4])
     arm.enable()
     arm.rest(400)

@@ -8,11 +8,9 @@
 #include "number.h"
 #include "types.h"
 
-#define MOTOR_STEP_TICKS 160u /* for so long a step may be what a gap began with; half: slow gaps have no beginning, double:
-                                 old steps are blamed */
+#define MOTOR_STEP_TICKS 160u /* for so long a step may be what a gap began with; half: slow gaps have no beginning, double: old steps are blamed */
 #define MOTOR_TWIST 0.5f /* of the largest current's twist of late: half: soft joints are dropped, twice: faults show later */
-#define MOTOR_WITNESS 0.1f /* of the speed it is held to: so much faster than the reading it must be to count; half: noise
-                              brakes, double: a wrong reading lets it be faster */
+#define MOTOR_WITNESS 0.1f /* of the speed it is held to: so much faster than the reading it must be to count; half: noise brakes, double: a wrong reading lets it be faster */
 
 /* Begin to watch a joint that reads angle_rad and has this speed limit; phase differs from joint to joint, so that not
  * all are sampled at once. */
@@ -22,11 +20,13 @@ void motor_start(motor_state *motor, float angle_rad, float speed_limit_rad_s, u
 static inline void motor_through(motor_state *motor, const transmission_config *between)
 {
     motor->twist_rad_per_a = between->twist_rad_per_a;
+    motor->twist_share = 1.0f;
     motor->uneven = between->uneven;
     motor->damping_share = between->damping_share;
     if (motor->swift_per_a > 0.0f) { /* twist over torque is 1/stiffness, speed over torque and time 1/inertia */
         const float radians = number_root(between->twist_rad_per_a * (float)TICKS_PER_S / motor->swift_per_a);
         motor->swing_ticks = (uint32_t)(3.14159f * radians);
+        motor->twist_share = 1.0f / (1.0f + radians);
     }
 }
 
@@ -134,8 +134,7 @@ bool motor_may_have_stepped(const motor_state *motor);
  * it: against the way error_rad that it is driven, or at all where nothing was put out and shorted windings brake. */
 bool motor_disobeys(const motor_state *motor, const motor_config *config, float supply_v, float error_rad);
 
-#define MOTOR_SWING 0.2f /* of the speed limit: so far from the reference's speed a swing goes at least; half: elastic joints
-                            alarm, double: slow swings are not seen */
+#define MOTOR_SWING 0.2f /* of the speed limit: so far from the reference's speed a swing goes at least; half: elastic joints alarm, double: slow swings are not seen */
 
 /* Return whether the motor swings about its reference, from whose speed it is far off by off_rad_s, by its own speed if known. */
 bool motor_swings_far(motor_state *motor, float off_rad_s, bool known);

@@ -4,13 +4,10 @@
 #include "number.h"
 
 #define INLINE static inline __attribute__((always_inline))
-#define BEYOND 2.0f /* so many times a speed is damped beyond its limit; half: limits are exceeded by loads, double: it chatters
-                       there */
+#define BEYOND 2.0f /* so many times a speed is damped beyond its limit; half: limits are exceeded by loads, double: it chatters there */
 #define BRAKE_S 0.003f /* s; a few ticks; half: a motor's speed measured a tick late swings, double: limits hold later */
-#define SPARE_SPEED 1.03f /* of the speed limit: a joint that moves at it can still catch up; 1: it cannot, 1.06: it is faster
-                             than its limit by that */
-#define LOADED 0.25f /* of the speed limit: a joint far from its reference that is slower is held back by a load; half: loads
-                        are lifted later, double: free joints overshoot */
+#define SPARE_SPEED 1.03f /* of the speed limit: a joint that moves at it can still catch up; 1: it cannot, 1.06: it is faster than its limit by that */
+#define LOADED 0.25f /* of the speed limit: a joint far from its reference that is slower is held back by a load; half: loads are lifted later, double: free joints overshoot */
 #define CREEP_RAD_S 0.005f /* from here on dry friction is compensated by half and more */
 
 void pid_reset(pid_state *pid, float measured_rad)
@@ -30,7 +27,9 @@ float pid_measure_by_motor(joint_state *joint, const joint_gains *gains)
         joint->held_rad = pid->measured_rad;
         joint->held_rad_s = pid->speed_rad_s;
     }
-    return joint->pot.angle_rad + joint->motor.twist_rad_per_a * joint->current_a;
+    const float twist_rad = joint->motor.twist_rad_per_a * joint->current_a;
+    joint->motor.twist_rad += joint->motor.twist_share * (twist_rad - joint->motor.twist_rad);
+    return joint->pot.angle_rad + joint->motor.twist_rad;
 }
 
 /* Return the duty asked for held to the limits, and say which of them held it. */
@@ -84,7 +83,7 @@ INLINE float step(pid_state *pid, const joint_gains *gains, const pid_demand *de
     const float forward = gains->ka_s2_per_rad * demand->reference_rad_s2 +
                           gains->kf_duty * direction_of(demand->reference_rad_s) + demand->gravity_duty;
     const float asked = spring + pid->integral_duty - gains->kd_s_per_rad * demand->damped_rad_s + forward;
-    const float duty = limited_duty(pid, demand, asked, limited);
+    const float duty = limited_duty(pid, demand, asked - demand->braked_duty, limited);
     float integral = pid->integral_duty;
     if (gains->ki_per_rad_s > 0.0f) {
         /* Back-calculation: what a limit took away is taken from the integral as well. */
@@ -130,8 +129,7 @@ void pid_control(joint_state *joint, const joint_config *config, float per_nomin
         const float cut_duty = config->current_cut_per_a_s * joint->over_a * TICK_S;
         joint->duty_cap = number_clamp(joint->duty_cap - cut_duty, 0.0f, config->duty_limit);
     }
-    float duty_low = -joint->duty_cap;
-    float duty_high = joint->duty_cap;
+    float duty_low = -joint->duty_cap, duty_high = joint->duty_cap;
     const float own_s_per_rad = config->motor.constant_v_s * per_nominal_v;
     const float fastest_rad_s = joint->motor.fastest_rad_s;
     const float free_duty = fastest_rad_s * own_s_per_rad;
@@ -147,12 +145,12 @@ void pid_control(joint_state *joint, const joint_config *config, float per_nomin
         joint->limited |= LIMITED_SPEED;
     }
     const float seen_rad_s = motor_witness(&joint->motor, joint->pid.speed_rad_s + joint->motor.beyond_rad_s);
-    const float beyond_rad_s = number_size(seen_rad_s) - fastest_rad_s;
-    const float more_rad_s = beyond_rad_s > 0.0f ? BEYOND * beyond_rad_s : 0.0f;
+    const float more_rad_s = BEYOND * (seen_rad_s - number_bound(seen_rad_s, fastest_rad_s));
     const pid_demand demand = {.reference_rad = joint->reference.position_rad,
                                .reference_rad_s = joint->reference.speed_rad_s,
                                .reference_rad_s2 = joint->reference.acceleration_rad_s2,
-                               .damped_rad_s = seen_rad_s + (seen_rad_s > 0.0f ? more_rad_s : -more_rad_s),
+                               .damped_rad_s = seen_rad_s + more_rad_s,
+                               .braked_duty = joint->motor.damping_share * own_s_per_rad * more_rad_s,
                                .spring_limit = spring_limit(config, own_s_per_rad),
                                .own_s_per_rad = own_s_per_rad,
                                .motor_rad_s = joint->motor.speed_rad_s,

@@ -341,6 +341,7 @@ typedef struct pid_demand {
     float duty_high;       /* 0 to duty_limit: likewise */
     float duty_slew_per_s;
     float damped_rad_s;    /* the speed that is damped: the measured one, or the motor's where the reading is wrong */
+    float braked_duty;     /* off it where the speed of an elastic joint's motor is beyond its limit: its integral gathers it, too */
     float own_s_per_rad;   /* duty that back-EMF takes per rad/s */
     float motor_rad_s;     /* the motor's speed by it, 0 where it is not watched */
 } pid_demand;
@@ -408,6 +409,8 @@ typedef struct motor_state {
     float damped_rad_s;      /* the speed, smoothed */
     float beyond_rad_s;      /* what kd damps beyond the reading's speed */
     float twist_rad_per_a;   /* of the configuration's transmission */
+    float twist_rad;         /* as far as the current has twisted it: at its resonance, noise of a duty does not */
+    float twist_share;       /* of what is left, in a tick */
     float uneven;
     float damping_share;
     float gap_rad;           /* travel of the reading less that of the motor; fades */
