@@ -29,7 +29,7 @@ pytestmark = [
     pytest.mark.usefixtures("host_firmware"),
     pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals"),
 ]
-CAMERAS = "640x360@15"
+CAMERAS = "640x360@10"
 MOTION = """
 [[motion]]
 kind = "joints"
@@ -66,7 +66,7 @@ def far(first, tmp_path, monkeypatch):
     monkeypatch.setattr(devices, "open_source", lambda spec: HostStamped(there))
     monkeypatch.setattr(devices, "HostClock", lambda: HostClock(there.now))
     monkeypatch.setattr(command, "_HANDEYE_POSES", 12)
-    monkeypatch.setattr(run_calibrate, "SWEEP_S", 3.0)
+    monkeypatch.setattr(run_calibrate, "SWEEP_S", 2.0)
     monkeypatch.setattr(run_calibrate, "DELAY_REST_S", 0.5)
     yield there
     there.close()
