@@ -160,9 +160,14 @@ def test_every_joint_of_any_arm_has_its_figure(joints, report, tmp_path):
 
 
 def test_what_was_found_is_printed_and_stored_though_it_cannot_be_drawn(run, report, tmp_path, monkeypatch, capsys):
+    report = replace(report, drift_mm_per_h=None)
     monkeypatch.setattr(evaluate, "evaluate_arm", lambda folder, arm, *, progress: report)
     monkeypatch.setattr(arm_report, "_figures_page", lambda report: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         cli_run("arm", "report", run, "-o", tmp_path / "out")
-    assert "What the arm does" in capsys.readouterr().out
+    printed, numbers = capsys.readouterr().out, report.to_json()
+    assert "What the arm does" in printed
+    known = [numbers.get(key) is not None for _, key, _ in arm_report._NUMBERS]
+    assert 0 < sum(known) < len(known)
+    assert [title in printed for title, *_ in arm_report._NUMBERS] == known
     assert json.loads((tmp_path / "out" / "report.json").read_text())["kind"] == "arm report"

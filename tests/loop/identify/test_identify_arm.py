@@ -131,6 +131,9 @@ def test_the_gauge_is_observable():
     assert len(geometric) == 4 * 6 + 6 - 3 - 9
     assert "base_z" in seen.reasons["d1"]
     assert "base_rz" in seen.reasons["offset1"]
+    rough = observed(model, x, measured, prior_sigma(model), (0.1, 0.0)).reasons  # people read mm and degrees
+    best = float(rough["alpha2"].split(" to ")[1].split(" deg at best")[0])
+    assert best > np.degrees(prior_sigma(model)[model.names.index("alpha2")])
 
 
 def test_the_fit_is_least_squares(scene):

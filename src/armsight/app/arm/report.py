@@ -73,6 +73,7 @@ def tables(report: ArmReport, others: Mapping[str, dict[str, Any]]) -> list[Text
     does = tuple(
         (title, *("–" if each.get(key) is None else f"{each[key]:.3f} {unit}" for each in columns))
         for title, key, unit in _NUMBERS
+        if any(each.get(key) is not None for each in columns)
     )
     parts = tuple(
         (
@@ -97,8 +98,7 @@ def tables(report: ArmReport, others: Mapping[str, dict[str, Any]]) -> list[Text
 
 
 def _shown(joint: JointFigures, key: str) -> bool:
-    """Return whether a number of a joint says anything: a droop at most only where there is one."""
-    return key != "droop_deg" or determined(joint.droop_deg_per_m)
+    return key != "droop_deg" or determined(joint.droop_deg_per_m)  # a droop at most only where there is one
 
 
 def remarks(report: ArmReport) -> list[str]:

@@ -31,7 +31,7 @@ from armsight.loop.identify.fit import (
 )
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.misread import check_plausible, without_tool
-from armsight.loop.identify.model import PLENTY, SENSOR, Model, Parameter
+from armsight.loop.identify.model import PLENTY, SENSOR, SHOWN_IN, Model, Parameter
 from armsight.loop.identify.observable import Observed, observed
 from armsight.loop.identify.placement import with_placement
 from armsight.loop.identify.selection import PLACEMENT, TOGETHER, SelectionStep, forward_selection, scaled_prior
@@ -234,10 +234,6 @@ class Identified(Record):
         names = self.model.names
         pairs = [(names[rows[a]], names[rows[b]], float(C[a, b])) for a, b in zip(i, j, strict=True)]
         return sorted(pairs, key=lambda pair: -abs(pair[2]))
-
-
-#: Unit of a parameter -> its factor to what people read, and that.
-SHOWN_IN = {"m": (1e3, "mm"), "rad": (180 / np.pi, "deg"), "rad/m": (180 / np.pi, "deg/m"), "rad/rad": (100.0, "%")}
 
 
 def value_text(p: Parameter, value: float) -> str:

@@ -221,6 +221,8 @@ def _levers(arm: Arm, q: Array, up_base: Array) -> Array:
     return np.asarray(np.einsum("i,inx,jnx->nij", arm.direction, z, pull))
 
 
+#: Unit of a parameter -> its factor to what people read, and that.
+SHOWN_IN = {"m": (1e3, "mm"), "rad": (180 / np.pi, "deg"), "rad/m": (180 / np.pi, "deg/m"), "rad/rad": (100.0, "%")}
 BASE = ("base_x", "base_y", "base_z", "base_rx", "base_ry", "base_rz")
 
 

@@ -18,7 +18,7 @@ from armsight.estimate.solve import whitened
 from armsight.loop.identify import model as chain
 from armsight.loop.identify.fit import Mask, linear_of, variances_of
 from armsight.loop.identify.measured import Measured
-from armsight.loop.identify.model import Model
+from armsight.loop.identify.model import SHOWN_IN, Model
 
 #: Less than this part of a column left over counts as nothing: rounding leaves 1e-12, the nearest real case 1e-4.
 NOTHING = 1e-7
@@ -60,8 +60,8 @@ def observed(model: Model, x: Array, measured: Measured, prior: Array, noise: tu
     reasons = {model.names[k]: "kept at its nominal value: a prior of zero" for k in np.flatnonzero(prior == 0)}
     reasons |= _tie_texts(model, ties, anywhere)
     for k, sigma in weak.items():
-        unit = model.parameters[k].unit
-        best = f"these poses determine it to {sigma:.2g} {unit} at best, worse than its prior"
+        scale, unit = SHOWN_IN[model.parameters[k].unit]
+        best = f"these poses determine it to {scale * sigma:.2g} {unit} at best, worse than its prior"
         reasons[model.names[k]] = f"kept at its nominal value: {best}"
     free = np.zeros(len(x), bool)
     free[kept] = True
