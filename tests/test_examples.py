@@ -90,6 +90,21 @@ def recording_into_pandas(main, folder, capsys):
     assert len((folder / "poses.csv").read_text().splitlines()) == 13
 
 
+def plate_to_print(main, folder, capsys):
+    triangles = main(folder)
+    corners = [[tuple(corner) for corner in triangle] for triangle in np.round(triangles, 6)]
+    edges = [(t[k], t[k - 2]) for t in corners for k in range(3)]
+    assert len(set(edges)) == len(edges)
+    assert {(b, a) for a, b in edges} == set(edges)  # each edge once in either direction: closed, faces outwards
+
+    def two_holes(diameter_mm):  # polygons of 48 sides
+        return 2 * 24 * (diameter_mm / 2) ** 2 * np.sin(np.pi / 24)
+
+    volume = (90 * 90 - two_holes(2.5)) * 3 + (32 * 12 - two_holes(3.2)) * 20
+    assert np.linalg.det(triangles).sum() / 6 == pytest.approx(volume, rel=1e-9)
+    assert (folder / "plate.stl").stat().st_size == 84 + 50 * len(triangles)
+
+
 #: Number of an example -> what runs it and holds what it prints.
 CHECKS = {
     "01": measure_a_board,
@@ -99,6 +114,7 @@ CHECKS = {
     "05": render_a_recording,
     "06": handeye_for_a_paper,
     "07": recording_into_pandas,
+    "08": plate_to_print,
 }
 
 
