@@ -115,7 +115,7 @@ def test_an_identified_arm_is_better_only_where_it_corrects_something_by_more_th
         found = SimpleNamespace(
             model=model, solution=SimpleNamespace(free=np.array([fitted])), moved_all_over=lambda: (1.0, 0.0)
         )
-        given = {"arm": SimpleNamespace(name="a"), "measured": SimpleNamespace(length_m=None), "notes": ()}
+        given = {"arm": SimpleNamespace(name="a"), "measured": None, "range_noise_m": None, "notes": ()}
         run = SimpleNamespace(held_out=held_out, how="poses", found=found, **given)
         result = assess(run)[0]
         assert ("no better than the nominal arm" in headline(run)) == (result == "poor")
