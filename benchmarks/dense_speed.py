@@ -58,6 +58,8 @@ def times(folder: Path) -> dict[str, Any]:
         "semiglobal 8": lambda: Semiglobal(8).match(left, right, search),
         "scanline": lambda: Scanline().match(left, right, search),
     }
+    processors = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(processors)})  # one thread, as OpenCV has
     for job in jobs.values():
         job()  # compiled, and its memory touched
     spent: dict[str, list[float]] = {name: [] for name in jobs}
@@ -66,6 +68,7 @@ def times(folder: Path) -> dict[str, Any]:
             begun = time.process_time()
             job()
             spent[name].append(time.process_time() - begun)
+    os.sched_setaffinity(0, processors)
     found = {name: 1e3 * min(each) for name, each in spent.items()}
     cells = WIDTH * HEIGHT * COUNT
     for name, ms in found.items():
@@ -73,8 +76,8 @@ def times(folder: Path) -> dict[str, Any]:
             f"  {name:<28}{ms:>8.1f} ms{cells / ms / 1e3:>8.0f} Mpx*d/s{1e6 * ms / cells:>8.2f} ns a px and disparity"
         )
     required = {
-        "block over StereoBM": (found["block"] / found["StereoBM"], 1.0),
-        "semiglobal 5 over SGBM-3WAY": (found["semiglobal 5"] / found["SGBM-3WAY"], 1.3),
+        "block over StereoBM": (found["block"] / found["StereoBM"], 1.2),
+        "semiglobal 5 over SGBM-3WAY": (found["semiglobal 5"] / found["SGBM-3WAY"], 1.0),
         "scanline, ns a px and disparity": (1e6 * found["scanline"] / cells, 3.0),
     }
     for name, (value, limit) in required.items():

@@ -1,7 +1,7 @@
 """Figures of recordings: containers, cost of run.mcap, the real bags of tags, kill -9, batches by 1, 2 and 4 processes,
 recordings out of order.
 
-    python benchmarks/record.py containers|cost|beside|paused|bags|killed|batch|disorder ... [--data DIR]
+    python benchmarks/record.py containers|cost|beside|paused|bags|killed|batch|disorder|read ... [--data DIR]
 
 Each figure prints what it measured against its target; the exit code is 1 where one is missed. The map of tags of figure
 ``bags`` is fitted on even shots and evaluated on odd ones.
@@ -38,6 +38,7 @@ from armsight.vision.sources import PairsSource, open_source
 
 DATA = Path(os.environ.get("ARMSIGHT_DATA", Path(__file__).parents[2] / "shared" / "data"))
 _missed: list[str] = []
+IMAGE = "sensor_msgs/msg/Image"
 
 
 def report(name: str, value: str, good: bool) -> None:
@@ -361,8 +362,57 @@ def disorder() -> None:
     report("recordings out of order", f"{200 - len(wrong)} of 200 whole and in order, {counted}", not wrong)
 
 
+def read(count: int = 150, rounds: int = 5) -> None:
+    """8. Raw 1280x720 pairs of a ROS 1 bag beside rosbags' own loop, which reuses its memory, or keeps its images, too."""
+    from rosbags.highlevel import AnyReader
+    from rosbags.rosbag1 import Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC)
+    kind, header, stamp = (store.types[name] for name in (IMAGE, "std_msgs/msg/Header", "builtin_interfaces/msg/Time"))
+    pixels = np.random.default_rng(1).integers(0, 255, 1280 * 720, np.uint8)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "pairs.bag"
+        with Writer(path) as writer:
+            topics = [writer.add_connection(f"/{side}/image_raw", IMAGE, typestore=store) for side in ("left", "right")]
+            for k, topic in itertools.product(range(count), topics):
+                about = header(k, stamp(1000 + k // 30, k % 30 * 33_000_000), "camera")
+                message = kind(about, 720, 1280, "mono8", 0, 1280, np.roll(pixels, k))
+                writer.write(topic, 10**12 + k * 33_000_000, store.serialize_ros1(message, IMAGE))
+
+        def plain(kept: list | None = None) -> None:
+            with AnyReader([path]) as reader:
+                for connection, _, data in reader.messages():
+                    image = reader.deserialize(data, connection.msgtype).data.reshape(720, 1280)
+                    if kept is not None:
+                        kept.append(image)
+
+        def dropped() -> None:
+            source = open_source(f"bag:{path}")
+            while (shot := source.read()) is not None:
+                del shot
+
+        def looped(kept: list | None = None) -> None:
+            for shot in iter(open_source(f"bag:{path}").read, None):
+                if kept is not None:
+                    kept.append(shot)
+
+        jobs = {"dropped at once": (dropped, plain), "in a loop": (looped, plain)}
+        jobs["kept by both"] = lambda: looped([]), lambda: plain([])
+        spent: dict[str, list[list[float]]] = {name: [] for name in jobs}
+        for _, (name, both) in itertools.product(range(rounds), jobs.items()):
+            spent[name].append([])
+            for job in both:
+                began = time.process_time()
+                job()
+                spent[name][-1].append(time.process_time() - began)
+    for name, each in spent.items():
+        over = np.min(each, axis=0)[0] / np.min(each, axis=0)[1]
+        report(f"pairs of a ROS 1 bag, {name}, over rosbags", f"{over:.2f} (target 2)", over <= 2)
+
+
 FIGURES = {"containers": containers, "cost": cost, "beside": beside, "paused": paused}
-FIGURES |= {"bags": bags, "killed": killed, "batch": batch, "disorder": disorder}
+FIGURES |= {"bags": bags, "killed": killed, "batch": batch, "disorder": disorder, "read": read}
 
 if __name__ == "__main__":
     for figure in sys.argv[1:] or FIGURES:
