@@ -54,7 +54,7 @@ def test_what_is_given_out_of_an_arm_whose_backlash_grew_is_as_uncertain_as_it_i
 
 def test_what_is_given_out_of_a_rig_that_drifts_far_is_as_uncertain_as_it_is_wrong():
     drift = np.array([20e-3, 0.0, 0.0, 0.0, np.radians(2.0), 0.0]) / 60.0
-    moved = watched_arm(36, lambda age_s: drift * age_s, 30.0)
+    moved = watched_arm(36, lambda age_s: drift * age_s, 22.0)
     assert {found.cause for found in moved.monitor.findings()} == {"fixed"}
     best, T_base_rig = moved.monitor.changes[0], moved.T_base_rig
     D = T_base_rig @ inverse(small(drift * (best.end_s - AT_S))) @ inverse(T_base_rig)
