@@ -4,7 +4,7 @@ python references.py hidden [N]     body hidden for 0.5, 2, 5 s on the circle, N
 python references.py fused [N [SEED]]   the same with an inertial unit, as replay --references fuses it, seeds from 4 on (4)
 python references.py jumps [N [SEED]]   the camera's clock jumps by 3, 10, -10 ms in motion, with a unit and without
 python references.py tilt [N]       base's tilt and the zeros that gravity shows, N simulated worn arms (40): a minute
-python references.py gravity        direction of gravity at rest, arm-imu, each rest left out of the fit: two minutes
+python references.py gravity        direction of gravity at rest, arm-imu, calibrated by the other take: half a minute
 
 Public recordings lie where ARMSIGHT_DATA points.
 """
@@ -12,6 +12,7 @@ Public recordings lie where ARMSIGHT_DATA points.
 import os
 import sys
 import tempfile
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache, partial
 from itertools import product
@@ -280,37 +281,59 @@ def arm_imu(folder: Path) -> tuple[np.ndarray, np.ndarray, PosePath]:
     return t[good], z[good], PosePath(at[keep], Ts)
 
 
+def rests(folder: Path) -> tuple[list[Reading], list[Reading], Callable[[float], ToolMotion]]:
+    """Return means of the accelerometer at rests, means of the gyro in motion, and the arm's motion, of a take of arm-imu.
+
+    Accelerations by the arm's poses, 30 a second, are worse than those at rest by more than their noise says: left out.
+    """
+    t, z, path = arm_imu(folder)
+    motion = cache(path)
+    inside = [k for k, at in enumerate(t) if path.covers(float(at), 0.3)]
+    t, z = t[inside], z[inside]
+    still = np.array([np.abs(motion(float(at)).twist).max() < 2e-3 for at in t])
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], still.astype(int), [0]]))).reshape(-1, 2)
+    resting = [np.arange(a + 15, b - 5) for a, b in edges if b - a > 40]  # without what swings after a motion
+    moving = [np.arange(a, a + 20) for a in range(0, len(t) - 20, 20) if not still[a : a + 20].any()]
+    z_g, z_w = ([z[rows].mean(axis=0) for rows in each] for each in (resting, moving))
+    at_rest = [
+        Reading(float(t[r].mean()), ACCELEROMETER, v[3:], 0.01**2 * np.eye(3))
+        for r, v in zip(resting, z_g, strict=True)
+    ]
+    return (
+        at_rest,
+        [Reading(float(t[r].mean()), GYRO, v[:3], 0.03**2 * np.eye(3)) for r, v in zip(moving, z_w, strict=True)],
+        motion,
+    )
+
+
 def gravity() -> None:
-    """Print the angle between gravity by the sensor and by the arm at each rest, that rest left out of the fit."""
+    """Print the angle between gravity by sensor and arm at each rest, the sensor calibrated by the other take alone.
+
+    Beside it, by how much the readings themselves differ at the rest of the other take with the same attitude of the arm.
+    """
+    takes = {folder: rests(folder) for folder in sorted((DATA / "references" / "arm-imu").glob("*/Sequencia*"))}
     found = []
-    for folder in sorted((DATA / "references" / "arm-imu").glob("*/Sequencia*")):
-        t, z, path = arm_imu(folder)
-        motion = cache(path)
-        inside = [k for k, at in enumerate(t) if path.covers(float(at), 0.3)]
-        t, z = t[inside], z[inside]
-        still = np.array([np.abs(motion(float(at)).twist).max() < 2e-3 for at in t])
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], still.astype(int), [0]]))).reshape(-1, 2)
-        rests = [np.arange(a + 15, b - 5) for a, b in edges if b - a > 40]  # without what swings after a motion
-        moving = [np.arange(a, a + 20) for a in range(0, len(t) - 20, 20) if not still[a : a + 20].any()]
-        for left in rests:
-            readings = [
-                Reading(float(t[rows].mean()), ACCELEROMETER, z[rows, 3:].mean(axis=0), 0.01**2 * np.eye(3))
-                for rows in rests
-                if rows is not left
-            ]
-            for rows in moving:
-                at, mean = float(t[rows].mean()), z[rows].mean(axis=0)
-                readings.append(Reading(at, GYRO, mean[:3], 0.03**2 * np.eye(3)))
-                readings.append(Reading(at, ACCELEROMETER, mean[3:], 0.15**2 * np.eye(3)))
-            readings.sort(key=lambda reading: reading.t_s)
-            first = replace(Inertial.of("imu"), sigma_delay_s=0.0)
-            sensor = calibrate(first.begun(readings, motion), readings, motion).reference
-            there = motion(float(t[left].mean()))
+    for folder, (at_rest, _, motion) in takes.items():
+        (other,) = (each for each in takes if each.name == folder.name and each != folder)
+        known, rates, way = takes[other]
+        readings = sorted([*known, *rates], key=lambda reading: reading.t_s)
+        first = replace(Inertial.of("imu"), sigma_delay_s=0.0)
+        sensor = calibrate(first.begun(readings, way), readings, way).reference
+        for reading in at_rest:
+            there = motion(reading.t_s)
             e = sensor.expected(there, ACCELEROMETER)
-            off, *_ = np.linalg.lstsq(e.by_tool[:, 3:], z[left, 3:].mean(axis=0) - e.z, rcond=1e-6)
-            found.append(float(np.degrees(np.linalg.norm(off))))
-            print(f"{folder.parent.name}/{folder.name} at {t[left].mean():.1f} s: {found[-1]:.3f} deg", flush=True)
-    print(f"{len(found)} rests: median {np.median(found):.3f} deg, 90 % {np.quantile(found, 0.9):.3f} deg")
+            off, *_ = np.linalg.lstsq(e.by_tool[:, 3:], reading.z - e.z, rcond=1e-6)
+            apart = [
+                np.linalg.norm(log_se3(inverse(there.T_base_tool) @ way(each.t_s).T_base_tool)[3:]) for each in known
+            ]
+            alike = known[int(np.argmin(apart))]
+            differ = np.linalg.norm(reading.z - alike.z) / STANDARD_GRAVITY_M_S2 if min(apart) < 1e-3 else np.nan
+            found.append(np.degrees([np.linalg.norm(off), differ]))
+            said = "{:.3f} deg; the readings of both takes differ by {:.3f}".format(*found[-1])
+            print(f"{folder.parent.name}/{folder.name} at {reading.t_s:.1f} s: {said}", flush=True)
+    off, differ = np.array(found).T
+    for name, each in (("all", off), ("readings repeat to 0.2 deg", off[differ < 0.2])):
+        print(f"{name}: {len(each)} rests, median {np.median(each):.3f} deg, 90 % {np.quantile(each, 0.9):.3f} deg")
 
 
 if __name__ == "__main__":

@@ -83,12 +83,14 @@ def test_check_says_rate_gap_and_noise_beside_that_of_the_class(sweep, capsys):
 def test_json_lines_are_read_as_csv_is_and_oddities_are_said(sweep, capsys, tmp_path):
     _, _, values = sweep
     odd = np.repeat(values[::2], 2, axis=0)
+    odd[:, HEAD.index("gyro_z_rad_s")] = 0.0
     lines = (json.dumps(dict(zip(HEAD, map(float, row), strict=True))) for row in odd)
     (tmp_path / "imu.jsonl").write_text("\n".join(lines))
     (tmp_path / "r.toml").write_text('[a]\nkind = "inertial"\nsource = "imu.jsonl"\nrate_hz = 100.0\n')
     said = said_of(capsys, "references", "check", tmp_path / "r.toml").done()
     assert "weak: a: the rate is 25 Hz, not 100 as the file says" in said.out
-    assert "a: 50 % of the readings repeat the one before: it is read too often" in said.out
+    assert "a: 50 % of readings repeat the one before: it is read too often" in said.out
+    assert "a: gyro_z never changes: it is not read, or broken" in said.out
 
 
 def test_calibrate_finds_the_sensor_and_writes_what_check_reads(sweep, capsys, tmp_path):
