@@ -30,9 +30,8 @@ def test_the_board_in_view_is_used_unless_one_was_named(named, tmp_path):
         for _ in range(2):  # one look alone may catch a board that is being moved
             step.look(LiveShot(Shot("1", left, right), 1, next(looks)))
 
-    if named is None:
-        look(other, empty)
-        assert (step.state.seen, step.state.used) == ("", False)
+    look(other, empty)
+    assert (step.state.seen, step.state.used) == ("", False)
     look(other, other)
     assert step.state.seen == "chessboard:8x5:20mm"
     assert step.state.spec == (named or "chessboard:8x5:20mm")
