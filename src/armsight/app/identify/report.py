@@ -183,8 +183,8 @@ FIGURES: dict[str, tuple[Callable[[Identification], Figure], str, str]] = {
         "Strong colours off the diagonal: these poses distinguish the two badly; their sigmas say so.",
     ),
 }
-#: Residual over what a range's noise and rounded joints explain, beyond which the model is wrong; half: arms with some
-#: scatter of their own are, double: another maker's arm passes where noise_m was not given.
+#: Residual over what a range's noise and rounded joints explain, beyond which the model is wrong; half: arms that scatter
+#: a little are, double: another maker's arm passes where noise_m was not given.
 UNEXPLAINED = 2.0
 _FOLDED = ("sources", "selection", "correlation")  # figures that stand beneath a line until a reader asks for them
 
@@ -251,7 +251,8 @@ def assess(run: Identification) -> tuple[Grade, str]:
         if left > UNEXPLAINED * (own := explained_m(run.found, run.measured, run.range_noise_m)):
             return "poor", (
                 f"Do not use this identification: its residual is {1e3 * left:.2f} mm where noise_m and rounded joints "
-                f"explain {1e3 * own:.2f} mm. Is {run.arm.name} the maker's nominal arm of this one, and noise_m true?"
+                f"explain {1e3 * own:.2f} mm. Is {run.arm.name} the maker's nominal arm of this one? If so, arm and wire "
+                "scatter by more: give that as noise_m."
             )
         return (
             "fair",
