@@ -41,7 +41,7 @@ def locked(array):
 REJECTED = {  # (kernel, arguments, number of the first that does not fit)
     "numbers of another size": (chain.forward, (TABLE, Q.astype(np.float32), T), 2),
     "integers for floats": (chain.forward, (TABLE, Q.astype(np.int64), T), 2),
-    "signed for unsigned": (cost._census, (np.zeros((9, 9), np.int8), np.zeros((3, 3), np.uint32)), 1),
+    "signed for unsigned": (cost.census, (np.zeros((9, 9), np.int8), 1, np.zeros((3, 3, 3), np.uint8)), 1),
     "another byte order": (chain.forward, (TABLE, Q.astype(">f8"), T), 2),
     "complex numbers": (chain.forward, (TABLE, Q.astype(complex), T), 2),
     "too few dimensions": (chain.forward, (TABLE, Q, T[0]), 3),
@@ -182,8 +182,8 @@ def results():
     unprojected = np.empty((9, 3))
     camera._unproject(False, k, d, rng.uniform(0, 480, (9, 2)), unprojected)
     image = rng.integers(0, 255, (12, 16), dtype=np.uint8)
-    words, low, high = np.zeros((8, 12), np.uint32), *np.zeros((2, 8, 12), np.uint8)
-    cost._census(image, words)
+    words, low, high = np.zeros((3, 8, 12), np.uint8), *np.zeros((2, 8, 12), np.uint8)
+    cost.census(image, 1, words)
     cost._half_way(image, low, high)
     done |= {"poses": poses, "gaps": gaps, "unprojected": unprojected, "words": words, "low": low, "high": high}
     done["seen"] = scanline.seen(rng.integers(-1, 6, (8, 12), dtype=np.int16), 1)
