@@ -75,23 +75,18 @@ def tables(report: ArmReport, others: Mapping[str, dict[str, Any]]) -> list[Text
         for title, key, unit in _NUMBERS
         if any(each.get(key) is not None for each in columns)
     )
-    parts = tuple(
-        (
-            name,
-            f"{round(100 * p.share)} %" if p.determined else "not determined",
-            f"{p.rms_mm:.3f} ± {p.sigma_mm:.3f}" if p.determined else f"± {p.sigma_mm:.3f}",
-            f"{p.without_mm:.3f}" if p.remedy and p.determined else "–",
-            p.remedy,
-        )
-        for name, p in report.parts.items()
-    )
+    parts = list[tuple[str, ...]]()
+    for name, p in report.parts.items():
+        known = f"{round(100 * p.share)} %", f"{p.rms_mm:.3f} ± {p.sigma_mm:.3f}"
+        shown = known if p.determined else ("not determined", f"± {p.sigma_mm:.3f}")
+        parts.append((name, *shown, f"{p.without_mm:.3f}" if p.remedy and p.determined else "–", p.remedy))
     joints = tuple(
         (j.name, *(_text(getattr(j, key), digits) if _shown(j, key) else "–" for _, key, digits in _OF_JOINT))
         for j in report.joints
     )
     title = f"What the {report.accuracy_mm[0]:.2f} mm are made of, and what each remedy alone would leave"
     return [
-        TextTable(title, ("", "share", "itself, mm", "left by the remedy, mm", "remedy"), parts),
+        TextTable(title, ("", "share", "itself, mm", "left by the remedy, mm", "remedy"), tuple(parts)),
         TextTable("What the arm does", ("", report.arm, *others), does),
         TextTable("Joints; sigma after ±", ("", *(title for title, *_ in _OF_JOINT)), joints),
     ]

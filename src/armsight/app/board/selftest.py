@@ -454,7 +454,6 @@ def _on_real(
 
 
 def _ticks_per_s(port: str, baud: int) -> float:
-    """Return how many ticks a real board makes in a second of this computer's clock."""
     with Board.connect(SerialLink.open(port, baud), name=port) as board:
         board.receive(0.1)
         start, from_s = time.perf_counter(), board.joints.t_s

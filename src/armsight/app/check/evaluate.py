@@ -102,7 +102,6 @@ def _groups(rows: list[Row], key: Callable[[Row], str]) -> dict[str, list[Row]]:
 
 
 def _several_ways(often: dict[str, list[Row]]) -> dict[str, Metric]:
-    """Return vAP of each pose that was approached repeatedly from more than one direction."""
     by_way = {name: _groups(rows, lambda row: row.approach).values() for name, rows in often.items()}
     ways = {name: [_stacked(way).p for way in each if len(way) > 1] for name, each in by_way.items()}
     return {name: iso9283.multi_directional(each) for name, each in ways.items() if len(each) > 1}

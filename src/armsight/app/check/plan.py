@@ -175,13 +175,6 @@ def plan_csv(plan: CheckPlan) -> str:
 
 def plan_json(test: PlannedTest) -> dict[str, object]:
     """Return a plan as JSON has it, SI units."""
-    return {
-        "test": test.name,
-        "cycles": test.cycles,
-        "side_m": test.plan.side_m,
-        "centre_m": test.plan.centre.tolist(),
-        "poses": list(test.plan.names),
-        "q_rad": test.plan.q.tolist(),
-        "T_base_tool": test.plan.Ts_base_tool.tolist(),
-        "notes": test.notes,
-    }
+    plan, arrays = test.plan, {"centre_m": "centre", "q_rad": "q", "T_base_tool": "Ts_base_tool"}
+    shown = {"test": test.name, "cycles": test.cycles, "side_m": plan.side_m, "poses": list(plan.names)}
+    return {**shown, **{key: getattr(plan, name).tolist() for key, name in arrays.items()}, "notes": test.notes}

@@ -223,17 +223,10 @@ def check_report(
         Html(html_table(TextTable(title, head, tuple(cells))) + bullets(meant)),
         all_compared(outcomes),
     ]
-    return Report(
-        "check",
-        "ISO 9283 test",
-        f"ISO 9283 · {source}",
-        "",
-        {"result": ("Result", blocks), **figures(FIGURES, result, rows)},
-        [Note("note", each) for each in result.notes],
-        result.values(),
-        prefix="check",
-        assessed=assess(listed, [each for each in outcomes if each is not None]),
-    )
+    sections = {"result": ("Result", blocks), **figures(FIGURES, result, rows)}
+    notes, graded = [Note("note", each) for each in result.notes], assess(listed, [*filter(None, outcomes)])
+    named = "check", "ISO 9283 test", f"ISO 9283 · {source}", ""
+    return Report(*named, sections, notes, result.values(), "check", graded)
 
 
 _CORRECT = "armsight identify corrects what is the same each time"

@@ -78,14 +78,10 @@ def read_rows(file: Path, columns: str | None = None) -> list[Row]:
         raise InputError(f"{file}: line 1: column {missing[0]} is missing; needed are {', '.join(NEEDED)}{hint}")
     known = [name for name in _NUMBERS if name in table.at]
     numbers, texts = table.numbers(known, empty=True), zip(*map(table.texts, _TEXTS), strict=True)
-    rows = [
-        _row(
-            f"{file}: line {line}",
-            dict(zip(_TEXTS, cells, strict=True)),
-            {name: float(value) for name, value in zip(known, values, strict=True) if not np.isnan(value)},
-        )
-        for (line, _), values, cells in zip(table.rows, numbers, texts, strict=True)
-    ]
+    rows = list[Row]()
+    for (line, _), values, cells in zip(table.rows, numbers, texts, strict=True):
+        given = {name: float(value) for name, value in zip(known, values, strict=True) if not np.isnan(value)}
+        rows.append(_row(f"{file}: line {line}", dict(zip(_TEXTS, cells, strict=True)), given))
     if not rows:
         raise InputError(f"{file}: no rows; one line an attained pose is needed")
     _require_sense(file, rows)

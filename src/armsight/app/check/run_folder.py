@@ -329,11 +329,8 @@ def _both_ways(groups: list[list[PathSegment]]) -> tuple[list[list[PathSegment]]
     """Return the two groups of the first circle that is run all around both ways; what is said of further ones."""
     rounds = [(group, *_round(group[0])) for group in groups if group[0].kind == "circle"]
     whole = [(group, shape, angle[-1]) for group, shape, angle in rounds if abs(angle[-1]) >= _WHOLE_RAD]
-    pairs = [
-        (a, b)
-        for (a, shape, angle), (b, other, back) in combinations(whole, 2)
-        if angle * back < 0 and np.abs(shape - other).max() < _SAME_M
-    ]
+    each = [(a, b) for a, b in combinations(whole, 2) if a[2] * b[2] < 0]
+    pairs = [(a[0], b[0]) for a, b in each if np.abs(a[1] - b[1]).max() < _SAME_M]
     if not pairs:
         return [], []
     circle = list(pairs[0])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -199,21 +199,12 @@ class CamerasStep(PageStep[CamerasState]):
     def now(self) -> CamerasState:
         """Return what is shown, with how the cameras do."""
         capture, simulated, shown = self.shared.capture, self.shared.simulated is not None, self.shown
-        newest = capture.newest
-        return CamerasState(
-            self.shared.source,
-            tuple(self._found),
-            capture.problem,
-            capture.rate_hz,
-            None if newest is None else 1e3 * newest.age_s(time.monotonic()),
-            shown.views,
-            shown.notes,
-            shown.finding_left,
-            capture.swapped,
-            shown.left_known,
-            ACTIONS if simulated else (),
-            "armsight demo" if simulated else f"armsight record {self.shared.source or 'usb:LEFT,RIGHT'} -o shots",
-        )
+        newest, source = capture.newest, self.shared.source
+        age_ms = None if newest is None else 1e3 * newest.age_s(time.monotonic())
+        shown = replace(shown, source=source, found=tuple(self._found), problem=capture.problem, age_ms=age_ms)
+        command = "armsight demo" if simulated else f"armsight record {source or 'usb:LEFT,RIGHT'} -o shots"
+        shown = replace(shown, simulated=ACTIONS if simulated else (), command=command)
+        return replace(shown, rate_hz=capture.rate_hz, swapped=capture.swapped)
 
     def _open(self) -> Source:
         shared = self.shared

@@ -476,18 +476,11 @@ def shown_pose(pose: PoseEstimate, T_zero_left: Array | None) -> PoseShown:
     """Return a pose as people read it; relative to a zero where one is given."""
     whole, noise = left_axes(pose.T_left_body, pose.cov), left_axes(pose.T_left_body, pose.cov_noise)
     shown = pose.T_left_body if T_zero_left is None else T_zero_left @ pose.T_left_body
-    (sigma_mm, sigma_deg), ellipsoid = _sigmas(whole), 1e6 * whole[:3, :3]
-    return PoseShown(
-        _mm(shown[:3, 3]),
-        tuple(np.degrees(euler_zyx(shown[:3, :3])[0]).tolist()),
-        sigma_mm,
-        _sigmas(noise)[0],
-        _mm(np.sqrt(np.maximum(np.diag(whole - noise), 0.0)[:3])),
-        sigma_deg,
-        pose.misfit,
-        len(pose.points.ids),
-        tuple(map(tuple, ellipsoid.tolist())),
-    )
+    (sigma_mm, sigma_deg), ellipsoid = _sigmas(whole), tuple(map(tuple, (1e6 * whole[:3, :3]).tolist()))
+    angles = tuple(np.degrees(euler_zyx(shown[:3, :3])[0]).tolist())
+    calibration = _mm(np.sqrt(np.maximum(np.diag(whole - noise), 0.0)[:3]))
+    sigmas = sigma_mm, _sigmas(noise)[0], calibration, sigma_deg
+    return PoseShown(_mm(shown[:3, 3]), angles, *sigmas, pose.misfit, len(pose.points.ids), ellipsoid)
 
 
 def _sigmas(cov: Array) -> tuple[tuple[float, ...], tuple[float, ...]]:

@@ -308,20 +308,11 @@ class LiveSession:
 
     def sections(self) -> dict[str, object]:
         """Return the state, section by section: records of this package."""
-        measure = self.measuring.state
-        return {
-            "overview": Overview(
-                self._step, STEPS, str(self.folder), self.arm.busy, self.arm.held, self._offer, tuple(self._settings)
-            ),
-            "cameras": self.cameras.state,
-            "board": self.board.state,
-            "calibrate": self.calibration.state,
-            "body": self.body.state,
-            "measure": measure,
-            "arm": self.arm.state,
-            "recorded": self.recorded.state,
-            "health": self._health(measure),
-        }
+        arm, measure, settings = self.arm, self.measuring.state, tuple(self._settings)
+        overview = Overview(self._step, STEPS, str(self.folder), arm.busy, arm.held, self._offer, settings)
+        found: dict[str, object] = {"overview": overview, "measure": measure, "health": self._health(measure)}
+        steps = {name: getattr(self, name).state for name in ("cameras", "board", "body", "arm", "recorded")}
+        return found | steps | {"calibrate": self.calibration.state}
 
     def _health(self, measure: MeasureState) -> HealthState:
         latency, of = measure.latency_ms, "from an image's arrival to its pose"

@@ -113,11 +113,8 @@ def _checked_outputs(options: MeasureOptions) -> Path | None:
     folder = None if options.view_dir is None else view_folder(options.view_dir)
     if options.output is not None:
         chart = folder and folder / CHART
-        check_writable(
-            options.output,
-            apart_from=(options.rig, options.target, options.source.removeprefix(DETECTIONS)),
-            outputs=(folder, chart),
-        )
+        read = options.rig, options.target, options.source.removeprefix(DETECTIONS)
+        check_writable(options.output, apart_from=read, outputs=(folder, chart))
     return folder
 
 
@@ -205,11 +202,9 @@ class MeasureRun:
         self.shutters = self.shutters or record.shutters
         if record.way is not None:
             self.ways[record.way] += 1
-        for shots, holds in (
-            (self.jumped, record.jump is not None),
-            (self.contradicted, record.ok and _contradicts(record.dropped, len(record.points_m))),
-            (self.misfit, record.ok and record.misfit > 1),
-        ):
+        odd = record.ok and _contradicts(record.dropped, len(record.points_m))
+        kinds = (self.jumped, record.jump is not None), (self.contradicted, odd)
+        for shots, holds in (*kinds, (self.misfit, record.ok and record.misfit > 1)):
             if holds:
                 shots.add(record.shot)
         if self.options.output is not None:

@@ -127,7 +127,6 @@ def command(
 def _run_logged(
     source_spec: str, board_spec: str, rig_path: Path, target_spec: str, arm_spec: str, output: Path, as_json: bool
 ) -> None:
-    """Calibrate hand and eye from a recording and the joint angles that were logged beside it."""
     import contextlib
 
     from armsight.app.run.angles import read_angles

@@ -251,7 +251,6 @@ def _close(loop: Loop, result: RunResult) -> None:
 
 
 def _require_seen(loop: Loop, plan: MotionPlan) -> None:
-    """Raise an ArmsightError if the body is not in view at the start."""
     setup = loop.setup
     here = plan.start if setup.clock is None else loop.log.joints[-1].q[-1]  # a real arm is only near the start
     there = point_to_point(setup.arm, np.clip(here, setup.arm.q_min, setup.arm.q_max), plan.start)
@@ -268,7 +267,6 @@ def _require_seen(loop: Loop, plan: MotionPlan) -> None:
 
 
 def _prepare(loop: Loop, result: RunResult, targets: Array, progress: Progress) -> None:
-    """Calibrate hand and eye, and measure the delay of the images; the arm ends at the plan's start."""
     setup, plan, stands = loop.setup, result.plan, result.plan.start
     if loop.led is not None:
         progress("looking for the sync LED")

@@ -14,7 +14,7 @@ from armsight.app.run.angles import LoggedAngles
 from armsight.app.run.folder import write_handeye
 from armsight.app.show.page import PAGE
 from armsight.app.show.plotting import BLUE, Figure, subplots
-from armsight.app.show.report import Lines, Report, figures
+from armsight.app.show.report import Lines, Report, Section, figures
 from armsight.data import Array, Missed, PoseEstimate, Record
 from armsight.errors import CalibrationError, InputError
 from armsight.files import table_text
@@ -211,14 +211,8 @@ def _report(result: LoggedRun, summary: dict[str, Any]) -> Report:
     missed = [*result.run.missed, *(f"{name}: no joint angles" for name in result.unpaired), *outliers]
     caption = "Good: no pose stands out, and nothing drifts from the first to the last."
     said = Lines([*result.weak, measured, *lines, f"board {summary['board']}", following])
-    return Report(
-        "run",
-        f"{summary['arm']}: logged poses",
-        "The arm was moved by another program; each pose is predicted by a fit to the others.",
-        headline,
-        {
-            "result": ("Result", [said]),
-            **figures({"errors": (errors, "Error of each pose left out of the fit", caption)}),
-            "missed": ("Shots that were not used", [Lines(missed, none="none")]),
-        },
-    )
+    sub = "The arm was moved by another program; each pose is predicted by a fit to the others."
+    sections: dict[str, Section] = {"result": ("Result", [said])}
+    sections |= figures({"errors": (errors, "Error of each pose left out of the fit", caption)})
+    sections["missed"] = "Shots that were not used", [Lines(missed, none="none")]
+    return Report("run", f"{summary['arm']}: logged poses", sub, headline, sections)

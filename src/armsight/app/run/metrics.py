@@ -84,9 +84,8 @@ def track_metrics(track: ToolTrack, truth: ToolTrack) -> TrackMetrics:
 class PassErrors:
     """Distance of the tool from its reference in one pass of the motions, m."""
 
-    #: RMS over the last fifth of a second of each rest as long, by motion.
+    #: RMS over the last fifth of a second of each rest as long, by motion; apart where the arm is nearly singular.
     rests: Mapping[str, float] = field(default_factory=dict)
-    #: the same of rests at which the servo corrects only in part, as the arm is nearly singular.
     singular: Mapping[str, float] = field(default_factory=dict)
     #: for each motion along a path (line, circle) times since its start, s, and distances from the path.
     paths: Mapping[str, tuple[Array, Array]] = field(default_factory=dict)

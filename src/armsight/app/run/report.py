@@ -48,13 +48,12 @@ _FIGURES = {
     "latency": (
         "latency",
         "Latency",
-        "Computing time from a decoded image to its command while the body is followed; decoding and the camera's own "
-        "delay are not in it, nor are searches of a lost body, beside which commands continue.",
+        "Time from a decoded image to its command while the body is followed, not searched.",
     ),
     "studies": (
         "studies",
         "What the error depends on",
-        "Measured errors with 95% intervals (from the number of shots), and those the covariance predicts.",
+        "Measured errors, their 95% intervals, and those predicted.",
     ),
     "overview": ("studies", "", ""),
 }
@@ -119,16 +118,8 @@ def report_of(
     }
     about, name = result.properties, result.setup.arm.name
     simulated = "simulated, {arm} · {cameras} · seed {seed}".format(**about) if "seed" in about else ""
-    return Report(
-        "run",
-        f"A {'simulated ' if simulated else ''}run of the arm {name}, measured",
-        simulated or name,
-        "",
-        sections,
-        _said(result),
-        prefix="",
-        assessed=assess(result, passes),
-    )
+    title, graded = f"A {'simulated ' if simulated else ''}run of the arm {name}, measured", assess(result, passes)
+    return Report("run", title, simulated or name, "", sections, _said(result), prefix="", assessed=graded)
 
 
 _MOST = 20_000  # rows of a run that show odometry; half: nothing, double: long runs take seconds
@@ -175,11 +166,8 @@ def assess(result: RunResult, passes: tuple[PassErrors, PassErrors] | None) -> t
 def _said(result: RunResult) -> list[Note]:
     level: Level = "error" if any(each.forbids for each in result.health) else "warn"
     remarks = [*unseen_lines(result.fixed_unseen), *correction_lines(result.log.corrections, result.not_corrected)]
-    return [
-        *(Note(level, line) for line in health_lines(result.health)),
-        *(Note("warn", line) for line in _lost(result)),
-        *(Note("hint", line) for line in remarks),
-    ]
+    said = [Note(level, line) for line in health_lines(result.health)] + [Note("warn", line) for line in _lost(result)]
+    return said + [Note("hint", line) for line in remarks]
 
 
 def _lost(result: RunResult) -> list[str]:
@@ -272,12 +260,9 @@ def _passes_json(before: PassErrors, after: PassErrors) -> dict[str, Any]:
     for when, each in (("before", before), ("after", after)):
         for name, value in each.singular.items():
             found["singular_rests"].setdefault(name, {})[f"rest_error_{when}_m"] = value
-        values = {
-            f"rest_error_{when}_m": each.rest_m,
-            f"rest_error_{when}_max_m": max(each.rests.values(), default=None),
-            f"path_error_{when}_m": each.path_m,
-        }
-        found |= _known(values)
+        most = max(each.rests.values(), default=None)
+        values = {f"rest_error_{when}_m": each.rest_m, f"rest_error_{when}_max_m": most}
+        found |= _known({**values, f"path_error_{when}_m": each.path_m})
     return found
 
 
@@ -306,14 +291,11 @@ def _cell(key: str, value: float | None) -> str:
 def _loop_table(passes: tuple[PassErrors, PassErrors] | None) -> TextTable | None:
     if passes is None:
         return None
-    rows = [
-        (name, f"{1e3 * alone:.3f}", f"{1e3 * closed:.3f}", f"{alone / closed:.1f}")
-        for name, (alone, closed) in (
-            ("at rest, RMS", (each.rest_m for each in passes)),
-            ("from the path, RMS", (each.path_m for each in passes)),
-        )
-        if alone is not None and closed is not None
-    ]
+    rows = list[tuple[str, ...]]()
+    for name, key in (("at rest, RMS", "rest_m"), ("from the path, RMS", "path_m")):
+        alone, closed = (getattr(each, key) for each in passes)
+        if alone is not None and closed is not None:
+            rows.append((name, f"{1e3 * alone:.3f}", f"{1e3 * closed:.3f}", f"{alone / closed:.1f}"))
     columns = ("", "open loop, mm", "loop closed, mm", "times smaller")
     return TextTable("Distance of the tool from its command", columns, tuple(rows))
 

@@ -384,16 +384,14 @@ class McapWriter:
 
     def _statistics(self) -> _Record:
         indexes = self._chunk_indexes
+        counts = {"channel_count": len(self._channels), "chunk_count": len(indexes), "schema_count": len(self._schemas)}
+        counts |= {"attachment_count": 0, "metadata_count": len(self._metadata_indexes)}
         return self._records.Statistics(
-            attachment_count=0,
-            channel_count=len(self._channels),
             channel_message_counts=dict(self._counts),
-            chunk_count=len(indexes),
             message_count=sum(self._counts.values()),
-            metadata_count=len(self._metadata_indexes),
             message_start_time=min((each.message_start_time for each in indexes), default=0),
             message_end_time=max((each.message_end_time for each in indexes), default=0),
-            schema_count=len(self._schemas),
+            **counts,
         )
 
     def _bytes(self, record: _Record) -> bytes:

@@ -24,7 +24,6 @@ CLOSE_S = 10.0
 
 
 def _image_bytes(datum: Datum) -> int:
-    """Return how much memory the images of a datum take."""
     shot = datum.shot if isinstance(datum, ShotDatum) else None
     raw = (shot.left, shot.right) if shot is not None else ()
     return sum(each.nbytes for each in raw if each is not None) + sum(map(len, (shot and shot.encoded) or ()))
