@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from armsight.app.run import logged
-from armsight.app.run.angles import read_angles
+from armsight.app.run.logged import read_angles
 from armsight.data import Missed, PoseEstimate, Shot
 from armsight.errors import InputError
 from armsight.geometry.pose import exp_se3, inverse, pose

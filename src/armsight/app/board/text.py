@@ -59,19 +59,14 @@ def welcome_text(board: MotionBoard) -> str:
 def status_json(board: MotionBoard, states: JointStates) -> dict[str, Any]:
     """Return a board's state, faults, newest angles and counters as JSON has them, SI units."""
     status, celsius = board.status, board.joints.temperature_c
-    return {
-        "t_s": round(status.t_s, 3),
-        "state": status.state.name,
-        "faults": [{"fault": f.fault.name, "joint": None if f.joint is None else f.joint + 1} for f in status.faults],
-        "not_homed": status.joints_not_homed,
-        "q_rad": [round(float(q), 5) for q in states.q[-1]] if len(states.q) else None,
-        "duty": [round(float(duty), 4) for duty in board.joints.duty],
-        "supply_v": None if math.isnan(status.supply_v) else round(status.supply_v, 3),
-        "temperature_c": None if celsius is None else [float(each) for each in celsius],
-        "readings": len(states.t_s),
-        **{name: getattr(status, name) for name in ("crc_errors", "lost_bytes", "overrun_bytes")},
-        "broken_messages": board.broken_messages,
-    }
+    faults = [{"fault": f.fault.name, "joint": None if f.joint is None else f.joint + 1} for f in status.faults]
+    found = {"t_s": round(status.t_s, 3), "state": status.state.name, "faults": faults}
+    found |= {"not_homed": status.joints_not_homed, "duty": [round(float(duty), 4) for duty in board.joints.duty]}
+    found |= {"q_rad": [round(float(q), 5) for q in states.q[-1]] if len(states.q) else None}
+    found |= {"supply_v": None if math.isnan(status.supply_v) else round(status.supply_v, 3)}
+    found |= {"temperature_c": None if celsius is None else [float(each) for each in celsius]}
+    found |= {name: getattr(status, name) for name in ("crc_errors", "lost_bytes", "overrun_bytes")}
+    return {**found, "readings": len(states.t_s), "broken_messages": board.broken_messages}
 
 
 def status_text(board: MotionBoard, states: JointStates) -> str:

@@ -25,7 +25,6 @@ from armsight.app.live.measuring import MeasureStep
 from armsight.app.live.records import asked
 from armsight.app.live.step import PageStep, Shared, why
 from armsight.app.options import LOGGED, SIM
-from armsight.app.run.angles import LoggedAngles, read_angles
 from armsight.app.run.devices import require_joints, setup_of
 from armsight.app.run.experiment import (
     RunResult,
@@ -37,6 +36,7 @@ from armsight.app.run.experiment import (
     start_rad,
 )
 from armsight.app.run.folder import finish, run_in
+from armsight.app.run.logged import LoggedAngles, read_angles
 from armsight.app.run.motion_file import MotionPlan, read_motions
 from armsight.app.setup.finding import check_arm, check_model, find_board
 from armsight.app.show.messages import require
@@ -581,19 +581,10 @@ class ArmStep(PageStep[ArmState]):
         options, board = self.shared.options, self._board
         q = self._q if self._logged is None else self._logged_q()
         vision, scene = self._vision(q)
-        shown = replace(
-            self.shown,
-            arm=options.arm,
-            named=options.board is not None,
-            missing=self._lacking(),
-            handeye=self.handeye.state,
-            identify=self._identifying.state,
-            motion_file=str(self.shared.motion),
-            command=self._command(),
-            q_deg=() if q is None else tuple(np.degrees(q).tolist()),
-            vision_deg=vision,
-            scene=scene,
-        )
+        shown = replace(self.shown, arm=options.arm, named=options.board is not None, missing=self._lacking())
+        shown = replace(shown, handeye=self.handeye.state, identify=self._identifying.state, command=self._command())
+        shown = replace(shown, motion_file=str(self.shared.motion), vision_deg=vision, scene=scene)
+        shown = replace(shown, q_deg=() if q is None else tuple(np.degrees(q).tolist()))
         if self._logged is not None:
             return replace(shown, board=options.board, state="joint angles of another program")
         if board is None:
@@ -604,17 +595,10 @@ class ArmStep(PageStep[ArmState]):
             state = "held at rest by the board since the last motion" if status.state is BoardState.HOLDING else state
             faults = ()
         off = 0.0 if q is None or self._start is None else float(np.abs(q - self._start).max())
-        return replace(
-            shown,
-            board=board.welcome.board,
-            state=state,
-            stopped=self._stopped(),
-            moves=True,
-            lacks=board.abilities.missing,
-            faults=faults,
-            away=off > start_rad(board.abilities),
-            error_mm=tuple((round(t, 3), round(e, 4), c) for t, e, c in list(self._chart)),
-        )
+        chart = tuple((round(t, 3), round(e, 4), c) for t, e, c in list(self._chart))
+        shown = replace(shown, lacks=board.abilities.missing, away=off > start_rad(board.abilities), error_mm=chart)
+        shown = replace(shown, board=board.welcome.board, state=state, faults=faults)
+        return replace(shown, stopped=self._stopped(), moves=True)
 
     def _command(self) -> str:
         options, measuring = self.shared.options, self._measuring

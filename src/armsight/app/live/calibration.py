@@ -406,18 +406,14 @@ class CalibrationStep(Guided[CalibrationState]):
         if time.monotonic() - newest_s > 1.0:
             newest = None
         still = 0.0 if newest is None else self._stillness()
-        return replace(
-            self.shown,
-            shots=tuple(self._shots),
-            left_out=tuple(f"shot {name}: {reason}" for name, reason in self._left_out.items()),
-            instruction=self.shown.instruction if self.shown.running or self.shown.ended else "",
-            still=still,
-            coverage=() if self._sizes is None else self._coverage(self._sizes),
-            aim_mm=1e3 * self.aim.error_m,
-            distance_m=self.aim.distance_m,
-            command=self._command(),
-            drawn=self._drawings(newest if still > 0.15 else None) if self.shown.running else (),
-        )
+        left_out = tuple(f"shot {name}: {reason}" for name, reason in self._left_out.items())
+        coverage, aim = () if self._sizes is None else self._coverage(self._sizes), self.aim
+        shown = replace(self.shown, shots=tuple(self._shots), left_out=left_out, still=still, coverage=coverage)
+        if shown.running:
+            shown = replace(shown, drawn=self._drawings(newest if still > 0.15 else None))
+        elif not shown.ended:
+            shown = replace(shown, instruction="")
+        return replace(shown, aim_mm=1e3 * aim.error_m, distance_m=aim.distance_m, command=self._command())
 
     def _coverage(self, sizes: Sizes) -> tuple[tuple[tuple[int, ...], ...], ...]:
         """Return, for each camera, rows of cells: in how many shots corners of the board were in it."""

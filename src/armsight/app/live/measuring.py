@@ -404,19 +404,15 @@ class MeasureStep(PageStep[MeasureState]):
         command = f"armsight measure {path} --target {body.spec} --source {source} -o poses.csv"
         if self.shared.simulated is not None:  # no camera: the workcell is measured by a run
             command = f"armsight run --rig {path} --target {body.spec} --source {source} --board emulated: -o run"
-        return replace(
-            shown,
-            ready=True,
-            rate_hz=(len(self._times) - 1) / span if span > 0 else None,
-            latency_ms=None if latency is None else (latency[0], latency[1]),
-            missed=tuple(self._missed.most_common(5)),
-            relative=self._zero is not None,
-            pivot=shown.pivot if self._pivot_poses is None else _pivoting(self._pivot_poses),
-            pivoting=self._pivot_poses is not None,
-            recording=None if recording is None else f"{recording.path.name}: {recording.rows} poses",
-            scene=self._scene(rig, p_body),
-            command=command,
-        )
+        if latency is not None:
+            shown = replace(shown, latency_ms=(latency[0], latency[1]))
+        if (pivoting := self._pivot_poses) is not None:
+            shown = replace(shown, pivot=_pivoting(pivoting), pivoting=True)
+        if recording is not None:
+            shown = replace(shown, recording=f"{recording.path.name}: {recording.rows} poses")
+        rate_hz, missed = (len(self._times) - 1) / span if span > 0 else None, tuple(self._missed.most_common(5))
+        shown = replace(shown, rate_hz=rate_hz, missed=missed, relative=self._zero is not None)
+        return replace(shown, ready=True, scene=self._scene(rig, p_body), command=command)
 
     def _distance(self, pose: PoseEstimate) -> tuple[float, float] | None:
         """Return the distance from the mark and its sigma by the noise of both poses, mm."""

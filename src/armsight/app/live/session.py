@@ -158,16 +158,10 @@ class LiveSession:
         if not 0 < len(name.strip()) <= _NAME:
             raise InputError(f"a name of 1 to {_NAME} characters is needed")
         aim, options = self.calibration.aim, self.shared.options
-        self._settings[name.strip()] = {
-            "cameras": self.shared.source,
-            "board": self.calibration.spec,
-            "error_mm": 1e3 * aim.error_m,
-            "distance_m": aim.distance_m,
-            "body": self.measuring.target_spec,
-            "arm": options.arm,
-            "arm_board": options.board,
-            "motion": str(self.shared.motion),
-        }
+        chosen = {"cameras": self.shared.source, "board": self.calibration.spec, "body": self.measuring.target_spec}
+        chosen |= {"arm": options.arm, "arm_board": options.board, "motion": str(self.shared.motion)}
+        numbers = {"error_mm": 1e3 * aim.error_m, "distance_m": aim.distance_m}
+        self._settings[name.strip()] = {**chosen, **numbers}
         kept = {"version": VERSION, "settings": self._settings}
         write_text(self.folder / SETTINGS, json.dumps(kept, indent=1) + "\n")
         self.say("good", f"settings kept: {name.strip()}")

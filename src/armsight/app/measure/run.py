@@ -14,9 +14,8 @@ import click
 import numpy as np
 
 from armsight.app.measure.command import MeasureOptions
-from armsight.app.measure.moving import Requested, requested_shutters
 from armsight.app.measure.picture import SINGULAR
-from armsight.app.measure.shots import DetectedShots, ImageShots, NamedShots, Result
+from armsight.app.measure.shots import DetectedShots, ImageShots, NamedShots, Requested, Result, requested_shutters
 from armsight.app.measure.view import CHART, PictureFolder, view_folder
 from armsight.app.options import DETECTIONS
 from armsight.app.progress import bar

@@ -1,11 +1,18 @@
-"""What ``armsight measure`` measures: images of a target, or detections of a body; each gives shots with their results."""
+"""What ``armsight measure`` measures: images of a target, or detections of a body; each gives shots with their results.
+
+A recording of a moving body before cameras that do not expose at one time is measured twice: first as if all exposures were
+simultaneous, with a wide gate, from which skew and readout are found where they are not given; then with every detection
+moved to its shot's time.
+"""
 
 from __future__ import annotations
 
+import itertools
 import json
+import re
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -13,12 +20,11 @@ import click
 import numpy as np
 
 from armsight.app.measure.command import MeasureOptions
-from armsight.app.measure.moving import NOTED_SHOTS, Requested, moved_results, skew_finding
 from armsight.app.show.messages import note
 from armsight.data import SIDES, Body, Image, Missed, PoseEstimate, Shot
 from armsight.errors import InputError
 from armsight.files import check_writable
-from armsight.loop.health import HealthFinding
+from armsight.loop.finding import HealthFinding, make_finding
 from armsight.vision.detections import NAMED, SeenShot, read_detections
 from armsight.vision.follow.follower import Follower, follows
 from armsight.vision.image import grey, one_image
@@ -30,7 +36,7 @@ from armsight.vision.markers.targets import open_body, open_target
 from armsight.vision.pose.measure import measure, measure_seen, size_problem
 from armsight.vision.pose.noise import DiscNoise
 from armsight.vision.pose.shot_pose import ShotPose
-from armsight.vision.pose.shutter import LOOSE_PX
+from armsight.vision.pose.shutter import LOOSE_PX, TimedShot, estimate_shutters, measure_moving
 from armsight.vision.rig import Shutters, StereoRig
 from armsight.vision.sources import Source, notes_of, open_source
 from armsight.vision.sources.folder import INDEX
@@ -38,6 +44,89 @@ from armsight.vision.sources.pairs import StoredSource
 
 #: So much a board that looks the same when it is rotated may be rotated less than by that, degrees.
 _ROTATED_SPARE_DEG = 35.0
+
+
+_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
+#: A skew beyond so many sigmas, and so many seconds, is said; from the first so many shots.
+_NOTED_SIGMAS, _NOTED_S, NOTED_SHOTS = 5.0, 1e-4, 200
+
+
+@dataclass(frozen=True)
+class Requested:
+    """What a user requests of the shutters; None is to be found."""
+
+    skew_s: float | None
+    readout_s: float | None
+
+
+def requested_shutters(skew: str | None, readout: str | None) -> Requested | None:
+    """Read ``--skew`` and ``--readout``; None where neither is given. Where only one is, the skew is found, no readout."""
+    if skew is None and readout is None:
+        return None
+    found = Requested(_seconds("--skew", skew or "find"), _seconds("--readout", readout or "0ms"))
+    if found.readout_s is not None and found.readout_s < 0:
+        raise InputError(f"--readout {readout}: must not be below zero")
+    if found.readout_s is None and found.skew_s is not None:
+        raise InputError("--readout find needs --skew find: both are found together")
+    return found
+
+
+def _seconds(option: str, text: str) -> float | None:
+    if text.strip() == "find":
+        return None
+    match = re.fullmatch(r"([+-]?\d*\.?\d+)\s*(s|ms|us)", text.strip())
+    if match is None:
+        raise InputError(f"{option} {text!r}: expected a time with its unit, such as 5ms, or find")
+    return float(match[1]) * _UNITS[match[2]]
+
+
+def moved_results(
+    rig: StereoRig,
+    body: Body,
+    first: Sequence[tuple[float | None, PoseEstimate | Missed]],
+    requested: Requested | Shutters,
+) -> tuple[list[tuple[PoseEstimate | Missed, bool]], Shutters]:
+    """Return the result of every shot with its detections moved to its time, and whether they were; and the shutters.
+
+    ``first``: time, s, and result of every shot as measured; ``requested``: shutters, or which are to be found.
+    """
+    if any(t_s is None and isinstance(result, PoseEstimate) for t_s, result in first):
+        why = "these shots have no times, so nothing is known of the body's motion between two exposures"
+        raise InputError(f"{why}: record them with `armsight record`, or give a video")
+    shots = _timed(first)
+    shutters = requested if isinstance(requested, Shutters) else _shutters(rig, body, shots, requested)
+    moved = iter(measure_moving(rig, body, shots, shutters))
+    return [next(moved) if isinstance(result, PoseEstimate) else (result, False) for _, result in first], shutters
+
+
+def _timed(first: Sequence[tuple[float | None, PoseEstimate | Missed]]) -> list[TimedShot]:
+    measured = [(t_s, r) for t_s, r in first if t_s is not None and isinstance(r, PoseEstimate)]
+    return [TimedShot(t_s, r.points.seen, r.T_left_body) for t_s, r in measured]
+
+
+def _shutters(rig: StereoRig, body: Body, shots: Sequence[TimedShot], requested: Requested) -> Shutters:
+    """Return the shutters that a user requests, found where they are not given."""
+    given = Shutters(requested.skew_s or 0.0, requested.readout_s or 0.0, np.zeros((2, 2)))
+    if requested.skew_s is not None:
+        return given
+    found = estimate_shutters(rig, body, shots, known=given, readout=requested.readout_s is None)
+    if isinstance(found, Missed):
+        raise InputError(f"the skew of the cameras cannot be found: {found.reason}; or give it: --skew 5ms")
+    return found
+
+
+def skew_finding(
+    rig: StereoRig, body: Body, first: Sequence[tuple[float | None, PoseEstimate | Missed]]
+) -> HealthFinding | None:
+    """Return what is wrong where shots that were measured as simultaneous show that they are not, or None."""
+    shots = _timed(first)
+    if any(b.t_s <= a.t_s for a, b in itertools.pairwise(shots)):
+        return None
+    found = estimate_shutters(rig, body, shots) if shots else Missed("")
+    if not isinstance(found, Shutters) or abs(found.skew_s) <= max(_NOTED_SIGMAS * found.sigmas[0], _NOTED_S):
+        return None
+    evidence = found.skew_s, float(found.sigmas[0])
+    return make_finding("shutters", evidence, shots[0].t_s, words={"shutters": str(found)})
 
 
 @dataclass(frozen=True)

@@ -129,9 +129,8 @@ def _run_logged(
 ) -> None:
     import contextlib
 
-    from armsight.app.run.angles import read_angles
     from armsight.app.run.folder import open_folder
-    from armsight.app.run.logged import run_logged, summary_lines, write_logged
+    from armsight.app.run.logged import read_angles, run_logged, summary_lines, write_logged
     from armsight.app.show.plotting import require_matplotlib
     from armsight.robot.arm_file import open_arm
     from armsight.vision.markers.targets import open_target

@@ -17,6 +17,7 @@ from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import click
@@ -24,16 +25,7 @@ import numpy as np
 
 from armsight.app.show.encode import jpeg
 from armsight.app.show.messages import say
-from armsight.app.stream.cell_file import (
-    ANSWER_S,
-    LONGEST,
-    STATE_S,
-    Cell,
-    hold_bytes,
-    read_cell,
-    signed_by,
-    zenoh_config,
-)
+from armsight.app.stream.cell_file import ANSWER_S, LONGEST, STATE_S, Cell, is_signed, read_cell, zenoh_config
 from armsight.app.stream.datum import Published, json_text
 from armsight.app.stream.outbox import Outbox, state_folder
 from armsight.app.stream.sink import CLOSE_S, Sink
@@ -238,18 +230,13 @@ class CellSink(Sink):
         rig, arm = self._published.rig, self._published.arm
         heldout = None if rig is None else rig.provenance.get("heldout_rigid_rms_m")
         heldout_mm = 1e3 * heldout if isinstance(heldout, int | float) else None
-        return {
-            "armsight": importlib.metadata.version("armsight"),
-            "host": socket.gethostname(),
-            "mode": self._mode,
-            "arm": None if arm is None else arm.name,
-            "body": self._published.body.name or None,
-            "rig_made_utc": None if rig is None else rig.provenance.get("made_utc"),
-            "rig_heldout_mm": None if heldout_mm is None else round(heldout_mm, 4),
-            "limit_mm": None if heldout_mm is None else round(_LIMIT * heldout_mm, 4),
-            "holds": self._cell.holds,
-            "alive_s": round(time.monotonic() - self._began, 1),
-        }
+        version = importlib.metadata.version("armsight")
+        found: dict[str, Any] = {"armsight": version, "host": socket.gethostname(), "mode": self._mode}
+        found |= {"arm": None if arm is None else arm.name, "body": self._published.body.name or None}
+        found |= {"rig_made_utc": None if rig is None else rig.provenance.get("made_utc"), "holds": self._cell.holds}
+        for name, times in (("rig_heldout_mm", 1.0), ("limit_mm", _LIMIT)):
+            found[name] = None if heldout_mm is None else round(times * heldout_mm, 4)
+        return {**found, "alive_s": round(time.monotonic() - self._began, 1)}
 
     def _posting(self) -> None:
         unheard_s, notes = math.inf, set[str]()
@@ -280,15 +267,13 @@ class CellSink(Sink):
 
         session, before = zenoh.open(self._config), threading.enumerate()
         topic = self._cell.topic
-        self._declared = [
-            session.declare_queryable(
-                topic("about"), lambda query: query.reply(topic("about"), json_text(self.about()))
-            ),
-            session.declare_queryable(topic("image"), lambda query: query.reply(topic("image"), self._image())),
-            session.declare_queryable(topic("shots"), lambda query: query.reply(topic("shots"), self._shots_kept())),
-            session.declare_queryable(topic("hold"), lambda query: query.reply(topic("hold"), self._hold(query))),
-            session.liveliness().declare_token(topic("alive", str(session.zid()))),
-        ]
+        answers: dict[str, Callable[[Any], bytes]] = {"about": lambda _: json_text(self.about()), "hold": self._hold}
+        answers |= {"image": lambda _: self._image(), "shots": lambda _: self._shots_kept()}
+        declared = list[Any]()
+        for name, answer in answers.items():
+            reply = partial(lambda at, answer, query: query.reply(at, answer(query)), topic(name), answer)
+            declared.append(session.declare_queryable(topic(name), reply))
+        self._declared = [*declared, session.liveliness().declare_token(topic("alive", str(session.zid())))]
         # Threads that answer; they are daemons as this one is, so that Python does not wait for them by itself.
         self._answering = [each for each in threading.enumerate() if each not in before]
         self._session = session
@@ -346,7 +331,7 @@ class CellSink(Sink):
         with as_input_error("it is no request to hold", ValueError, KeyError, TypeError):
             request = json.loads(payload)
             t, text, signature = float(request["t"]), str(request["text"]), bytes.fromhex(request["signature"])
-        if not signed_by(self._cell.ca, signature, hold_bytes(self._cell.site, self._cell.name, t, text)):
+        if not is_signed(self._cell, t, text, signature):
             raise InputError("it is not signed by the key of this site")
         if not abs(time.time() - t) < _FRESH_S or t < self._began_utc:
             raise InputError(f"it is of {t - time.time():+.0f} s by this cell's clock: it is old, or a clock is wrong")

@@ -133,16 +133,17 @@ def certificate(path: Path, *, ended: bool = False) -> x509.Certificate:
     return found
 
 
-def signed_by(ca: Path, signature: bytes, data: bytes) -> bool:
-    """Whether the key of a site's certificate signed bytes."""
+def is_signed(cell: Cell, t: float, text: str, signature: bytes) -> bool:
+    """Whether the key of the site's certificate signed a request to hold."""
     from cryptography.exceptions import InvalidSignature
     from cryptography.hazmat.primitives import hashes
     from cryptography.hazmat.primitives.asymmetric import ec
 
-    public = certificate(ca, ended=True).public_key()
+    assert cell.ca is not None
+    public = certificate(cell.ca, ended=True).public_key()
     try:
         assert isinstance(public, ec.EllipticCurvePublicKey)
-        public.verify(signature, data, ec.ECDSA(hashes.SHA256()))
+        public.verify(signature, hold_bytes(cell.site, cell.name, t, text), ec.ECDSA(hashes.SHA256()))
     except InvalidSignature:
         return False
     return True
