@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -234,8 +234,7 @@ def plan(
     if extent.min() < _NARROW_M:
         lost = "zeros, base and tool, and lengths will hardly be distinguished"
         note(f"{around} saw the body over only {size}: {lost}; first record a run whose hand-eye poses cover more")
-    answer: dict[str, Any] = {"arm": arm.name, "poses": poses, "cycles": cycles}
-    answer |= {"extent_m": extent.tolist(), "output": str(output)}
+    answer = {"arm": arm.name, "poses": poses, "cycles": cycles, "extent_m": extent.tolist(), "output": str(output)}
     _print((answer, [f"{output}: {poses} poses over {size}"]), as_json)
 
 

@@ -300,14 +300,8 @@ def _one_size(sizes: _Sizes | None, images: tuple[Grey, Grey], files: tuple[Path
 
 def provenance(given: dict[str, str], calibration: Calibration) -> dict[str, Any]:
     """Return how the rig was made, as its file records it."""
-    h = calibration.held_out
-    return {
-        "made_by": f"armsight {importlib.metadata.version('armsight')} calibrate, OpenCV {cv2.__version__}",
-        "made_utc": datetime.now(UTC).isoformat(timespec="seconds"),
-        **given,
-        "pairs_used": len(calibration.pairs),
-        "heldout_epipolar_rms_px": h.epipolar_rms_px,
-        "heldout_rigid_rms_m": h.rigid_rms_m,
-        "heldout_scale_error": h.scale_error,
-        **({CONTRADICTED: round(h.epipolar_rms_px, 2)} if contradicted(calibration) else {}),
-    }
+    h, version = calibration.held_out, importlib.metadata.version("armsight")
+    made: dict[str, Any] = {"made_by": f"armsight {version} calibrate, OpenCV {cv2.__version__}"}
+    made |= {"made_utc": datetime.now(UTC).isoformat(timespec="seconds"), **given, "pairs_used": len(calibration.pairs)}
+    made |= {f"heldout_{key}": getattr(h, key) for key in ("epipolar_rms_px", "rigid_rms_m", "scale_error")}
+    return made | ({CONTRADICTED: round(h.epipolar_rms_px, 2)} if contradicted(calibration) else {})

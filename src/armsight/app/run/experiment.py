@@ -99,9 +99,7 @@ def require_followed(rig: StereoRig, path: Path) -> None:
     """Reject a rig that cannot be followed, as its file does not say how well it is known."""
     if not rig.cov.any():
         mend = "calibrate it (armsight calibrate), or leave out --follow-rig"
-        raise InputError(
-            f"--follow-rig: {path} has no covariance: a rig that moved looks like one poorly known: {mend}"
-        )
+        raise InputError(f"--follow-rig: {path} has no covariance: a moved rig looks like one poorly known: {mend}")
 
 
 def passed(way: Trajectory) -> Array:

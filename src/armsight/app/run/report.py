@@ -93,9 +93,7 @@ def report_of(
         if before is not None and (occlusion := _occlusion(before, result.covered_s)) is not None:
             values["occlusion"] = occlusion
             most = f"{1e3 * occlusion['fused_position_max_m']:.2f} mm at most"
-            lines.append(
-                f"body hidden for {occlusion['duration_s']:g} s in motion: the fused estimate was off by {most}"
-            )
+            lines.append(f"body hidden for {occlusion['duration_s']:g} s in motion: the estimate was off by {most}")
         if result.open_s is not None and (alone := _odometry(tracks.between(*result.open_s, most=_MOST), tracks.arm)):
             values["odometry"] = alone._asdict()
             lines.append(alone.line)

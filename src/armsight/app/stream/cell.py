@@ -181,15 +181,11 @@ class CellSink(Sink):
     def _put_state(self) -> None:
         now, window, motors = time.monotonic(), self._window, self._published.temperatures_c
         celsius = None if motors is None else motors()
-        state = {
-            "t": round(time.time(), 3),
-            "mode": self._mode,
-            "rate_hz": round(window.shots / max(now - self._state_at, 1e-3), 2),
-            "shots": self._shots,
-            **window.state(),
-            "temperature_c": None if celsius is None else round(float(celsius.max()), 1),
-            "health": [each[:300] for each in self._findings[:_FINDINGS]],
-        }
+        state: dict[str, Any] = {"t": round(time.time(), 3), "mode": self._mode, "shots": self._shots}
+        state |= window.state()
+        state["rate_hz"] = round(window.shots / max(now - self._state_at, 1e-3), 2)
+        state["temperature_c"] = None if celsius is None else round(float(celsius.max()), 1)
+        state["health"] = [each[:300] for each in self._findings[:_FINDINGS]]
         self._window, self._state_at = _Window(), now
         if self._session is not None:
             # No declared publisher: with access control it would drop all (zenoh 1.10; findings/zenoh_acl_subscriber.sh).

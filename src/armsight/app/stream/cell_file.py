@@ -163,14 +163,8 @@ def zenoh_config(mode: str, end: str, keys: Sequence[Path | None] = (None,)) -> 
     import zenoh
 
     config, way = zenoh.Config(), {"client": "connect", "router": "listen"}[mode]
-    settings: dict[str, Any] = {
-        "mode": mode,
-        "scouting/multicast/enabled": False,
-        "scouting/gossip/enabled": False,
-        "listen/endpoints": [],
-        f"{way}/endpoints": [end],
-        "connect/timeout_ms": 1000,
-    }
+    settings: dict[str, Any] = {f"scouting/{kind}/enabled": False for kind in ("multicast", "gossip")}
+    settings |= {"mode": mode, "connect/timeout_ms": 1000, "listen/endpoints": [], f"{way}/endpoints": [end]}
     if keys[0] is not None:
         files = zip(("root_ca_certificate", f"{way}_certificate", f"{way}_private_key"), map(str, keys), strict=True)
         settings["transport/link/tls"] = {"enable_mtls": True, **dict(files)}

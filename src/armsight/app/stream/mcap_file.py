@@ -342,15 +342,10 @@ class McapWriter:
         self.flush()
         self._write(self._bytes(self._records.DataEnd(data_section_crc=0)))
         begin, offsets = self._at, []
-        groups = (
-            (_SCHEMAS, self._schemas),
-            (_CHANNEL, self._channels),
-            (_STATISTICS, [self._statistics()]),
-            (_CHUNK_INDEX, self._chunk_indexes),
-            (_METADATA_INDEX, self._metadata_indexes),
-        )
+        groups = {_SCHEMAS: self._schemas, _CHANNEL: self._channels, _STATISTICS: [self._statistics()]}
+        groups |= {_CHUNK_INDEX: self._chunk_indexes, _METADATA_INDEX: self._metadata_indexes}
         summary = b""
-        for opcode, records in groups:
+        for opcode, records in groups.items():
             data = b"".join(self._bytes(record) for record in records)
             offsets.append(self._records.SummaryOffset(opcode, begin + len(summary), len(data)))
             summary += data
