@@ -54,8 +54,7 @@
 #define SEEN_RAD_S 0.5f /* rad/s, above a motor's speed in one tick by noise: no slower limit is held by it; half:
                            noise brakes, double: slow joints go beyond theirs */
 #define SIDE_UNKNOWN 0
-#define REVERSAL_TICKS 64u /* in a longer window a joint may have reversed and come back; half: less is learnt, double:
-                              backlash teaches */
+#define REVERSAL_TICKS 64u /* in a longer window a joint may have reversed and come back; half: less is learnt, double: backlash teaches */
 #define DEAD_SHARE 0.05f /* of what the voltage could drive: a smaller current of late is none; half: dead sensors show
                             later, double: unloaded joints look dead */
 #define SETTLE_TICKS 3u /* after the windings were closed, currents are not yet known; half: the first current is
@@ -144,7 +143,8 @@ static void earn(motor_state *motor, const motor_config *config, float way_rad)
 static float window_noise(motor_state *motor, const motor_config *config, float way_rad)
 {
     const bool moved = number_size(way_rad) > WINDOW_WAY_RAD;
-    const int32_t side = moved ? (way_rad > 0.0f ? 1 : -1) : SIDE_UNKNOWN;
+    const int32_t pulled = motor->window_ir_v > 0.0f ? 1 : 2; /* a torque that changes its sign moves the teeth, too */
+    const int32_t side = moved ? (way_rad > 0.0f ? pulled : -pulled) : SIDE_UNKNOWN;
     const bool goes_on = side == motor->window_side && moved && motor->window_ticks <= REVERSAL_TICKS;
     motor->window_side = side;
     const float crossed = goes_on ? 0.0f : moved ? 1.0f : RESTING;

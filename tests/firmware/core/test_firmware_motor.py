@@ -231,6 +231,7 @@ def test_elastic_joints_are_held_and_not_taken_for_broken_ones(arms, library):
     # One whose gains have no kd goes beyond its limit, another's current steps with the noise as it is enabled.
     for seed in (740002234486, 861002599911):
         arms.softest(library, seed, table)
+    arms.elastic(library, 862002598254, table)  # its teeth change sides while it moves, which taught a resistance
     assert not sum(table.false.values())
 
 
