@@ -130,3 +130,11 @@ def test_a_pair_all_of_whose_corners_are_gross_errors_is_rejected():
     mixed = [Pair(p.name, p.left, q.right) for p, q in zip(pairs, pairs[1:] + pairs[:1], strict=True)]
     found = calibrate_boards(board, pairs[:14] + mixed[14:], SIZES, models=("brown4",), folds=2)
     assert not {p.name for p in pairs[14:]} & set(found.pairs)
+
+
+@pytest.mark.parametrize(("longer", "named"), [(1.01, True), (1.0, False)])
+def test_a_print_that_is_longer_one_way_is_named(longer, named):
+    true, board, Ts = rig_and_board("brown4", count=COUNT, seed=901)
+    pairs = board_pairs(true, board.body.points * [longer, 1, 1], Ts, seed=1)
+    found = calibrate_boards(board, pairs, SIZES, models=("brown4",), folds=2)
+    assert any("longer one way than the other" in weak for weak in found.weaknesses) == named

@@ -13,10 +13,8 @@ import numpy as np
 
 from armsight.app.show.report import Grade
 from armsight.data import Array, Record
-from armsight.errors import InputError
 from armsight.geometry.pose import transform
 from armsight.vision.calibrate.result import Calibration, corner_variance_px2
-from armsight.vision.markers.board import open_board
 from armsight.vision.rig import StereoRig
 from armsight.vision.triangulate import optimal_points
 
@@ -120,18 +118,9 @@ class GradedMetric:
     advice: str = ""  #: what to do where it is not good; may be empty
 
 
-def target_drawing(calibration: Calibration) -> Array | None:
-    """Return (M, 3) the drawing of the calibration target, m; None where the calibration is from a body of markers."""
-    try:
-        points = open_board(calibration.body.name).body.points
-    except InputError:
-        return None
-    return points if points.shape == calibration.body.points.shape else None
-
-
 def target(calibration: Calibration) -> str:
     """Return what the cameras were shown: body or target."""
-    return "body" if target_drawing(calibration) is None else "target"
+    return "body" if calibration.drawing is None else "target"
 
 
 def distance_m(calibration: Calibration) -> float:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.interpolate import griddata
 
-from armsight.app.calibrate.assessment import HELD_M, SHARES, target_drawing, target_points, volume_slice
+from armsight.app.calibrate.assessment import HELD_M, SHARES, target_points, volume_slice
 from armsight.app.show.plotting import BLUE, EMPTY, INK, MUTED, ORANGE, RED, WIDTH_IN, arrows, new_figure, nice, plain
 from armsight.data import SIDES, Array
 from armsight.vision.calibrate.result import Calibration
@@ -92,7 +92,7 @@ def round_steps(low: float, high: float) -> list[float]:
 
 def target_figure(calibration: Calibration) -> Figure | None:
     """Plot the target's estimated deviation from its drawing, mm: colour out of the plane, arrows within; None without."""
-    drawing = target_drawing(calibration)
+    drawing = calibration.drawing
     if drawing is None or calibration.deviation_m < HELD_M:
         return None
     at, off = 1e3 * drawing[:, :2], 1e3 * (calibration.body.points - drawing)

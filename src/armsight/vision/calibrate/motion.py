@@ -108,11 +108,12 @@ class CameraChange(Record):
 
 
 def _condensed(
-    model: BundleModel, solution: BundleSolution, seen: Observations, free: NDArray[np.bool_]
+    model: BundleModel, solution: BundleSolution, seen: Observations, free: NDArray[np.bool_] | None = None
 ) -> tuple[Array, Array]:
     """Return P + 1 residuals of each shot, (S, P + 1), that say all it says of the rig, and their derivative.
 
-    They are whitened, and by the P free parameters of the rig; the shot's own are eliminated.
+    They are whitened, and by the P free parameters of the rig; the shot's own are eliminated. The axes of the relative
+    position are :func:`_baseline_axes`.
     """
     uv, by_shared, by_own = predict(model, solution.state, seen)
     W, count = whiteners(seen, solution.sigma_px), by_shared.shape[2] - len(model.modes)
@@ -131,11 +132,13 @@ def _condensed(
         total[:, -1, ours] -= pull
         total[:, -1, -1] += (pull * solution.state.motions).sum(axis=1)
     left = total[:, own:, own:] - total[:, own:, :own] @ np.linalg.solve(total[:, :own, :own], total[:, :own, own:])
-    kept = np.append(free, True)
-    left = left[:, kept][:, :, kept]
+    if free is not None:
+        kept = np.append(free, True)
+        left = left[:, kept][:, :, kept]
     unit = 1 / np.sqrt(np.maximum(np.einsum("sii->i", left), 1e-300))
     values, axes = np.linalg.eigh(unit[:, None] * left * unit)
     rows = np.sqrt(np.maximum(values, 0.0))[..., None] * axes.swapaxes(1, 2) / unit
+    rows[:, :, -7:-4] = rows[:, :, -7:-4] @ _baseline_axes(solution.state.T_left_right)
     return rows[:, :, -1], rows[:, :, :-1]
 
 
@@ -152,19 +155,14 @@ def other_size(model: BundleModel, start: BundleSolution, seen: Observations, pa
     Each pair shows its board's size beside the distance of the cameras alone. That the start leaves less than half of its
     error if the later boards may be of another size shows it.
     """
-    free, state = np.ones(sum(camera.parameters.size for camera in start.state.cameras) + 6, bool), start.state
-    e, J = _condensed(model, start, seen, free)
-    along = J[:, :, -6:-3] @ _baseline_axes(state.T_left_right)[:, :1]
-    poses = state.Ts_left_body[:pairs, :3, 3]
-    J = np.concatenate([J[:, :, :-6], along, J[:, :, -3:]], axis=2)
-    found = changed(e, J, {SIZE: np.array([J.shape[2] - 4])}, poses, count=pairs)
+    state, count = start.state, len(model.points)
+    e, J = _condensed(model, start, seen)
+    found = changed(e, J, {SIZE: np.array([J.shape[2] - 6])}, state.Ts_left_body[:pairs, :3, 3], count=pairs)
     if found is None:
         return None
-    none = np.zeros_like(model.points)
-    points, modes = np.vstack([model.points] * 2), np.vstack([none, model.points])[None]
-    both = replace(model, points=points, modes=modes, shape_sigma_m=1.0)
-    seen = replace(seen, point=seen.point + len(none) * (seen.shot >= found.row))
-    state = replace(state, shape=np.zeros(1))
+    points, modes = np.vstack([model.points] * 2), np.vstack([0 * model.points, model.points])[None]
+    both, state = replace(model, points=points, modes=modes, shape_sigma_m=1.0), replace(state, shape=np.zeros(1))
+    seen = replace(seen, point=seen.point + count * (seen.shot >= found.row))
     for sigma_px in (5.0, start.sigma_px):
         fitted = minimise(both, state, seen, sigma_px, covariance=False)
         state = fitted.state
@@ -189,12 +187,10 @@ def change_of(
     sight = middle[:, :2] / middle[:, 2:]
     off_axis = np.linalg.norm(sight - sight[:pairs].mean(axis=0), axis=1)
     poses = np.column_stack([sight, np.log(middle[:, 2]), solution.state.Ts_left_body[:, :2, 2], off_axis])
-    e, J = _condensed(model, solution, seen, free)
-    J[:, :, -6:-3] = J[:, :, -6:-3] @ (axes := _baseline_axes(rig.T_left_right))
-    found = changed(e, J, ways, poses, count=pairs)
-    if found is None:
+    if (found := changed(*_condensed(model, solution, seen, free), ways, poses, count=pairs)) is None:
         return None
-    off = np.concatenate([found.off[:, :-6], found.off[:, -6:-3] @ axes.T, found.off[:, -3:]], axis=1)
+    off, axes = found.off.copy(), _baseline_axes(rig.T_left_right)
+    off[:, -6:-3] = off[:, -6:-3] @ axes.T
     if not matters(found := replace(found, off=off).over_all(free), rig.cov):
         return None
     off, p = found.off, named[found.way]

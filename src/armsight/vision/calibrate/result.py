@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from armsight.data import Array, Body, Record
+from armsight.errors import InputError
 from armsight.plots import new_figure
 from armsight.vision.calibrate.motion import CameraChange, ExposureMotion
+from armsight.vision.markers.board import open_board
 from armsight.vision.pose.bundle import BundleSolution, Observations
 from armsight.vision.rig import StereoRig
 
@@ -102,6 +105,14 @@ class Calibration(Record):
         axes[0].set(ylabel="board's points, mm RMS", title="errors of pairs left out of the fit")
         axes[1].set(ylabel="epipolar, px RMS", xlabel="pair")
         return figure
+
+    @property
+    def drawing(self) -> Array | None:
+        """(M, 3) the drawing of the calibration target, m; None where the calibration is from a body of markers."""
+        with contextlib.suppress(InputError):
+            points = open_board(self.body.name).body.points
+            return points if points.shape == self.body.points.shape else None
+        return None
 
     @property
     def reprojection_rms_px(self) -> float:

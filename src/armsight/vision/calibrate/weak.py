@@ -23,6 +23,9 @@ _SCALE_SIGMAS = 4.0
 _REJECTED_SHARE = 0.2
 #: Held-out epipolar RMS, as a share of an image's longer side, beyond which the images do not belong to two cameras.
 _CONTRADICTION = 0.005
+#: By which share a print may be longer one way than the other. Half: ordinary printers' feeds are named; double: sigmas of
+#: a good rig are too small by ten times.
+_LONGER = 0.002
 #: How many times as large as what boards moved between exposures it may be.
 _OF_MOTION = 3.0
 #: By which share of their distance points may move where pairs fit other cameras: beyond, sigmas cannot hold it. Half: a
@@ -41,7 +44,7 @@ _FIELD_DEGREE, _FIELD_SHARE, _FIELD_CHANCE = 4, 0.04, 1e-4
 
 def weaknesses(calibration: Calibration) -> tuple[str, ...]:
     """Assess a calibration: one sentence per weakness, what it is and what to do; empty where nothing stands out."""
-    checks = [_agreement, _changed, _pairs, _focus, _synchrony, _sides]
+    checks = [_agreement, _changed, _print, _pairs, _focus, _synchrony, _sides]
     if calibration.rig.cov[0, 0] > 0:  # intrinsics were estimated, not given
         checks += [_tilts, _coverage, _focal, _scale]
     return tuple(message for check in checks if (message := check(calibration)) is not None)
@@ -98,6 +101,19 @@ def _changed(calibration: Calibration) -> str | None:
         f"{1e3 * change.shift_m:.2g} mm; the rig is of neither state, and its sigmas allow for that. Did a lens "
         "refocus, was a camera knocked, are images cropped or resized? It may also be another board or print, or one that "
         "moved between two exposures. Lock the lenses, and calibrate from the pairs of one state"
+    )
+
+
+def _print(calibration: Calibration) -> str | None:
+    if (drawing := calibration.drawing) is None:
+        return None
+    p, found = (each[:, :2] - each[:, :2].mean(axis=0) for each in (drawing, calibration.body.points))
+    longest, shortest = np.linalg.svd(np.linalg.lstsq(p, found)[0])[1]
+    if longest < (1 + _LONGER) * shortest:
+        return None
+    return (
+        f"the board is printed {100 * (longest / shortest - 1):.2g} % longer one way than the other: the scale of the rig "
+        "is known no better, which its sigmas do not hold; measure many squares both ways with a caliper"
     )
 
 

@@ -22,15 +22,10 @@ NOTHING, MEASURED, OCCLUDED, FILLED = range(4)
 
 @dataclass(frozen=True)
 class Search:
-    """The range of disparities that are tried.
+    """The range of disparities that are tried."""
 
-    Attributes:
-        first: the least, px.
-        count: how many, one pixel apart.
-    """
-
-    first: int
-    count: int
+    first: int  #: the least, px
+    count: int  #: how many, one pixel apart
 
     def __post_init__(self) -> None:
         """Reject an invalid range."""
@@ -47,24 +42,17 @@ class Search:
 
 @dataclass(frozen=True, eq=False)
 class Disparity(Record):
-    """A disparity for every pixel of the left image.
+    """A disparity for every pixel of the left image."""
 
-    Attributes:
-        disparity: (H, W) px, column in the left image less column in the right one; filled where it was not measured;
-            NaN everywhere where nothing at all was.
-        state: (H, W) NOTHING, MEASURED, OCCLUDED or FILLED.
-        sigma_px: (H, W) standard deviation where it was measured; NaN elsewhere.
-        confidence: (H, W) of 0 to 1: share of the neighbourhood that measured the same surface; 0 elsewhere.
-        search: which disparities were tried.
-        problem: why nothing was measured; None where something was.
-    """
-
+    #: (H, W) px, column in the left image less column in the right one; filled where it was not measured; NaN
+    #: everywhere where nothing at all was
     disparity: NDArray[np.float32]
-    state: NDArray[np.uint8]
-    sigma_px: NDArray[np.float32]
+    state: NDArray[np.uint8]  #: (H, W) NOTHING, MEASURED, OCCLUDED or FILLED
+    sigma_px: NDArray[np.float32]  #: (H, W) standard deviation where it was measured; NaN elsewhere
+    #: (H, W) of 0 to 1: share of the neighbourhood that measured the same surface; 0 elsewhere
     confidence: NDArray[np.float32]
-    search: Search
-    problem: str | None = None
+    search: Search  #: which disparities were tried
+    problem: str | None = None  #: why nothing was measured; None where something was
 
     @property
     def measured(self) -> NDArray[np.bool_]:

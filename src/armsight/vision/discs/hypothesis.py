@@ -36,21 +36,13 @@ Congruent: TypeAlias = tuple[NDArray[np.bool_], NDArray[np.bool_]]
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis(Record):
-    """A naming of detections and the pose that follows.
+    """A naming of detections and the pose that follows."""
 
-    Attributes:
-        rows: (M, 2) rows of the left and the right camera's discs, -1 where a disc was not seen.
-        T_left_body: (4, 4) the pose.
-        cov: (6, 6) covariance of its tangent, noise and calibration.
-        seen: ellipse centres by rows of the target's body.
-        score: logarithm of the Bayes factor against clutter.
-    """
-
-    rows: Ids
-    T_left_body: Array
-    cov: Array
-    seen: Correspondences
-    score: float
+    rows: Ids  #: (M, 2) rows of the left and the right camera's discs, -1 where a disc was not seen
+    T_left_body: Array  #: (4, 4) the pose
+    cov: Array  #: (6, 6) covariance of its tangent, noise and calibration
+    seen: Correspondences  #: ellipse centres by rows of the target's body
+    score: float  #: logarithm of the Bayes factor against clutter
 
     def contradicts(self, other: Hypothesis) -> bool:
         """Whether one disc is two detections, or one detection two discs."""

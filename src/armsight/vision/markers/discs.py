@@ -38,18 +38,12 @@ _KEPT = threading.local()
 
 @dataclass(frozen=True, eq=False)
 class DiscTarget(Record):
-    """The discs of a body.
+    """The discs of a body."""
 
-    Attributes:
-        body: their centres; their names.
-        radii_m: (M,) radii, m.
-        bright: (M,) whether a disc is brighter than what surrounds it.
-        normals: (M, 3) unit vectors out of the discs' faces, body frame; NaN where the body file does not give them.
-    """
-
-    body: Body
-    radii_m: Array
-    bright: NDArray[np.bool_]
+    body: Body  #: their centres; their names
+    radii_m: Array  #: (M,) radii, m
+    bright: NDArray[np.bool_]  #: (M,) whether a disc is brighter than what surrounds it
+    #: (M, 3) unit vectors out of the discs' faces, body frame; NaN where the body file does not give them
     normals: Array
 
     @staticmethod

@@ -48,40 +48,29 @@ _LEFT_BEHIND = ("timeshift_cam_imu", "rostopic")
 
 @dataclass(frozen=True)
 class ImportOptions:
-    """Values that a user may have to add to a foreign file.
+    """Values that a user may have to add to a foreign file."""
 
-    Attributes:
-        unit_m: length of the file's unit of translation, m; None where the file or the format says it.
-        image_size_px: (width, height); None where the file says it.
-        sigma_px: standard deviation of a detection, px.
-        pair: names of the left and the right camera, of a file that has more than two; None takes the first two.
-    """
-
+    #: length of the file's unit of translation, m; None where the file or the format says it
     unit_m: float | None = None
-    image_size_px: tuple[int, int] | None = None
-    sigma_px: float = ASSUMED_SIGMA_PX
+    image_size_px: tuple[int, int] | None = None  #: (width, height); None where the file says it
+    sigma_px: float = ASSUMED_SIGMA_PX  #: standard deviation of a detection, px
+    #: names of the left and the right camera, of a file that has more than two; None takes the first two
     pair: tuple[str, str] | None = None
 
 
 @dataclass(frozen=True)
 class RigFormat:
-    """One foreign format.
+    """One foreign format."""
 
-    Attributes:
-        title: what its files are, for messages: "a Kalibr camchain".
-        recognises: says by their content whether files are of this format.
-        read: returns the rig of files; its provenance says what was assumed and left behind. InputError: a file is damaged,
-            misses a key, or holds what armsight cannot; the message names the file.
-        write: writes a rig and returns what the format cannot hold, a line each; None where it is only read. InputError:
-            the rig does not fit the format, or a file cannot be written; no file is left half-written.
-        rectifies: whether the files that are written hold a rectification, which is computed with ALPHA.
-    """
-
-    title: str
-    recognises: Callable[[Sequence[Document]], bool]
+    title: str  #: what its files are, for messages: "a Kalibr camchain"
+    recognises: Callable[[Sequence[Document]], bool]  #: says by their content whether files are of this format
+    #: returns the rig of files; its provenance says what was assumed and left behind. InputError: a file is damaged,
+    #: misses a key, or holds what armsight cannot; the message names the file.
     read: Callable[[Sequence[Document], Sequence[Path], ImportOptions], StereoRig]
+    #: writes a rig and returns what the format cannot hold, a line each; None where it is only read. InputError: the
+    #: rig does not fit the format, or a file cannot be written; no file is left half-written.
     write: Callable[[StereoRig, Sequence[Path]], tuple[str, ...]] | None = None
-    rectifies: bool = False
+    rectifies: bool = False  #: whether the files that are written hold a rectification, which is computed with ALPHA
 
 
 def posed_format(
