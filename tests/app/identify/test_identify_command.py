@@ -113,7 +113,7 @@ def test_an_identified_arm_is_better_only_where_it_corrects_something_by_more_th
         held_out = Validation(*(HeldOut(each, np.zeros(0)) for each in off), False, 1.0)
         model = SimpleNamespace(parameters=[SimpleNamespace(kind="a")])
         found = SimpleNamespace(
-            model=model, solution=SimpleNamespace(free=np.array([fitted])), moved_all_over=lambda: (1.0, 0.0)
+            model=model, solution=SimpleNamespace(free=np.array([fitted])), moved_all_over=lambda: (1.0, 0.0), lacks=()
         )
         given = {"arm": SimpleNamespace(name="a"), "measured": None, "range_noise_m": None, "notes": ()}
         run = SimpleNamespace(held_out=held_out, how="poses", found=found, **given)

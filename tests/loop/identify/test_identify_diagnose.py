@@ -14,6 +14,7 @@ from armsight.loop.identify.identify import identify
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.misread import check_plausible, placed_change, points_off, without_tool
 from armsight.loop.identify.read import read_poses
+from armsight.loop.identify.validate import with_change_allowed
 from armsight.robot.arm_file import open_arm
 from armsight.tables.rotations import ROTATIONS
 
@@ -240,3 +241,28 @@ def test_a_base_that_was_displaced_between_two_poses_is_found():
     text = said(w, replace(measured, p_rig=p, R_rig_body=R))
     assert "base, or the instrument, was displaced" in text
     assert re.search("the first 1[456] poses", text)
+
+
+def test_a_coupled_joint_and_an_instrument_of_another_scale_are_named():
+    w, rng = worn(71, waves=0, backlash=False, compliance=False), np.random.default_rng(71)
+    q, sides = poses(w.nominal, 40, rng)
+    seen = w.seen(q, sides, rng)
+    read = q.copy()
+    read[:, 4] += 0.03 * q[:, 3]
+    coupled = replace(seen, q=read, p_rig=1.1 * seen.p_rig)
+    lacks = with_change_allowed(identify(w.nominal, coupled), coupled).lacks
+    assert len(lacks) == 2
+    assert "all lengths come out +1" in lacks[0]
+    assert "joint 5 seems to move by -0.0" in lacks[1]
+    assert "of the reading of joint 4" in lacks[1]
+    assert with_change_allowed(identify(w.nominal, seen), seen).lacks == ()
+
+
+@pytest.mark.parametrize("seed", [72, 73, 74])
+def test_a_wrong_sign_near_the_tool_is_named_though_positions_nearly_fit(seed):
+    w, rng = worn(seed), np.random.default_rng(seed)
+    seen = w.seen(*poses(w.nominal, 60, rng), rng)
+    points = replace(seen, R_rig_body=None, cov=None)
+    check_plausible(w.nominal, points)
+    with pytest.raises(InputError, match="the sign is wrong of joint 6"):
+        check_plausible(w.nominal, replace(points, q=points.q * [1, 1, 1, 1, 1, -1]))

@@ -260,7 +260,7 @@ def assess(run: Identification) -> tuple[Grade, str]:
         )
     if elsewhere := undetermined(*run.found.moved_all_over()):
         return "fair", f"Usable near these poses only: there {said}; {elsewhere}."
-    weak = [note for note in run.notes if "times as large as predicted" in note or "another state" in note]
+    weak = [*run.found.lacks, *(n for n in run.notes if "times as large as predicted" in n or "another state" in n)]
     if weak or 2 * after > before:
         why = "read the notes below first" if weak else "a part of the error is of a kind that was not found"
         return "fair", f"Usable: {said}; {why}."

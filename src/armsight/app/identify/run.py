@@ -70,7 +70,7 @@ def run_identify(
 
 
 def _notes(arm: Arm, found: Identified, measured: Measured, lines: Array) -> list[str]:
-    notes = []
+    notes = list(found.lacks)
     still = [str(i + 1) for i in np.flatnonzero(np.ptp(measured.q, axis=0) < ALIKE)]
     lost = [p.name for p, k in zip(found.model.parameters, found.solution.free, strict=True) if p.joint < 0 and not k]
     if still:

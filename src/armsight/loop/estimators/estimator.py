@@ -21,19 +21,12 @@ from armsight.data import Array, JointStates, Record
 
 @dataclass(frozen=True, eq=False)
 class PoseMeasurement(Record):
-    """A pose of the tool measured by vision.
+    """A pose of the tool measured by vision."""
 
-    Attributes:
-        t_s: the middle of the exposure as the camera stamps it, s; the camera's delay is still in it.
-        T_base_tool: (4, 4) pose of the tool, m.
-        cov_noise: (6, 6) covariance from what differs from shot to shot: pixel noise.
-        cov_common: (6, 6) covariance from what all shots share: the rig's calibration and the hand-eye's.
-    """
-
-    t_s: float
-    T_base_tool: Array
-    cov_noise: Array
-    cov_common: Array
+    t_s: float  #: the middle of the exposure as the camera stamps it, s; the camera's delay is still in it
+    T_base_tool: Array  #: (4, 4) pose of the tool, m
+    cov_noise: Array  #: (6, 6) covariance from what differs from shot to shot: pixel noise
+    cov_common: Array  #: (6, 6) covariance from what all shots share: the rig's calibration and the hand-eye's
 
     def __post_init__(self) -> None:
         """Lay the arrays out row by row, as kernels take them."""
@@ -44,19 +37,12 @@ class PoseMeasurement(Record):
 
 
 class ClockEffect(NamedTuple):
-    """What an error of the camera's clock did to an innovation, as far as it is known.
+    """What an error of the camera's clock did to an innovation, as far as it is known."""
 
-    Attributes:
-        offset_s: by how much the stamp was later than the filter took it to be, s.
-        in_z: (6,) what that made of the innovation, [m; rad]; the filter has adapted to it in part.
-        change: (K,) what was added to the filter's state as stamps were corrected; None where they are not.
-        sigma_s: standard deviation of the offset, s.
-    """
-
-    offset_s: float
-    in_z: Array
-    change: Array | None
-    sigma_s: float
+    offset_s: float  #: by how much the stamp was later than the filter took it to be, s
+    in_z: Array  #: (6,) what that made of the innovation, [m; rad]; the filter has adapted to it in part
+    change: Array | None  #: (K,) what was added to the filter's state as stamps were corrected; None where they are not
+    sigma_s: float  #: standard deviation of the offset, s
 
 
 class Outcome(Enum):
@@ -75,73 +61,46 @@ class Innovation(Record):
 
     Of a reading of a reference beside vision (:meth:`KalmanEstimator.take`) z has its m numbers in place of 6, measured
     minus predicted, and ``T_base_tool`` is the predicted pose.
-
-    Attributes:
-        t_s: time of the measurement, s, the delay removed.
-        T_base_tool: (4, 4) the measured pose of the tool, m.
-        z: (6,) right tangent from the predicted pose of the tool to the measured one, [m; rad].
-        cov: (6, 6) covariance of z, what all measurements share included.
-        by_state: (6, K) derivative of the prediction by the filter's state.
-        kept: (K,) share of the state that was kept since the measurement before.
-        gain: (K, 6) what of z was added to the state; zero where the measurement was rejected.
-        outcome: what became of it.
-        clock: what is known of an error of the camera's clock; None where nothing is.
-        reference: returns (6,) as z, from the pose predicted by a state that stays, and its derivative (6, K), where they
-            are asked for; None where none is kept (:meth:`KalmanEstimator.keep_reference`).
-        added: (K,) variances that were added to the state since the measurement before; None where nobody needs them.
-        noise: (6, 6) covariance of z without the state's and without what all measurements share; None likewise.
     """
 
-    t_s: float
-    T_base_tool: Array
-    z: Array
-    cov: Array
-    by_state: Array
-    kept: Array
-    gain: Array
-    outcome: Outcome
-    clock: ClockEffect | None = None
+    t_s: float  #: time of the measurement, s, the delay removed
+    T_base_tool: Array  #: (4, 4) the measured pose of the tool, m
+    z: Array  #: (6,) right tangent from the predicted pose of the tool to the measured one, [m; rad]
+    cov: Array  #: (6, 6) covariance of z, what all measurements share included
+    by_state: Array  #: (6, K) derivative of the prediction by the filter's state
+    kept: Array  #: (K,) share of the state that was kept since the measurement before
+    gain: Array  #: (K, 6) what of z was added to the state; zero where the measurement was rejected
+    outcome: Outcome  #: what became of it
+    clock: ClockEffect | None = None  #: what is known of an error of the camera's clock; None where nothing is
+    #: returns (6,) as z, from the pose predicted by a state that stays, and its derivative (6, K), where they are asked
+    #: for; None where none is kept (:meth:`KalmanEstimator.keep_reference`).
     reference: Callable[[], tuple[Array, Array]] | None = None
+    #: (K,) variances that were added to the state since the measurement before; None where nobody needs them
     added: Array | None = None
+    #: (6, 6) covariance of z without the state's and without what all measurements share; None likewise
     noise: Array | None = None
 
 
 @dataclass(frozen=True)
 class Delay:
-    """How late a camera's stamps are on the board's clock: the exposure was at ``t_s - delay_s``.
+    """How late a camera's stamps are on the board's clock: the exposure was at ``t_s - delay_s``."""
 
-    Attributes:
-        delay_s: the delay, s.
-        sigma_s: its standard deviation, common to all shots, s.
-        jitter_s: standard deviation of each shot's own, s.
-    """
-
-    delay_s: float
-    sigma_s: float
-    jitter_s: float = 0.0
+    delay_s: float  #: the delay, s
+    sigma_s: float  #: its standard deviation, common to all shots, s
+    jitter_s: float = 0.0  #: standard deviation of each shot's own, s
 
 
 @dataclass(frozen=True, eq=False)
 class Track(Record):
-    """Poses of the tool at N times.
+    """Poses of the tool at N times."""
 
-    Attributes:
-        t_s: (N,) times, s.
-        Ts_base_tool: (N, 4, 4) poses of the tool, m.
-        covs: (N, 6, 6) their covariance, everything included.
-        covs_own: (N, 6, 6) the same without what all measurements share (``PoseMeasurement.cov_common``).
-        q: (N, 6) potentiometers, smoothed, rad.
-        qd: (N, 6) their speeds, rad/s.
-        vision_age_s: (N,) time since the newest measurement used, s; infinite before the first.
-    """
-
-    t_s: Array
-    Ts_base_tool: Array
-    covs: Array
-    covs_own: Array
-    q: Array
-    qd: Array
-    vision_age_s: Array
+    t_s: Array  #: (N,) times, s
+    Ts_base_tool: Array  #: (N, 4, 4) poses of the tool, m
+    covs: Array  #: (N, 6, 6) their covariance, everything included
+    covs_own: Array  #: (N, 6, 6) the same without what all measurements share (``PoseMeasurement.cov_common``).
+    q: Array  #: (N, 6) potentiometers, smoothed, rad
+    qd: Array  #: (N, 6) their speeds, rad/s
+    vision_age_s: Array  #: (N,) time since the newest measurement used, s; infinite before the first
 
     def __len__(self) -> int:
         """Return N."""
@@ -155,46 +114,27 @@ class Track(Record):
 
 @dataclass(frozen=True, eq=False)
 class ArmEstimate(Record):
-    """The pose of the tool at one time.
+    """The pose of the tool at one time."""
 
-    Attributes:
-        t_s: when, s.
-        T_base_tool: (4, 4) pose of the tool, m.
-        cov: (6, 6) its covariance, everything included.
-        cov_own: (6, 6) the same without what all measurements share (``PoseMeasurement.cov_common``).
-        q: (6,) potentiometers, smoothed, rad.
-        qd: (6,) their speeds, rad/s.
-        vision_age_s: time since the newest measurement used, s; infinite before the first.
-    """
-
-    t_s: float
-    T_base_tool: Array
-    cov: Array
-    cov_own: Array
-    q: Array
-    qd: Array
-    vision_age_s: float
+    t_s: float  #: when, s
+    T_base_tool: Array  #: (4, 4) pose of the tool, m
+    cov: Array  #: (6, 6) its covariance, everything included
+    cov_own: Array  #: (6, 6) the same without what all measurements share (``PoseMeasurement.cov_common``).
+    q: Array  #: (6,) potentiometers, smoothed, rad
+    qd: Array  #: (6,) their speeds, rad/s
+    vision_age_s: float  #: time since the newest measurement used, s; infinite before the first
 
 
 @dataclass(frozen=True, eq=False)
 class Learned(Record):
-    """What a filter has learned about an arm.
+    """What a filter has learned about an arm."""
 
-    Attributes:
-        joint_offset: (6,) true joint angles minus readings where the joints are now, rad.
-        sigma_joint_offset: (6,) standard deviations; wide where two joints' errors look alike to vision.
-        backlash: (6,) widths between potentiometer and link, rad.
-        sigma_backlash: (6,) standard deviations.
-        side: (6,) where each joint is in it, -1 to 1: 1 when it came up from below.
-        delay: how late the camera's stamps are.
-    """
-
-    joint_offset: Array
-    sigma_joint_offset: Array
-    backlash: Array
-    sigma_backlash: Array
-    side: Array
-    delay: Delay
+    joint_offset: Array  #: (6,) true joint angles minus readings where the joints are now, rad
+    sigma_joint_offset: Array  #: (6,) standard deviations; wide where two joints' errors look alike to vision
+    backlash: Array  #: (6,) widths between potentiometer and link, rad
+    sigma_backlash: Array  #: (6,) standard deviations
+    side: Array  #: (6,) where each joint is in it, -1 to 1: 1 when it came up from below
+    delay: Delay  #: how late the camera's stamps are
 
 
 class Estimator(Protocol):

@@ -102,6 +102,7 @@ class Identified(Record):
             not known, because the joints' and the instrument's share cannot be separated then.
         held_out: how it does on poses left out; None where none were.
         notes: what a person should know, such as why none were.
+        lacks: those of them that say what else would explain the data far better.
         change: how base, tool or a joint's zero changed while the poses were taken, which ``cov`` allows for; None where
             they did not.
     """
@@ -119,6 +120,7 @@ class Identified(Record):
     joint_sigma_rad: Array
     held_out: LeftOut | None = None
     notes: tuple[str, ...] = ()
+    lacks: tuple[str, ...] = ()
     change: StateChange | None = None
 
     def __repr__(self) -> str:

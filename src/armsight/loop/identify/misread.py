@@ -555,6 +555,12 @@ def check_plausible(arm: Arm, measured: Measured) -> None:
     good = at.right < (limit if at.sized else max(limit, BAD_M * at.scale))
     if good and at.sized:
         _check_rotations(arm, measured, rows)
+        flipped = [points_off(arm, q * (1 - 2 * one), p).right for one in np.eye(arm.joints)]
+        if (least := min(flipped)) * (CLEAR if len(q) >= FEW else BETTER) < at.right:
+            raise InputError(
+                f"the data fit this arm if the sign is wrong of joint {int(np.argmin(flipped)) + 1} (off by "
+                f"{1e3 * at.right:.1f} mm as they are, {1e3 * least:.1f} mm so): put the columns right"
+            )
         found = placed_change(arm, measured)
         if found is not None and found[1].sure and found[1].left < found[1].before / CLEAR:
             model, change = found

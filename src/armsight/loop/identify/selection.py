@@ -21,13 +21,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
+from scipy.linalg import solve_triangular
+from scipy.special import stdtr
 
 from armsight.data import Array
 from armsight.estimate.change import StateChange, changed, robust
 from armsight.estimate.select import Folds, Mask, Removal
-from armsight.estimate.solve import condensed, solve, whitened
+from armsight.estimate.solve import condensed, regression, solve, whitened
 from armsight.estimate.variance import restricted
-from armsight.loop.identify.fit import Solution, linear_of, variances_of
+from armsight.loop.identify.fit import Solution, by_joints, linear_of, variances_of
 from armsight.loop.identify.measured import Measured, visits
 from armsight.loop.identify.model import Model
 
@@ -79,6 +81,9 @@ def _upper_ends(cost: Callable[[Array], float], best: Array) -> Array:
 FOLDS, CLUSTERS, CLUSTER = 20, 200, 3
 #: What a harmonic's or load's coefficient costs in the log of held-out squares; none: chance keeps half as many again.
 PRICE = 1.0
+#: Chance of lengths that are off in proportion, the share of residuals that a coupling explains, and how large it may be,
+#: rad/rad. Half: large scales, or small couplings, are not named; double: ordinary arms are.
+PROPORTIONAL, EXPLAINS, LINEAR = 5e-3, 0.3, 0.25
 PLACEMENT = ("base", "tool")  # the kinds that say where the arm is: base in the rig, tool on the flange
 #: A sensor's harmonics make one curve, the links' loads one compliance: they may be added together.
 CURVE = ("wave", "ripple")
@@ -281,6 +286,43 @@ def change_at(
     named = {name: np.array(columns) for name, columns in ways.items()}
     found = changed(-e, J, named, measured.q, known=linear.known, at=linear.at)
     return None if found is None else found.over_all(free)
+
+
+def lacking(
+    model: Model, x: Array, measured: Measured, free: Mask, prior: Array, noise: tuple[float, float]
+) -> tuple[str, ...]:
+    """Return what else would explain a fit far better: all lengths by one factor, or a joint that moves with another.
+
+    Arguments as of :func:`change_at`. The residuals' score says by how much any reading, times a number, moves a joint.
+    """
+    found, lengths = (
+        [],
+        np.array([p.kind in ("a", "d") for p in model.parameters]) & free & (abs(model.nominal()) > 1e-3),
+    )
+    nominal = model.nominal()[lengths]
+    if len(nominal) > 2:
+        (scale,), (sigma,) = regression(nominal[:, None], x[lengths] - nominal, None)
+        if 2 * stdtr(len(nominal) - 1, -abs(scale) / max(sigma, 1e-12)) < PROPORTIONAL:
+            found.append(
+                f"all lengths come out {100 * scale:+.2g} % off, in proportion: is it the instrument's scale, such as the "
+                "square size of its calibration?"
+            )
+    linear = linear_of(model, x, measured, np.ones(len(x), bool), prior)
+    e, J = robust(*whitened(linear, variances_of(linear, noise)))
+    by = (by_joints(model, J)[..., None] * (measured.q - measured.q.mean(axis=0))[:, None, None]).reshape(e.size, -1)
+    rows, known = J[:, :, free].reshape(e.size, -1), linear.known[free]
+    beside = np.column_stack([rows.T @ by, rows.T @ e.ravel() + known * linear.at[free]])
+    slope = solve_triangular(np.linalg.cholesky(rows.T @ rows + np.diag(known)), beside, lower=True)
+    squares = np.maximum((by**2).sum(axis=0) - (slope[:, :-1] ** 2).sum(axis=0), 1e-9 * (by**2).sum(axis=0)) + 1e-300
+    pull = (slope[:, -1] @ slope[:, :-1] - e.ravel() @ by) / squares
+    k = int(np.argmax(pull**2 * squares * (abs(pull) < LINEAR)))
+    i, j = divmod(k, model.arm.joints)
+    if pull[k] ** 2 * squares[k] > max(EXPLAINS, 30 / e.size) * (e**2).sum():  # of few numbers chance explains much
+        of = "its own reading" if i == j else f"the reading of joint {j + 1}"
+        found.append(
+            f"joint {i + 1} seems to move by {pull[k]:+.3g} of {of} beside the model: is it coupled, or geared?"
+        )
+    return tuple(found)
 
 
 def change_text(model: Model, change: StateChange) -> str:

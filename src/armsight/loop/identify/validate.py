@@ -24,7 +24,7 @@ from armsight.loop.identify.measured import Measured, Read, measured_of, visits
 from armsight.loop.identify.misread import check_plausible, without_tool
 from armsight.loop.identify.model import Model
 from armsight.loop.identify.placement import with_placement
-from armsight.loop.identify.selection import PLACEMENT, change_at, changed_from
+from armsight.loop.identify.selection import PLACEMENT, change_at, changed_from, lacking
 from armsight.robot.kinematics.arm import Arm
 
 OTHER = 5.0  # another set-up: the error is this many times that with base and tool fitted again,
@@ -170,7 +170,9 @@ def with_change_allowed(found: Identified, measured: Measured) -> Identified:
     """Return an identified arm whose covariance allows for a change of state among its poses, which it names."""
     free = np.diag(found.cov_everything) > 0
     weighted = with_joint_noise(found.model, found.solution.x, measured, found.joint_sigma_rad)
-    change = change_at(found.model, found.solution.x, weighted, free, found.prior, found.solution.noise)
+    fit_to = found.model, found.solution.x, weighted, free, found.prior, found.solution.noise
+    change, lacks = change_at(*fit_to), () if measured.length_m is not None else lacking(*fit_to)
+    found = replace(found, lacks=lacks, notes=(*found.notes, *lacks))
     if change is None or not matters(change, found.cov):
         return found
     note = changed_from(found.model, change, f"pose {change.row}")
