@@ -223,15 +223,18 @@ def _rests(
         if len(Ts) >= _REST_SHOTS:
             seen = Row("pose", name, str(times[name]), came, t_s, mean_pose(Ts), T, noise.own / len(Ts), noise.common)
             visits.setdefault((name, came), []).append(seen)
-    often, attained = any(len(group) >= MIN_POSES for group in visits.values()), Counter[str]()
-    for (name, _), group in visits.items():
-        attained[name] += len(group)
-    rare = {at: len(group) for at, group in visits.items() if often and len(group) < MIN_POSES <= attained[at[0]]}
+    rare = _rare(visits)
     rows = [row for at, group in visits.items() if at not in rare for row in group]
     said = [f"left out: {name} approached from {came}, too seldom ({n})" for (name, came), n in rare.items()]
     notes = [f"{unseen} rests were not seen, and are left out"] if unseen else []
     notes += first_few(said, "approaches, too seldom")
     return sorted(rows, key=lambda row: (natural_key(row.pose), row.t_s)), notes
+
+
+def _rare(visits: dict[tuple[str, str], list[Row]]) -> dict[tuple[str, str], int]:
+    attained = Counter(name for (name, _), group in visits.items() for _ in group)
+    often = any(len(group) >= MIN_POSES for group in visits.values())
+    return {at: len(rows) for at, rows in visits.items() if often and len(rows) < MIN_POSES <= attained[at[0]]}
 
 
 def _pose_names(rests: list[PathSegment]) -> list[tuple[Array, str]]:

@@ -139,7 +139,7 @@ def checked(entries: list[Entry]) -> Report:
     return Report(name, "References", "", "", sections, notes, {"references": found}, assessed=answer)
 
 
-def _weak_stream(entry: Entry, stream: StreamCheck, saturated: list[str], still: list[str]) -> list[str]:
+def _weak_stream(entry: Entry, stream: StreamCheck, axes: list[str], z: Array) -> list[str]:
     """Return what is weak in how readings came, whatever they are."""
     name, weak = entry.reference.name, []
     if entry.rate_hz is not None and abs(stream.rate_hz / entry.rate_hz - 1) > RATE:
@@ -149,8 +149,9 @@ def _weak_stream(entry: Entry, stream: StreamCheck, saturated: list[str], still:
             weak.append(f"{name}: {100 * stream.doubled:.0f} % of readings repeat the one before: it is read too often")
         if stream.frozen_s:
             weak.append(f"{name}: no value changes for {stream.frozen_s:.2f} s")
+        still = [axis for axis, column in zip(axes, z.T, strict=True) if np.ptp(column) == 0.0]
         weak += [f"{name}: {axis} never changes: it is not read, or broken" for axis in still]
-    return weak + [f"{name}: {axis} stands at the end of its range: that is too small" for axis in saturated]
+    return weak + [f"{name}: {axes[k]} stands at the end of its range: that is too small" for k in stream.saturated]
 
 
 def _check(entry: Entry) -> tuple[dict[str, Any], list[str], list[str]]:
@@ -160,7 +161,6 @@ def _check(entry: Entry) -> tuple[dict[str, Any], list[str], list[str]]:
     values: dict[str, Any] = {"name": name, "readings": len(t_s)} | {each: getattr(stream, each) for each in kept}
     axes = ["_".join(column.split("_")[:2]) for column in COLUMNS[type(entry.reference)]]
     values["saturated"] = [axes[k] for k in stream.saturated]
-    still = [axis for axis, column in zip(axes, z.T, strict=True) if np.ptp(column) == 0.0]
     lines = [
         f"{name}: {len(t_s)} readings, {stream.rate_hz:.4g} Hz, jitter {1e3 * stream.jitter_s:.2g} ms, "
         f"{stream.gaps} gaps, the longest {1e3 * stream.longest_gap_s:.0f} ms"
@@ -168,7 +168,7 @@ def _check(entry: Entry) -> tuple[dict[str, Any], list[str], list[str]]:
     for unit, scale in (("ms", 1e3), ("us", 1e6), ("ns", 1e9)):
         if entry.rate_hz is not None and abs(stream.rate_hz * scale / entry.rate_hz - 1) <= RATE:
             raise InputError(f"{source}: the rate is {stream.rate_hz:.4g} Hz, as if t_s were in {unit}; give s")
-    weak = _weak_stream(entry, stream, values["saturated"], still)
+    weak = _weak_stream(entry, stream, axes, z)
     if isinstance(entry.reference, Magnetometer):
         check_unit(str(source), z)
     if isinstance(entry.reference, Distance) and not np.median(np.abs(z)) < MOST_M:
