@@ -172,7 +172,7 @@ def with_change_allowed(found: Identified, measured: Measured) -> Identified:
     weighted = with_joint_noise(found.model, found.solution.x, measured, found.joint_sigma_rad)
     fit_to = found.model, found.solution.x, weighted, free, found.prior, found.solution.noise
     change, lacks = change_at(*fit_to), () if measured.length_m is not None else lacking(*fit_to)
-    found = replace(found, lacks=lacks, notes=(*found.notes, *lacks))
+    found = replace(found, lacks=lacks, notes=(*found.notes, *lacks)) if lacks else found
     if change is None or not matters(change, found.cov):
         return found
     note = changed_from(found.model, change, f"pose {change.row}")
