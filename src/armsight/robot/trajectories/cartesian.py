@@ -49,12 +49,7 @@ class PathMotion:
 
 
 def follow(
-    arm: Arm,
-    path: Path,
-    q_start: ArrayLike,
-    *,
-    duration_s: float | None = None,
-    cruises: Array | None = None,
+    arm: Arm, path: Path, q_start: ArrayLike, *, duration_s: float | None = None, cruises: Array | None = None
 ) -> PathMotion:
     """Plan to travel a path of the tool that begins where ``q_start`` puts it, in the configuration of the start.
 

@@ -82,12 +82,7 @@ def circle(
 
 
 def arc(
-    arm: Arm,
-    q_start: ArrayLike,
-    via_base: ArrayLike,
-    T_base_goal: ArrayLike,
-    *,
-    duration_s: float | None = None,
+    arm: Arm, q_start: ArrayLike, via_base: ArrayLike, T_base_goal: ArrayLike, *, duration_s: float | None = None
 ) -> PathMotion:
     """Plan the arc of the tool from where it is through a point to a pose, the orientation rotating evenly (slerp).
 

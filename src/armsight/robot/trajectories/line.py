@@ -43,13 +43,7 @@ class LinePath(Record):
         return PathPoints(T, twist, np.zeros_like(twist))
 
 
-def line(
-    arm: Arm,
-    q_start: ArrayLike,
-    T_base_goal: ArrayLike,
-    *,
-    duration_s: float | None = None,
-) -> PathMotion:
+def line(arm: Arm, q_start: ArrayLike, T_base_goal: ArrayLike, *, duration_s: float | None = None) -> PathMotion:
     """Plan a straight line of the tool from where it is.
 
     Args:

@@ -68,12 +68,7 @@ def _fade(s: Array, reach: Array) -> tuple[Array, Array, Array, Array]:
 
 
 def waypoints(
-    arm: Arm,
-    q_start: ArrayLike,
-    Ts_base_way: ArrayLike,
-    *,
-    blend_m: float,
-    duration_s: float | None = None,
+    arm: Arm, q_start: ArrayLike, Ts_base_way: ArrayLike, *, blend_m: float, duration_s: float | None = None
 ) -> PathMotion:
     """Plan a path of the tool from where it is past way-points to the last of them, without stopping.
 

@@ -19,15 +19,7 @@ from numpy.typing import NDArray
 
 from armsight.data import Array, Image
 from armsight.errors import InputError
-from armsight.sim.camera.stages import (
-    CameraPipeline,
-    Flicker,
-    Jpeg,
-    Lamp,
-    Photosensor,
-    TemporalDenoise,
-    ToneCurve,
-)
+from armsight.sim.camera.stages import CameraPipeline, Flicker, Jpeg, Lamp, Photosensor, TemporalDenoise, ToneCurve
 from armsight.sim.render.optics import Optics, Radiance, Sensor, exposed, noise_start, noise_strip, shaded
 
 _METHODS = {

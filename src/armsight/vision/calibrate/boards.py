@@ -44,14 +44,7 @@ from armsight.vision.calibrate.heldout import (
 )
 from armsight.vision.calibrate.motion import ExposureMotion, other_size
 from armsight.vision.calibrate.result import Calibration, HeldOutErrors, RejectedPair
-from armsight.vision.calibrate.screen import (
-    LEAST_CORNERS,
-    MOTION_EASE,
-    Screened,
-    noise_px,
-    robust_sigma,
-    screen,
-)
+from armsight.vision.calibrate.screen import LEAST_CORNERS, MOTION_EASE, Screened, noise_px, robust_sigma, screen
 from armsight.vision.calibrate.start import agreed_symmetries, fits, imitated, residual_rms_px, start_board
 from armsight.vision.camera import DISTORTION_MODELS, Camera
 from armsight.vision.markers.circles import unseen_row

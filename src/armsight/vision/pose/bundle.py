@@ -18,14 +18,7 @@ from numpy.typing import NDArray
 from armsight.data import Array, Ids, Record
 from armsight.errors import CalibrationError
 from armsight.kernels import kernel
-from armsight.vision.pose.projection import (
-    BundleModel,
-    BundleState,
-    Observations,
-    derivatives,
-    moved,
-    predict,
-)
+from armsight.vision.pose.projection import BundleModel, BundleState, Observations, derivatives, moved, predict
 
 
 @kernel(nogil=True)

@@ -18,19 +18,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from armsight.data import (
-    SIDES,
-    Array,
-    Body,
-    Correspondences,
-    Detections,
-    Discs,
-    Ids,
-    Image,
-    Missed,
-    PoseEstimate,
-    Shot,
-)
+from armsight.data import SIDES, Array, Body, Correspondences, Detections, Discs, Ids, Image, Missed, PoseEstimate, Shot
 from armsight.errors import require
 from armsight.geometry.pose import inverse
 from armsight.vision.camera import Camera
