@@ -61,8 +61,7 @@ def read_calibration(path: str | Path, nominal: Arm) -> Arm:
     """
     if Path(path).suffix.lower() == ".conf":
         return _checked(path, nominal, _with_deltas(path, nominal))
-    origins = _origins(path, nominal)
-    links = [ChainLink(T, np.array([0.0, 0.0, 1.0])) for T in origins]
+    links = [ChainLink(T, np.array([0.0, 0.0, 1.0])) for T in _origins(path, nominal)]
     links.append(ChainLink(nominal.T_flange_tool, np.zeros(3)))
     rows = arm_rows(f"{path}", list(nominal.joint_names), links, np.eye(4))
     arm = replace(

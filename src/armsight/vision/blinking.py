@@ -80,8 +80,7 @@ def candidates(means: Array) -> list[tuple[int, int]]:
             (weight.sum(axis=0) @ np.arange(columns.start, columns.start + weight.shape[1])) / weight.sum()
         )
         u = int(np.clip(round((at_column + 0.5) * BLOCK - WINDOW / 2), 0, max(wide - WINDOW, 0)))
-        v = int(np.clip(round((at_row + 0.5) * BLOCK - WINDOW / 2), 0, max(high - WINDOW, 0)))
-        found.append((u, v))
+        found.append((u, int(np.clip(round((at_row + 0.5) * BLOCK - WINDOW / 2), 0, max(high - WINDOW, 0)))))
         left[rows, columns] = 0.0
     return found
 

@@ -169,8 +169,7 @@ _DARK, _LIT_SHARE = 32, 1e-3
 
 def darkness(image: NDArray[np.uint8]) -> str:
     """Return "the image is dark: ..." where a grey image (H, W) shows next to nothing, else an empty string."""
-    lit = np.count_nonzero(image >= _DARK)
-    if lit > _LIT_SHARE * image.size:
+    if np.count_nonzero(image >= _DARK) > _LIT_SHARE * image.size:
         return ""
     level = float(np.percentile(image, 100.0 * (1.0 - _LIT_SHARE)))
     return f"the image is dark: 99.9% of it at most {level:.0f} of 255 grey levels: light the scene, or expose longer"

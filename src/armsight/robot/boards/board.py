@@ -263,8 +263,7 @@ class Board(Closing):
                 f" of 1/{self._ticks_per_s} s, {_LONGEST_TICKS} at most"
             )
         q_ref, qd_ref = _six("q_ref", command.q_ref), _six("qd_ref", command.qd_ref)
-        gravity_duty = _six("gravity_duty", command.gravity_duty)
-        return self._send("move", round(ticks), q_ref, qd_ref, gravity_duty)
+        return self._send("move", round(ticks), q_ref, qd_ref, _six("gravity_duty", command.gravity_duty))
 
     def command(self, command: Command) -> int:
         """Send a command and return its number; :meth:`confirm` waits until the board acknowledges or rejects it."""

@@ -175,8 +175,7 @@ class UnicornEmulator:
         # The processor's own map lets code run in RAM, and Unicorn takes every store to such a page through a slow path
         # that looks for translated code: more than half of a tick's time. These permissions are in place of that map.
         self.uc.ctl_set_tlb_mode(unicorn.UC_TLB_VIRTUAL)
-        code = unicorn.UC_PROT_READ | unicorn.UC_PROT_EXEC
-        self.uc.hook_add(unicorn.UC_HOOK_TLB_FILL, partial(_fill, code, data))
+        self.uc.hook_add(unicorn.UC_HOOK_TLB_FILL, partial(_fill, unicorn.UC_PROT_READ | unicorn.UC_PROT_EXEC, data))
         for segment in elf.segments:
             self.uc.mem_write(segment.load_address, segment.data)
         self.uc.mem_write(_CALL, _CALLER)

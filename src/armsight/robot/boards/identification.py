@@ -238,8 +238,7 @@ def dead_spots(counts: Array, noise_counts: float, low: float, high: float) -> l
     counts (n,) come a few milliseconds apart; below ``low`` is a short circuit, above ``high`` an open wiper.
     """
     width = 15
-    padded = np.pad(counts, width // 2, mode="edge")
-    middle = np.median(np.lib.stride_tricks.sliding_window_view(padded, width), axis=1)
+    middle = np.median(np.lib.stride_tricks.sliding_window_view(np.pad(counts, width // 2, mode="edge"), width), axis=1)
     slope = np.abs(np.gradient(middle))
     lost = (counts < low) | (counts > high) | (np.abs(counts - middle) > 400 + 12 * noise_counts + 10 * slope)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], lost.astype(int), [0]])))
@@ -261,8 +260,7 @@ def _smooth(values: Array, step_s: float, *, derivative: bool = False, sigma_s: 
     if derivative:
         kernel = -at * kernel
         kernel /= -(kernel * at).sum()
-    padded = np.pad(values, reach, mode="reflect", reflect_type="odd")
-    smoothed: Array = np.convolve(padded, kernel, mode="valid")
+    smoothed: Array = np.convolve(np.pad(values, reach, mode="reflect", reflect_type="odd"), kernel, mode="valid")
     return smoothed
 
 
@@ -277,16 +275,14 @@ def _sure(speed: Array, step_s: float, share: float) -> NDArray[np.bool_]:
 
 def _integral(t: Array, values: Array) -> Array:
     """Return the integral (n,) of values by time, by the trapezoidal rule."""
-    parts = 0.5 * (values[1:] + values[:-1]) * np.diff(t)
-    return np.concatenate([[0.0], np.cumsum(parts)])
+    return np.concatenate([[0.0], np.cumsum(0.5 * (values[1:] + values[:-1]) * np.diff(t))])
 
 
 def _fit_flux(
     t: Array, volts: Array, amperes: Array, q: Array, speed: Array, sure: NDArray[np.bool_]
 ) -> tuple[tuple[float, float, float], tuple[float, float]]:
     """Return resistance, constant and half the backlash, and the standard deviations of the first two."""
-    drift = np.vander(t / t[-1] - 0.5, 4)
-    columns = np.column_stack([_integral(t, amperes), q, np.sign(speed), drift])[sure]
+    columns = np.column_stack([_integral(t, amperes), q, np.sign(speed), np.vander(t / t[-1] - 0.5, 4)])[sure]
     right = _integral(t, volts)[sure]
     solution, _, rank, _ = np.linalg.lstsq(columns, right, rcond=None)
     if rank < columns.shape[1]:

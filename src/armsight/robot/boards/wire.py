@@ -122,8 +122,7 @@ class Wire:
             if self._crc(data[at + 1 : end] + layout.extra).crc != _CHECK.unpack_from(data, end)[0]:
                 break
             # Zeros at a payload's end are not sent; what is longer than known is of a newer dialect.
-            payload = data[at + _HEAD.size : end].ljust(layout.unpacker.size, b"\0")
-            values = layout.unpacker.unpack_from(payload)
+            values = layout.unpacker.unpack_from(data[at + _HEAD.size : end].ljust(layout.unpacker.size, b"\0"))
             fields = {
                 name: values[where] if isinstance(where, int) else list(values[where]) for name, where in layout.fields
             }

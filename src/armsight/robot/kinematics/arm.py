@@ -551,8 +551,7 @@ def untilted(table: Array) -> Array:
     starts of the iterative inverse.
     """
     out = table.copy()
-    rows = rows_of(out)
-    for row, after in itertools.pairwise(rows):
+    for row, after in itertools.pairwise(rows_of(out)):
         if abs(row[_SIN]) > np.sin(TILT_RAD) or row[_SIN] == 0.0:
             continue
         along = -row[_D] / row[_COS]  # on the next axis, as far up as this joint stands

@@ -164,8 +164,7 @@ class ManySolutions(Record):
 
 def many_solutions(found: list[Array], joints: int) -> ManySolutions:
     """Return the solutions of many poses from the rows of each."""
-    most = max((len(rows) for rows in found), default=0)
-    out = np.zeros((len(found), most, joints + ROW_END - 1))
+    out = np.zeros((len(found), max((len(rows) for rows in found), default=0), joints + ROW_END - 1))
     for k, rows in enumerate(found):
         out[k, : len(rows)] = rows[:, :-1]
     return ManySolutions.of(np.array([len(rows) for rows in found], dtype=np.int64), out)

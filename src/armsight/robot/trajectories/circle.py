@@ -38,8 +38,7 @@ class ArcPath(Record):
         T[:, :3, :3] = exp_so3(share[:, None] * self.rotation_base) @ self.T_base_start[:3, :3]
         speed = np.cross(self.sweep, arm_base)
         twist = np.hstack([speed, np.tile(self.rotation_base, (len(share), 1))])
-        bend = np.hstack([np.cross(self.sweep, speed), np.zeros((len(share), 3))])
-        return PathPoints(T, twist, bend)
+        return PathPoints(T, twist, np.hstack([np.cross(self.sweep, speed), np.zeros((len(share), 3))]))
 
 
 def circle(
@@ -101,8 +100,7 @@ def arc(
     goal = checked_pose(T_base_goal, "T_base_goal")
     center, sweep = through(T_base_start[:3, 3], checked(via_base, (3,), "via_base"), goal[:3, 3])
     rotation_base = log_so3(np.ascontiguousarray(goal[:3, :3] @ T_base_start[:3, :3].T))
-    path = ArcPath(T_base_start, center, sweep, rotation_base)
-    return follow(arm, path, q_start, duration_s=duration_s)
+    return follow(arm, ArcPath(T_base_start, center, sweep, rotation_base), q_start, duration_s=duration_s)
 
 
 def through(a: Array, via: Array, b: Array) -> tuple[Array, Array]:

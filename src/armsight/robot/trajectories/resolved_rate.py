@@ -170,8 +170,7 @@ def _share_state(arm: Arm, start: Joints, path: Path) -> Joints:
 
 def _first_guess_s(arm: Arm, q: Array, path: Path) -> float:
     """Return a duration that the speeds and accelerations of the joints at the start would allow."""
-    twist = path.at(np.zeros(1)).twist[0]
-    q1 = np.abs(_speeds(arm.jacobian(q), twist, _scale(arm))[0])
+    q1 = np.abs(_speeds(arm.jacobian(q), path.at(np.zeros(1)).twist[0], _scale(arm))[0])
     slowest = max(float((SHAPE[0] * q1 / arm.qd_max).max()), float(np.sqrt((SHAPE[1] * q1 / arm.qdd_max).max())))
     return max(slowest, 1e-2)
 
@@ -187,8 +186,7 @@ def position_first(J: Array, V: Array, inverted: Callable[[Array], Array]) -> tu
     U, s, Vt = np.linalg.svd(J[:3], full_matrices=False)
     qd = (inverted(s) * (V[:3] @ U)) @ Vt
     used = Vt[s > _RANK]
-    free = J[3:] - (J[3:] @ used.T) @ used
-    U_free, s_free, Vt_free = np.linalg.svd(free, full_matrices=False)
+    U_free, s_free, Vt_free = np.linalg.svd(J[3:] - (J[3:] @ used.T) @ used, full_matrices=False)
     qd += (inverted(np.where(s_free > _RANK, s_free, 0.0)) * ((V[3:] - J[3:] @ qd) @ U_free)) @ Vt_free
     return qd, float(s[-1])
 
@@ -273,5 +271,4 @@ def _check(arm: Arm, path: Path, law: Profile, run: _Run, tolerance_m: float) ->
 def _rejection(path: Path, law: Profile, reason: str, t_s: float) -> MotionRejected:
     """Return the rejection of a tracked motion at a time, s."""
     share = float(law.at(t_s).q[0])
-    p_base = path.at(np.array([share])).T_base_tool[0, :3, 3]
-    return MotionRejected(reason, share=share, t_s=t_s, p_base=p_base)
+    return MotionRejected(reason, share=share, t_s=t_s, p_base=path.at(np.array([share])).T_base_tool[0, :3, 3])

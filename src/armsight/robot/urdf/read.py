@@ -302,8 +302,7 @@ def arm_rows(where: str, names: list[str], links: list[ChainLink], first_fixed: 
 
 def check_same(where: str, arm: Arm, links: list[ChainLink]) -> None:
     """Compare an arm with the chain it was read from, or raise InputError: they differ by more than rounding."""
-    rng = np.random.default_rng(0)
-    for q in rng.uniform(-np.pi, np.pi, (PROBES, arm.joints)):
+    for q in np.random.default_rng(0).uniform(-np.pi, np.pi, (PROBES, arm.joints)):
         T = np.eye(4)
         for link, angle in zip(links, [*(arm.coupling @ q), 0.0], strict=True):
             T = T @ link.T_before @ pose(exp_so3(link.axis * angle), np.zeros(3))
@@ -347,8 +346,7 @@ def _parallel(C: Array) -> Decomposition:
 
 def _gamma(C: Array, beta: float, alpha: float) -> float:
     """Return gamma."""
-    step = _motion(Decomposition(beta, 0, 0, alpha, 0, 0))
-    R = step[:3, :3].T @ C[:3, :3]
+    R = _motion(Decomposition(beta, 0, 0, alpha, 0, 0))[:3, :3].T @ C[:3, :3]
     return float(np.arctan2(R[1, 0], R[0, 0]))
 
 
@@ -364,8 +362,7 @@ def _upright(axis: Array) -> tuple[Array, float]:
         return np.eye(4), -1.0 if axis[2] < 0 else 1.0
     rotation = np.array([-axis[1], axis[0], 0.0])
     size = np.linalg.norm(rotation)
-    angle = np.arctan2(size, axis[2])
-    return pose(exp_so3(rotation / size * angle), np.zeros(3)), 1.0
+    return pose(exp_so3(rotation / size * np.arctan2(size, axis[2])), np.zeros(3)), 1.0
 
 
 def _wrapped(angle: Array) -> Array:

@@ -118,8 +118,7 @@ def _solid(link: ET.Element, origin: Array, radius: float, *, moves: bool) -> No
     for xyz, rpy, tall, thick in cylinders:
         visual = ET.SubElement(link, "visual")
         ET.SubElement(visual, "origin", xyz=_numbers(xyz), rpy=_numbers(rpy))
-        geometry = ET.SubElement(visual, "geometry")
-        ET.SubElement(geometry, "cylinder", radius=repr(thick), length=repr(tall))
+        ET.SubElement(ET.SubElement(visual, "geometry"), "cylinder", radius=repr(thick), length=repr(tall))
 
 
 def _along(vector: Array) -> Array:

@@ -198,8 +198,7 @@ class Ar4Teensy(Wired):
             self._say(f"ER: panic, joint {'ABCDEF'[k]} value {degrees[k]:f} out of range")
             return
         self._most[:] = MOST_SPEED_DEG_S
-        goal = np.trunc(degrees * self.model.steps_per_deg * ENCODER_DIRECTION)
-        steps = goal - self._steps()
+        steps = np.trunc(degrees * self.model.steps_per_deg * ENCODER_DIRECTION) - self._steps()
         far = np.abs(steps) > DEAD_STEPS
         there = self._pulsed() + steps * ENCODER_DIRECTION / self.model.steps_per_deg
         self._target = np.where(far, there, self._target)
@@ -218,8 +217,7 @@ class Ar4Teensy(Wired):
             return
         model = self.model
         counts = np.trunc((self._motor - self._encoder_zero) * model.steps_per_deg * COUNTS_PER_STEP).astype(int)
-        joints = sorted({int(each) for each in sequence[1:]})
-        for k in joints:
+        for k in sorted({int(each) for each in sequence[1:]}):
             # At the switch the encoder is set to the limit; the joint really is beside it.
             beside = SENSE[k] * self.mechanics.homing_deg[k] + self.mechanics.scatter_deg * self._rng.standard_normal()
             self._encoder_zero[k] = beside + model.offset_deg[k]

@@ -127,8 +127,7 @@ class So101Servos:
         carried = pulls != 0.0 and abs(shaft - motor + pulls * half) < 1e-4
         free = effort - (load if carried else 0.0)
         moving = math.copysign(max(0.0, abs(free) - mechanics.friction_n_m), free)
-        speed = moving / (mechanics.stiffness_n_m_rad * mechanics.lag_s)
-        motor += min(max(speed, -_MOST_RAD_S), _MOST_RAD_S) * h
+        motor += min(max(moving / (mechanics.stiffness_n_m_rad * mechanics.lag_s), -_MOST_RAD_S), _MOST_RAD_S) * h
         # The shaft falls to the side of the backlash that its load pulls to; without load it stays until it is pushed.
         fall = motor - pulls * half - shaft if pulls else 0.0
         moved = shaft + min(max(fall, -_FALL_RAD_S * h), _FALL_RAD_S * h)
@@ -302,8 +301,7 @@ class So101Bus(Wired):
             self.servos.switch(servo, table[40] == 1)
         if address <= 42 < address + len(data):
             goal = (self._word(servo, 42) + self._offset(servo) - MIDDLE) * RAD_PER_COUNT
-            speed = (self._word(servo, 46) or 3400) * RAD_PER_COUNT
-            self.servos.goal(servo, goal, speed)
+            self.servos.goal(servo, goal, (self._word(servo, 46) or 3400) * RAD_PER_COUNT)
 
     def _refresh(self, ahead_s: float = 0.0) -> None:
         """Write the states into the registers, as they will be after less than some steps."""

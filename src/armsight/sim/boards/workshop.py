@@ -142,8 +142,7 @@ class WorkshopPlant:
 
 def drawn_wiring(seed: int) -> Wiring:
     """Return a wiring with signs as they happen to come."""
-    rng = np.random.default_rng([seed, 21])
-    motors, pots = rng.choice((-1, 1), (2, JOINTS))
+    motors, pots = np.random.default_rng([seed, 21]).choice((-1, 1), (2, JOINTS))
     return Wiring(motor_signs=tuple(map(int, motors)), potentiometer_signs=tuple(map(int, pots)))
 
 

@@ -64,8 +64,7 @@ def _box(
     canvas: NDArray[np.uint8], centre: NDArray[np.float64], size: float, grey: int, rng: np.random.Generator
 ) -> None:
     """Draw a rotated rectangle with a darker side, as a box seen from above."""
-    shape = (centre.tolist(), (size, size * rng.uniform(0.3, 1.0)), rng.uniform(0, 180))
-    corners = cv2.boxPoints(shape)
+    corners = cv2.boxPoints((centre.tolist(), (size, size * rng.uniform(0.3, 1.0)), rng.uniform(0, 180)))
     cv2.fillPoly(canvas, [corners.round().astype(np.int32)], grey, cv2.LINE_AA)
     side = np.concatenate([corners[:2], corners[1::-1] + rng.uniform(-0.2, 0.2, 2) * size])
     cv2.fillPoly(canvas, [side.round().astype(np.int32)], grey // 2, cv2.LINE_AA)
@@ -88,8 +87,7 @@ def _ellipse(
     axes = (int(size / 4) + 2, int(size / 4 * rng.uniform(0.3, 1.0)) + 2)
     width = -1 if rng.random() < 0.5 else int(rng.integers(2, 10))
     whole = 360 if rng.random() < 0.6 else float(rng.uniform(60, 300))
-    middle = (int(centre[0]), int(centre[1]))
-    cv2.ellipse(canvas, middle, axes, rng.uniform(0, 180), 0, whole, grey, width, cv2.LINE_AA)
+    cv2.ellipse(canvas, (int(centre[0]), int(centre[1])), axes, rng.uniform(0, 180), 0, whole, grey, width, cv2.LINE_AA)
 
 
 def _print(

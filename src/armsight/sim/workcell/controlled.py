@@ -110,8 +110,7 @@ def _so101(true: Arm, given: Imperfections, seed: int) -> tuple[ControlledArm, M
 
     q = np.append(true.home, np.zeros(SERVOS - n))
     arm = ControlledArm(true, So101Bus.made(mechanics, load, q))
-    bus = ServoBus(SteppedLink(arm), "the emulated SO-101", now=lambda: arm.t_s)
-    board = FeetechBoard.connect(bus, begin_s=0.0)
+    board = FeetechBoard.connect(ServoBus(SteppedLink(arm), "the emulated SO-101", now=lambda: arm.t_s), begin_s=0.0)
     board.enable()
     return arm, board
 

@@ -265,8 +265,7 @@ def _driven(
     if own is not None and sync_led:
         raise InputError(f"{model.name} keeps its own controller, which drives no sync LED")
     if own is not None:  # its zeros are off in its controller
-        true = sample_arm(model, replace(amounts, zero_rad=0.0), seed).arm
-        arm, own_board = own.open(true, amounts, seed)
+        arm, own_board = own.open(sample_arm(model, replace(amounts, zero_rad=0.0), seed).arm, amounts, seed)
         return arm, None, own_board, np.zeros_like
     if model.joints != JOINTS:
         raise InputError(
@@ -371,8 +370,7 @@ class Workcell(Closing):
         sensor = Sensor(read_noise=noise)
         seen = like._cameras if like is not None else _standing(true_rig, T_base_rig, plant, seed, sensor, psf_sigma_px)
         known = assumed if assumed is not None else built_to
-        T_tool_body = mount @ exp_se3(off)
-        parts = (known, timing, seed, plant, true_rig, T_base_rig, T_tool_body, seen, room)
+        parts = (known, timing, seed, plant, true_rig, T_base_rig, mount @ exp_se3(off), seen, room)
         p_led = transform(T_base_rig, distance_m * np.array(LED_AT)) if sync_led else None
         return cls(
             _Parts(*parts, pipeline, link, board, gravity, built_to.name == DEFAULT_ARM, p_led, processes, target)

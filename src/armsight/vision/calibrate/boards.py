@@ -125,8 +125,7 @@ def motion_of(model: BundleModel, screened: Screened, count: int) -> tuple[Expos
     guess = ExposureMotion.guessed(model.points, len(screened.kept))
     still, observations = screened.solution, screened.observations
     before = noise_px(still, observations, freed(model, still))
-    moving = replace(model, motion_sigmas=guess.sigmas)
-    solution = minimise(moving, still.state, observations, before)
+    solution = minimise(replace(model, motion_sigmas=guess.sigmas), still.state, observations, before)
     motion, taken = guess.updated(solution)
     if noise_px(solution, observations, freed(model, solution) + taken) > (1 - MOTION_WORTH) * before:
         return None
@@ -630,8 +629,7 @@ def _shown(pairs: Sequence[Pair]) -> list[Ids]:
 
 def _spread(pairs: Sequence[Pair]) -> list[Pair]:
     """Return at most _PAIRS_MOST pairs, evenly spread."""
-    count = min(len(pairs), _PAIRS_MOST)
-    return [pairs[k] for k in np.linspace(0, len(pairs) - 1, count).round().astype(int)]
+    return [pairs[k] for k in np.linspace(0, len(pairs) - 1, min(len(pairs), _PAIRS_MOST)).round().astype(int)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -737,8 +735,7 @@ def _busiest(shots: dict[int, TimedShot]) -> dict[int, TimedShot]:
         return shots
     at = np.array([shot.T_left_body[:3, 3] for shot in shots.values()])
     ways = np.minimum(np.linalg.norm(np.diff(at, axis=0), axis=1), 0.1)  # an abrupt change is another pose, no motion
-    sums = np.convolve(ways, np.ones(_SKEW_SHOTS - 1), "valid")
-    first = int(np.argmax(sums))
+    first = int(np.argmax(np.convolve(ways, np.ones(_SKEW_SHOTS - 1), "valid")))
     return dict(list(shots.items())[first : first + _SKEW_SHOTS])
 
 

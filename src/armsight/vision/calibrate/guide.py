@@ -107,8 +107,7 @@ class Knowledge(Record):
         state, points = calibration.solution.state, board.body.points
         model = printed_board(points) if len(state.shape) else rigid_board(points)
         model = replace(model, disc_radius_m=calibration.disc_radius_m or 0.0)
-        cov = calibration.solution.cov_shared * calibration.held_out.normalised_rms**2
-        root = covariance_root(cov)
+        root = covariance_root(calibration.solution.cov_shared * calibration.held_out.normalised_rms**2)
         variance, points = corner_variance_px2(calibration), working_points(calibration.rig, aim.distance_m)
         goal_m = aim.error_m or noise_m(calibration.rig, points, variance)
         bare = replace(state, Ts_left_body=np.zeros((0, 4, 4)), motions=np.zeros((0, 6)))
@@ -235,8 +234,7 @@ class Guide:
         near = rig.left.intrinsics[0] * self._diagonal_m / (0.75 * rig.left.image_size_px[1])
         for share in np.linspace(1.0, 2.5, 7):
             ahead = np.array([0.0, 0.0, share * near])
-            middle = (ahead + transform(rig.T_left_right, ahead)) / 2
-            T = self.facing(middle, rotation)
+            T = self.facing((ahead + transform(rig.T_left_right, ahead)) / 2, rotation)
             if self.in_view(rig, T[None])[0]:
                 return NextPose(T, float("nan"))
         return None

@@ -80,8 +80,7 @@ def pair_errors(
             continue
         board, body = drawing[seen.ids[good]], found[seen.ids[good]]
         p, cov_p, by_rig = p[good], cov_p[good], by_rig[good]
-        T = fit_rigid(board, p)
-        gap = p - transform(T, board)
+        gap = p - transform(fit_rigid(board, p), board)
         epipolar = epipolar_distances(rig, seen.uv[good, 0], seen.uv[good, 1])
         T_found, cov_rig = fit_rigid(body, p), np.array(rig.cov)
         if motion is not None:
@@ -310,8 +309,7 @@ def adjusted(
         )
         damping, state, free = NEAR, solution.state, freed(model, solution)
         if modes:
-            posterior = np.diag(solution.cov_shared)[-modes:]
-            tolerance = float(np.sqrt(np.mean(state.shape**2 + posterior)))
+            tolerance = float(np.sqrt(np.mean(state.shape**2 + np.diag(solution.cov_shared)[-modes:])))
             model = replace(model, shape_sigma_m=max(tolerance, LEAST_TOLERANCE_M))
         if motion is not None:
             motion, taken = motion.updated(solution)

@@ -58,8 +58,7 @@ def noise_px(solution: BundleSolution, observations: Observations, free_count: f
     Under it the whitened residuals have the expected sum of squares, ``free_count`` shared parameters being estimated.
     """
     d2 = (solution.residuals_px**2).sum(axis=1)
-    freedom = 2 * len(d2) - 6 * observations.shot_count - free_count
-    per_axis = d2.sum() / max(freedom, 1)
+    per_axis = d2.sum() / max(2 * len(d2) - 6 * observations.shot_count - free_count, 1)
     image = float(np.trace(observations.cov_uv, axis1=1, axis2=2).mean() / 2)
     return float(np.sqrt(max(per_axis - image, 1e-6)))
 

@@ -199,8 +199,7 @@ def start_board(
     plain = BundleModel(points, np.zeros((0, len(points), 3)), 1.0, True)
     best: BundleSolution | None = None
     for left, right in zip(*focals, strict=True):
-        cameras = (pinhole(sizes[0], left, model), pinhole(sizes[1], right, model))
-        state = _assemble(points, cameras, observations)
+        state = _assemble(points, (pinhole(sizes[0], left, model), pinhole(sizes[1], right, model)), observations)
         if state is None:
             continue
         solution = _staged(plain, state, observations)

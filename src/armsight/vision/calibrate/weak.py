@@ -172,8 +172,7 @@ def _focus(calibration: Calibration) -> str | None:
     image = np.trace(observations.cov_uv, axis1=1, axis2=2)
     each, residual_px2 = [observations.camera == side for side in (0, 1)], calibration.solution.residuals_px**2
     noise = [float(np.sqrt(np.median(image[rows]))) for rows in each]
-    residual = [float(np.sqrt(np.median(residual_px2[rows].sum(axis=1)))) for rows in each]
-    for values in (noise, residual):
+    for values in (noise, [float(np.sqrt(np.median(residual_px2[rows].sum(axis=1)))) for rows in each]):
         worse = int(np.argmax(values))
         if min(values) > 0 and values[worse] > _FOCUS_RATIO * values[1 - worse]:
             name = ("left", "right")[worse]
@@ -220,8 +219,7 @@ def _by_position(calibration: Calibration) -> float | None:
 
 
 def _moved(calibration: Calibration, motion: ExposureMotion) -> str | None:
-    state = calibration.solution.state
-    ways = np.linalg.norm(state.motions[:, :3], axis=1)
+    ways = np.linalg.norm(calibration.solution.state.motions[:, :3], axis=1)
     far = [int(j) for j in np.argsort(-ways) if ways[j] > _FAR_MOTION * np.sqrt(3) * motion.rms_m][:_FARTHEST]
     most = "".join(f", {calibration.pairs[j]} by {1e3 * ways[j]:.1f} mm" for j in far)
     if (field_px := _by_position(calibration)) is not None:
@@ -266,8 +264,7 @@ def require_order(calibration: Calibration) -> None:
 
 
 def _focal(calibration: Calibration) -> str | None:
-    sigma = np.sqrt(np.diag(calibration.rig.cov))
-    share = float(sigma[0] / calibration.rig.left.intrinsics[0])
+    share = float(np.sqrt(np.diag(calibration.rig.cov))[0] / calibration.rig.left.intrinsics[0])
     if share > 0.005:
         return (
             f"the focal length is known to {100 * share:.1f}% only, and distances with it: add tilted boards at several "

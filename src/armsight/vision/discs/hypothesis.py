@@ -170,8 +170,7 @@ def _score(view: DiscView, pairs: Pairs, expected: Expected, congruent: Congruen
     by_position = np.zeros((len(m), 2, 3 * len(ids)))
     for n, i in enumerate(ids):
         by_position[m == i, :, 3 * n : 3 * n + 3] = expected.J[i, side[m == i], :, :3]
-    once = np.eye(2 * len(m)).compress(np.repeat(~both[m], 2), axis=1)
-    J = np.hstack([by_position.reshape(2 * len(m), -1), once])
+    J = np.hstack([by_position.reshape(2 * len(m), -1), np.eye(2 * len(m)).compress(np.repeat(~both[m], 2), axis=1)])
     solid = (
         _integrated(fit.weight, J)
         + in_image[~both[m]].sum()

@@ -286,8 +286,7 @@ class Follower:
     def _estimate(self, T: Array, count: int, chi_square: float) -> PoseEstimate:
         """Make the record of the compiled call's result: ``count`` ellipses."""
         found = self._found
-        freedom = 2 * count - 6
-        misfit = max(chi_square / freedom, 1.0) if chi_square > self._limits[count] else 1.0
+        misfit = max(chi_square / (2 * count - 6), 1.0) if chi_square > self._limits[count] else 1.0
         uv, cov_uv = found.uv - found.bias, found.cov_uv.copy()
         dropped: tuple[Dropped, ...] = ()
         seen = both = self._rows

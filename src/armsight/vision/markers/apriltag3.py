@@ -114,8 +114,7 @@ def read_tag(image: NDArray[np.uint8], quad: Array, family: str) -> tuple[int, A
     weights = np.uint64(1) << np.arange(len(at) - 1, -1, -1, dtype=np.uint64)
     allowed = layout.distance // 6  # cells that are read wrong, of those in which two codes differ
     for rotation in range(4):
-        rotated = np.rot90(bits, rotation)
-        code = weights[rotated[at[:, 0], at[:, 1]]].sum(dtype=np.uint64)
+        code = weights[np.rot90(bits, rotation)[at[:, 0], at[:, 1]]].sum(dtype=np.uint64)
         wrong = _POPULATION[(known ^ code).view(np.uint8)].reshape(len(known), 8).sum(axis=1)
         best = int(wrong.argmin())
         if wrong[best] <= allowed:

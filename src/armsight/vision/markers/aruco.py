@@ -107,11 +107,9 @@ def detect_markers(image: NDArray[np.uint8], family: str, border: int = 1) -> tu
     ``border``: width of their dark border, cells.
     """
     image = _full_range(image)
-    share = round(4.0 * SIDE_MIN_PX / max(image.shape), 4)
-    found, read, unread = _detector(family, share, border).detectMarkers(image)
+    found, read, unread = _detector(family, round(4.0 * SIDE_MIN_PX / max(image.shape), 4), border).detectMarkers(image)
     identities = [] if read is None else map(int, np.ravel(read))
-    quads = [np.asarray(quad, np.float64).reshape(4, 2) for quad in found]
-    markers = list(zip(identities, quads, strict=True))
+    markers = list(zip(identities, [np.asarray(quad, np.float64).reshape(4, 2) for quad in found], strict=True))
     for quad in unread if _dictionary(family).markerSize >= _CODE_CELLS else ():
         if (code := _nearest_code(image, np.reshape(quad, (4, 2)), family, border)) is not None:
             markers.append(code)

@@ -134,8 +134,7 @@ class Charuco(Record, CalibrationBoard):
         fits = fit_grid(image, completed(rough), arm=plain)  # a marker that was not read hides corners that are there
         y, x = np.mgrid[: self.rows - 1, : self.columns - 1]
         colours = np.sign(fits.contrast) * np.where((x + y) % 2 == 0, 1.0, -1.0).ravel()
-        agree = colours == np.sign(np.sum(colours[fits.kept]))
-        kept = fits.kept & agree & ~misfits(fits)
+        kept = fits.kept & (colours == np.sign(np.sum(colours[fits.kept]))) & ~misfits(fits)
         if kept.sum() < 4:
             return Detections.none(f"{self.body.name} was found but only {kept.sum()} of its corners fit")
         return Detections(np.flatnonzero(kept), fits.uv[kept], fits.cov_uv[kept])
@@ -143,8 +142,7 @@ class Charuco(Record, CalibrationBoard):
     def _rough(self, image: NDArray[np.uint8], corners: Array, identities: NDArray[np.int32], legacy: bool) -> Array:
         """Return (rows - 1, columns - 1, 2) rough corners in one of OpenCV's two layouts; NaN where not seen."""
         rough = np.full(((self.rows - 1) * (self.columns - 1), 2), np.nan)
-        size = (self.columns, self.rows)
-        detector = charuco_detector(size, self.square_m, self.marker_m, self.family, legacy)
+        detector = charuco_detector((self.columns, self.rows), self.square_m, self.marker_m, self.family, legacy)
         ours = (identities >= 0) & (identities < len(self.codes[1]))
         if ours.any():
             markers = list(corners[ours, None].astype(np.float32))

@@ -132,8 +132,7 @@ class Chessboard(Record, CalibrationBoard):
 
     def _canonical_order(self, fits: CornerFits, first_is_dark: bool) -> Ids:
         """Return (M,) the permutation that sorts the fits into the board's order."""
-        here = np.arange(self.columns * self.rows)
-        orders = [here, *(perm for _, perm in self._rotations)]
+        orders = [np.arange(self.columns * self.rows), *(perm for _, perm in self._rotations)]
         dark = [first_is_dark, *(first_is_dark != self._exchanges_colours(n) for n, _ in self._rotations)]
         if any(dark):
             orders = [order for order, is_dark in zip(orders, dark, strict=True) if is_dark]
@@ -181,8 +180,7 @@ def fit_grid(image: NDArray[np.uint8], rough: Array, arm: float = 1.0) -> Corner
     first = refine_corners(image, rough_uv, local_squares(rough)[0].reshape(-1, 2, 2), arm=arm, rough=True)
     uv = np.where(first.kept[:, None], first.uv, rough_uv)
     squares, bows = (array.reshape(-1, 2, 2) for array in local_squares(uv.reshape(rough.shape)))
-    fits = refine_corners(image, uv, squares, bows, arm=arm, like=first)
-    return _in_smaller_copy(image, fits, squares, bows, arm)
+    return _in_smaller_copy(image, refine_corners(image, uv, squares, bows, arm=arm, like=first), squares, bows, arm)
 
 
 def _in_smaller_copy(image: NDArray[np.uint8], fits: CornerFits, squares: Array, bows: Array, arm: float) -> CornerFits:

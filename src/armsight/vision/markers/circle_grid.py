@@ -128,8 +128,7 @@ def _regularity(blobs: Blobs, i: int, js: Ids) -> int:
     length = np.hypot(*z.T)
     count = 0
     for rotated in (-z, np.column_stack([-z[:, 1], z[:, 0]])):
-        gap = np.linalg.norm(z[:, None] - rotated[None], axis=2)
-        count += int((gap.min(axis=0) < _NEAR * length).sum())
+        count += int((np.linalg.norm(z[:, None] - rotated[None], axis=2).min(axis=0) < _NEAR * length).sum())
     return count
 
 
@@ -138,8 +137,7 @@ def _sides(blobs: Blobs, i: int, js: Ids) -> tuple[int, int] | None:
     z = _flattened(blobs, i, js)
     length = np.hypot(*z.T)
     for a in np.argsort(length):
-        across = np.array([-z[a, 1], z[a, 0]])
-        gap = np.linalg.norm(z - across, axis=1)
+        gap = np.linalg.norm(z - np.array([-z[a, 1], z[a, 0]]), axis=1)
         b = int(np.argmin(gap))
         if length[a] > 1.8 and gap[b] < 1.5 * _NEAR * length[a]:
             return int(js[a]), int(js[b])

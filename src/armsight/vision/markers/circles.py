@@ -133,8 +133,7 @@ class CircleGrid(Record, CalibrationBoard):
         """The discs' middles, m, z = 0, named by their number."""
         points = grid_points(self.columns, self.rows, self.pitch_m)
         if self.staggered:
-            row = np.arange(len(points)) // self.columns
-            points[:, 0] = 2.0 * points[:, 0] + (row % 2) * self.pitch_m
+            points[:, 0] = 2.0 * points[:, 0] + ((np.arange(len(points)) // self.columns) % 2) * self.pitch_m
         return Body(self.spec, tuple(str(i) for i in range(len(points))), points)
 
     @cached_property

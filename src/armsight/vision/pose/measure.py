@@ -163,8 +163,7 @@ def measure_detections(
     rig: StereoRig, body: Body, left: Detections, right: Detections, *, symmetries: tuple[np.ndarray, ...] = ()
 ) -> PoseEstimate | Missed:
     """Measure a body from what each camera detected; ``symmetries`` as in :func:`~armsight.vision.match.match`."""
-    seen = match(rig, body, left, right, symmetries=symmetries)
-    result = locate(rig, body, triangulate(rig, body, seen))
+    result = locate(rig, body, triangulate(rig, body, match(rig, body, left, right, symmetries=symmetries)))
     if isinstance(result, Missed) and _exchanged(rig, body, left, right):
         return Missed(f"left and right are exchanged: the images fit the rig the other way round ({result.reason})")
     return result

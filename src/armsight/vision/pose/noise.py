@@ -65,8 +65,7 @@ class DiscNoise:
             expected[m], by_p, _ = camera.project_jacobians(p[m] @ T[:3, :3].T + T[:3, 3])
             by_point[m] = by_p @ T[:3, :3]
         by_pose = np.concatenate([by_point, by_point @ np.array([-skew(each) for each in p])], axis=2)
-        factors = np.array(self.rig.disc_variance_factors)[side]
-        image = cov / factors[:, None, None]
+        image = cov / np.array(self.rig.disc_variance_factors)[side][:, None, None]
         self._shots.append(_Shot(ids - self._first, side, uv, uv - expected, image, by_pose, by_point))
 
     def found(self) -> tuple[CameraNoise, CameraNoise] | None:

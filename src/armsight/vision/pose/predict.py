@@ -65,8 +65,7 @@ def look_direction(points: Array, normals: Array) -> Array:
         normal = np.linalg.svd(points - points.mean(axis=0))[2][2]
         first = normal[np.abs(normal) > 1e-9][-1]
         return np.asarray(-np.sign(first) * normal)
-    candidates = [known.mean(axis=0), *known]
-    units = [c / np.linalg.norm(c) for c in candidates if np.linalg.norm(c) > 0.1]
+    units = [c / np.linalg.norm(c) for c in [known.mean(axis=0), *known] if np.linalg.norm(c) > 0.1]
     return np.asarray(max(units, key=lambda v: (int((known @ v > FACING).sum()), float((known @ v).clip(0).sum()))))
 
 
@@ -98,8 +97,7 @@ def view(
     axes = _axes(forward, np.array([1.0, 0.0, 0.0]))
     middle = middle + axes[:, :2] @ np.array(aside_m)
     R = axes @ exp_so3(np.array([*rotation, roll])) @ face_axes(towards).T
-    facing = normals @ towards > FACING
-    used = facing | ~np.isfinite(normals).all(axis=1)
+    used = (normals @ towards > FACING) | ~np.isfinite(normals).all(axis=1)
     return view_at(rig, points, normals, pose(R, middle - R @ points[used].mean(axis=0)), forward)
 
 

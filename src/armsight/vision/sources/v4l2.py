@@ -122,8 +122,7 @@ def control_range(device: int, ioctl: Ioctl, control: int, unit: float = 1.0) ->
 def find_cameras(sys: Path = Path("/sys/class/video4linux"), dev: Path = Path("/dev")) -> list[VideoDevice]:
     """List the attached cameras; devices that deliver no images (metadata, output) are left out."""
     cameras = []
-    nodes = sorted(sys.glob("video*"), key=natural_key) if sys.is_dir() else []
-    for node in nodes:
+    for node in sorted(sys.glob("video*"), key=natural_key) if sys.is_dir() else []:
         path = dev / node.name
         links = [link for kind in ("by-id", "by-path") for link in sorted((dev / "v4l" / kind).glob("*"))]
         stable = tuple(str(link) for link in links if link.resolve() == path.resolve())

@@ -279,8 +279,7 @@ class Ar4Board(PolledBoard):
         """Return whether the encoders may read so, degrees, after what they read before."""
         if not np.any(reported):
             return True  # a Teensy that has restarted
-        width = self.model.high_deg - self.model.low_deg
-        if np.any(np.abs(reported) > width + 2 * _MARGIN_DEG):
+        if np.any(np.abs(reported) > (self.model.high_deg - self.model.low_deg) + 2 * _MARGIN_DEG):
             return False
         if not self._t_s > 0.0:  # the first reading, or the first after homing
             return True

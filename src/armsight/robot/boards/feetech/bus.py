@@ -69,8 +69,7 @@ class ServoBus:
 
     def write(self, id: int, register: Register, value: int) -> None:
         """Write a register of a servo, which acknowledges it, or raise DeviceError: it does not."""
-        data = bytes((register.address,)) + register.encode(value)
-        self._asked(packet(id, Instruction.WRITE, data), [id], 0)
+        self._asked(packet(id, Instruction.WRITE, bytes((register.address,)) + register.encode(value)), [id], 0)
 
     def states(self, ids: Sequence[int]) -> ServoStates:
         """Return the states of servos, all read with one question, or raise DeviceError: one does not answer."""

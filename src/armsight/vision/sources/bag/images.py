@@ -177,8 +177,7 @@ def open_bag_source(rest: str) -> BagSource:
     """Open ``FILE[,left=TOPIC][,right=TOPIC]``; InputError without images of both, or where topics are ambiguous."""
     path, named = parsed(rest)
     bag = Bag(path)
-    topics = image_topics(bag, named)
-    return source_of(bag, topics)
+    return source_of(bag, image_topics(bag, named))
 
 
 def source_of(bag: Bag, topics: tuple[str, str]) -> BagSource:
