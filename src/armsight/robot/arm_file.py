@@ -76,12 +76,9 @@ _LONGEST = 20.0  # a longer link is rejected as a mistake of units, m
 def open_arm(name_or_path: str | Path) -> Arm:
     """Return the arm of a built-in model's name, of a .toml file or of a .urdf file.
 
-    Args:
-        name_or_path: such as "six_r", "my_arm.toml", "my_arm.urdf", or "my_arm.urdf#tool0" where the link tool0 is the
-            tool; without it the chain's last link is.
-
-    Raises:
-        InputError: the name is unknown, the file is unreadable or holds no arm, or a tool link for what is no .urdf file.
+    ``name_or_path``: such as "six_r", "my_arm.toml", "my_arm.urdf", or "my_arm.urdf#tool0" where the link tool0 is the
+    tool; without it the chain's last link is. Raises InputError: the name is unknown, the file is unreadable or holds no
+    arm, or a tool link for what is no .urdf file.
     """
     text = str(name_or_path)
     path, link = split_arm(text)
@@ -235,9 +232,8 @@ def undetermined(moved_m: float, sigma_m: float) -> str:
 
     The nominal arm is off by moved^2 - sigma^2 on the mean, the corrected one by sigma^2: from here on it is no better.
 
-    Args:
-        moved_m: how far the identified arm puts its tool from the nominal one's, RMS over the joint limits, m.
-        sigma_m: sigma of that, m.
+    ``moved_m``: how far the identified arm puts its tool from the nominal one's, RMS over the joint limits, m; ``sigma_m``:
+    sigma of that, m.
     """
     if not 2 * sigma_m**2 > moved_m**2:
         return ""

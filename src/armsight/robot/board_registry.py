@@ -102,9 +102,8 @@ def slowed(arm: Arm, name: str) -> Arm:
 def open_board(name: str, plant: Plant | None = None, *, config: Configuration | None = None) -> Board:
     """Open a board with our firmware, an emulated one with a configuration (the lab's without) that waits for ``receive``.
 
-    Raises:
-        InputError: there is no such kind of board, it has another controller, or an emulated one has no plant.
-        DeviceError: it does not answer, or is of another version.
+    Raises InputError: there is no such kind of board, it has another controller, or an emulated one has no plant;
+    DeviceError: it does not answer, or is of another version.
     """
     if name.startswith(SERIAL):
         port, baud, _ = serial_port(name, BAUD)
@@ -132,8 +131,7 @@ def emulator_name(name: str) -> str:
 def configured(link: EmulatedLink, config: Configuration | None = None) -> Board:
     """Store a configuration (the lab's without) on a fresh emulated board, restart it, and return it.
 
-    Raises:
-        InputError: a value of the configuration is outside its range.
+    Raises InputError: a value of the configuration is outside its range.
     """
     board = Board.connect(link, name="the emulated board")
     try:

@@ -6,9 +6,8 @@ to wrist_3 (``ur_calibration``, beside a ``hash``), the xArm's joint1 to joint7 
 controller keeps ``calibration.conf``: delta_theta, delta_a, delta_d, delta_alpha, m and rad, are added to the table.
 
 In: such a file and the nominal arm, whose limits, names and tool hold. Out: an :class:`Arm`, exactly, axes that are a
-little
-off parallel included. And back: any arm, such as an identified one, as such a file, its joints' frames as near to those of
-the nominal table as its axes allow; and how far the two arms put their tools apart.
+little off parallel included. And back: any arm, such as an identified one, as such a file, its joints' frames as near to
+those of the nominal table as its axes allow; and how far the two arms put their tools apart.
 """
 
 from __future__ import annotations

@@ -154,16 +154,9 @@ def _tried(
 def path(rig: StereoRig, patterns: Sequence[Pattern], times_s: Array) -> tuple[Array, Array]:
     """Return a smooth path of a target through the volume that both cameras see; its start comes back after some ten s.
 
-    Args:
-        rig: the cameras.
-        patterns: the target; all of it stays in view.
-        times_s: (N,) times, s.
-
-    Returns:
-        (N, 4, 4) poses of the target in the left camera's frame, m, and (N, 6) its velocity in its own axes, m/s, rad/s.
-
-    Raises:
-        InputError: the target is not in view even at rest in the middle.
+    ``patterns``: the target; all of it stays in view. ``times_s``: (N,) times, s. Returns (N, 4, 4) poses of the target in
+    the left camera's frame, m, and (N, 6) its velocity in its own axes, m/s, rad/s. Raises InputError: the target is not in
+    view even at rest in the middle.
     """
     distance_m = 0.5  # of the path's middle from the cameras
     middle = _between(rig, np.array([distance_m]))[0]

@@ -94,11 +94,9 @@ def plain_model() -> JointModel:
 def drawn_model(seed: int, *, load: float = 0.6, inertia: float = 6.0, spread: float = 0.15) -> JointModel:
     """Return joints as they come out of a workshop.
 
-    Args:
-        seed: of all that is drawn.
-        load: greatest gravity load with payload, of the stall torque, either way.
-        inertia: greatest inertia, of the data sheet's; the least is half of it.
-        spread: how far resistance and motor constant are off the data sheet, at most.
+    ``load``: greatest gravity load with payload, of the stall torque, either way. ``inertia``: greatest inertia, of the
+    data sheet's; the least is half of it. ``spread``: how far resistance and motor constant are off the data sheet, at
+    most.
     """
     rng = np.random.default_rng([seed, 20])
     off = rng.uniform(1 - spread, 1 + spread, (2, JOINTS))

@@ -215,12 +215,8 @@ class Camera(Record):
     def project_jacobians(self, p: Array) -> tuple[Array, Array, Array]:
         """Project points and differentiate.
 
-        Args:
-            p: (N, 3) points, m, this camera's frame.
-
-        Returns:
-            (N, 2) raw pixels, NaN behind the camera; (N, 2, 3) derivative by the point, px/m; (N, 2, 4 + n) derivative
-            by the camera's parameters.
+        ``p``: (N, 3) points, m, this camera's frame. Returns (N, 2) raw pixels, NaN behind the camera; (N, 2, 3) derivative
+        by the point, px/m; (N, 2, 4 + n) derivative by the camera's parameters.
         """
         p = np.ascontiguousarray(p, dtype=np.float64)
         uv, J_p, J_k = np.empty((len(p), 2)), np.empty((len(p), 2, 3)), np.empty((len(p), 2, 12))

@@ -40,9 +40,8 @@ class SeenShot(Record):
 def read_detections(path: str | Path, body: Body) -> list[SeenShot]:
     """Read a CSV file of detections of a body: one record per shot, in the file's order.
 
-    Raises:
-        InputError: missing file or column, text or NaN where a number must be, an unknown camera or marker, no line at
-            all; the message names file and line.
+    Raises InputError: missing file or column, text or NaN where a number must be, an unknown camera or marker, no line at
+    all; the message names file and line.
     """
     rows = read_table(path)
     if not rows:
@@ -98,8 +97,7 @@ def detections_text(shots: Iterable[tuple[str, float | None, Correspondences]], 
 def detection_times(path: str | Path) -> dict[str, float]:
     """Return the times of the shots of a file of detections that has the column ``t_s``, by their names; else nothing.
 
-    Raises:
-        InputError: a time is no number.
+    Raises InputError: a time is no number.
     """
     rows = read_table(path)
     header = [name.strip() for name in rows[0]] if rows else []

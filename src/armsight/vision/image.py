@@ -38,8 +38,7 @@ _STDERR = threading.Lock()
 def _quiet() -> Iterator[None]:
     """Discard what C libraries write to file descriptor 2: libjpeg and libpng print warnings there, past Python.
 
-    The descriptor is the process's, so the lock admits one decoder at a time and the replacement lasts for one decode
-    only.
+    The descriptor is the process's, so the lock admits one decoder at a time and the replacement lasts for one decode only.
     """
     with _STDERR:
         kept, null = os.dup(2), os.open(os.devnull, os.O_WRONLY)
@@ -114,11 +113,8 @@ def _right_angles(file: IO[bytes]) -> int:
 def read_image(path: str | Path) -> Image:
     """Read an image file as stored, for pixels must stay where the camera has them; only a TIFF's mirroring is applied.
 
-    Returns:
-        (H, W) grey or (H, W, 3) BGR, uint8 or uint16.
-
-    Raises:
-        InputError: missing, unreadable, not an image, or truncated; the message names the file.
+    Returns (H, W) grey or (H, W, 3) BGR, uint8 or uint16. Raises InputError: missing, unreadable, not an image, or
+    truncated; the message names the file.
     """
     with opened(path, _RAW_MB) as file:
         piecewise = os.fstat(file.fileno()).st_size > IMAGE_MB * 1e6 and not file.read(8).startswith(tuple(_FORMATS))
@@ -221,8 +217,7 @@ class BitDepth:
 
     Converters of fewer than 16 bits leave the high ones empty (GenICam's PFNC: Mono12), and the file does not say so.
 
-    Args:
-        first: images that are looked at before the first uint16 image is scaled, so that the scale stays.
+    ``first``: images that are looked at before the first uint16 image is scaled, so that the scale stays.
     """
 
     def __init__(self, first: Callable[[], Iterable[Image]] = tuple) -> None:

@@ -37,13 +37,8 @@ def join(left: Detections, right: Detections) -> Correspondences:
 def epipolar_distances(rig: StereoRig, uv_left: Array, uv_right: Array) -> Array:
     """Measure the distance of each point from the epipolar line of its partner.
 
-    Args:
-        rig: the calibrated pair.
-        uv_left: (N, 2) raw pixels.
-        uv_right: (N, 2) raw pixels of the same points.
-
-    Returns:
-        (N, 2) distance in the left and in the right image, undistorted px; NaN where a pixel has no ray.
+    ``uv_left``: (N, 2) raw pixels; ``uv_right``: (N, 2) raw pixels of the same points. Returns (N, 2) distance in the left
+    and in the right image, undistorted px; NaN where a pixel has no ray.
     """
     out = np.empty((len(uv_left), 2))
     focal = np.array([camera.intrinsics[:2] for camera in rig.cameras])
@@ -97,16 +92,10 @@ def match(
 ) -> Correspondences:
     """Match one shot's detections: identity, then the epipolar gate.
 
-    Args:
-        rig: the calibrated pair.
-        body: the body of both detections.
-        left: detections of the left camera.
-        right: detections of the right camera.
-        symmetries: permutations (M,) under which the body looks the same, so that its points may have been named by any
-            of them; the one with which most pairs agree with the rig is applied to the right camera.
-
-    Returns:
-        The correspondences; points seen by one camera only are kept, for they constrain the pose too.
+    ``body``: the body of both detections. ``left``: detections of the left camera. ``right``: detections of the right
+    camera. ``symmetries``: permutations (M,) under which the body looks the same, so that its points may have been named by
+    any of them; the one with which most pairs agree with the rig is applied to the right camera. Returns the
+    correspondences; points seen by one camera only are kept, for they constrain the pose too.
     """
     best = join(left, right)
     if symmetries and best.paired.any():

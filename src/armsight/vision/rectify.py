@@ -49,8 +49,7 @@ class Rectification(Record):
     def images(self, left: Image, right: Image) -> tuple[Image, Image]:
         """Rectify a pair of raw images; where a camera sees nothing they are black.
 
-        Raises:
-            InputError: an image is not of the size its camera was calibrated at.
+        Raises InputError: an image is not of the size its camera was calibrated at.
         """
         out = []
         for side, image in zip(SIDES, (left, right), strict=True):

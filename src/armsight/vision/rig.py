@@ -157,8 +157,7 @@ class StereoRig(Record):
 
         What moves all points of an image by c + k x is another principal point and focal length.
 
-        Args:
-            common: (2, 2, 3) of each camera, as :class:`~armsight.data.Correspondences` have it.
+        ``common``: (2, 2, 3) of each camera, as :class:`~armsight.data.Correspondences` have it.
         """
         cov = np.array(self.cov)
         for first, camera, shifts in zip((0, 4 + len(self.left.distortion)), self.cameras, common, strict=True):
@@ -225,8 +224,7 @@ class StereoRig(Record):
 
         NaN where two rays do not meet before both cameras.
 
-        Raises:
-            InputError: not as many pixels of both cameras, or not two numbers each.
+        Raises InputError: not as many pixels of both cameras, or not two numbers each.
         """
         from armsight.vision.triangulate import optimal_points
 
@@ -245,11 +243,7 @@ class StereoRig(Record):
         return rectify(self)
 
     def save(self, path: str | Path) -> None:
-        """Write the rig as JSON, in one step.
-
-        Raises:
-            InputError: the file cannot be written.
-        """
+        """Write the rig as JSON, in one step. Raises InputError: the file cannot be written."""
         write_text(path, self.to_text())
 
     def to_text(self) -> str:
@@ -284,8 +278,7 @@ class StereoRig(Record):
     def load(path: str | Path) -> StereoRig:
         """Read a rig file.
 
-        Raises:
-            InputError: missing, not a rig, of a newer version, or inconsistent; the message names the file.
+        Raises InputError: missing, not a rig, of a newer version, or inconsistent; the message names the file.
         """
         return StereoRig.from_text(read_text(path), path)
 
@@ -293,8 +286,7 @@ class StereoRig(Record):
     def load_trusted(path: str | Path) -> StereoRig:
         """Return the rig of a file to measure with.
 
-        Raises:
-            InputError: as :meth:`load`, or its calibration said that its images contradict each other.
+        Raises InputError: as :meth:`load`, or its calibration said that its images contradict each other.
         """
         rig = StereoRig.load(path)
         if (by_px := rig.provenance.get(CONTRADICTED)) is not None:
@@ -308,8 +300,7 @@ class StereoRig(Record):
     def from_text(text: str, path: str | Path) -> StereoRig:
         """Return the rig of a rig file's text; ``path`` is where it comes from, for messages.
 
-        Raises:
-            InputError: not a rig, of a newer version, or inconsistent; the message names the file.
+        Raises InputError: not a rig, of a newer version, or inconsistent; the message names the file.
         """
         document = _document(text, path)
         try:

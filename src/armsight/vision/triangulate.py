@@ -28,13 +28,8 @@ _LOOKING = 0.99
 def midpoints(rig: StereoRig, uv_left: Array, uv_right: Array) -> Array:
     """Return the points halfway between the two rays of each pair of raw pixels.
 
-    Args:
-        rig: the calibrated pair.
-        uv_left: (N, 2) raw pixels.
-        uv_right: (N, 2) raw pixels of the same points.
-
-    Returns:
-        (N, 3) points, m, left frame; NaN where the rays are parallel or come closest behind a camera.
+    ``uv_left``: (N, 2) raw pixels; ``uv_right``: (N, 2) raw pixels of the same points. Returns (N, 3) points, m, left
+    frame; NaN where the rays are parallel or come closest behind a camera.
     """
     p = np.empty((len(uv_left), 3))
     _between(rig.left.unproject(uv_left), rig.right.unproject(uv_right), np.array(rig.T_left_right), p)
@@ -65,9 +60,8 @@ def _between(rays_left: Array, rays_right: Array, T: Array, p: Array) -> None:
 def optimal_points(rig: StereoRig, uv: Array, cov_uv: Array) -> tuple[Array, Array, Array]:
     """Triangulate pairs of raw pixels uv (N, 2, 2), point and camera, of positive definite cov_uv (N, 2, 2, 2), px^2.
 
-    Returns:
-        (N, 3) points, m, left frame, NaN where the rays do not meet before both cameras; (N, 3, 3) covariance from the
-        pixel noise, m^2; (N, 3, P) derivative by the rig's parameters.
+    Returns (N, 3) points, m, left frame, NaN where the rays do not meet before both cameras; (N, 3, 3) covariance from the
+    pixel noise, m^2; (N, 3, P) derivative by the rig's parameters.
     """
     T, n = np.array(rig.T_left_right), len(uv)
     rays = rig.left.unproject(uv[:, 0]), rig.right.unproject(uv[:, 1])
@@ -257,14 +251,9 @@ def _ahead(p: Array, ray_left: Array, q: Array, ray_right: Array) -> bool:
 def triangulate(rig: StereoRig, body: Body, seen: Correspondences) -> Points:
     """Triangulate one shot's matched points.
 
-    Args:
-        rig: the calibrated pair; its ``sigma_px`` adds to the detections' covariance.
-        body: names the points.
-        seen: the correspondences of both cameras, gated.
-
-    Returns:
-        The points with their covariance; a point that does not lie before both cameras is dropped by name, and its
-        detections with it.
+    ``rig``: the calibrated pair; its ``sigma_px`` adds to the detections' covariance. ``body``: names the points. ``seen``:
+    the correspondences of both cameras, gated. Returns the points with their covariance; a point that does not lie before
+    both cameras is dropped by name, and its detections with it.
     """
     rows = np.flatnonzero(seen.paired)
     cov_uv = seen.cov_uv[rows] + max(rig.sigma_px, 1e-6) ** 2 * np.eye(2)

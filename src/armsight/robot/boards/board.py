@@ -252,9 +252,8 @@ class Board(Closing):
     def send(self, command: JointCommand) -> int:
         """Send a motion command and return its number; :attr:`status` says whether it was acknowledged.
 
-        Raises:
-            InputError: a shape, a number that is not finite, or a duration that is no whole number of ticks.
-            DeviceError: the board is gone.
+        Raises InputError: a shape, a number that is not finite, or a duration that is no whole number of ticks;
+        DeviceError: the board is gone.
         """
         ticks = command.duration_s * self._ticks_per_s
         if not 0.5 <= ticks <= _LONGEST_TICKS or abs(ticks - round(ticks)) > 1e-6 * ticks:
@@ -315,8 +314,7 @@ class Board(Closing):
     def watch_sensors(self, every_s: float) -> None:
         """Let the board report so often what its converters read; 0 ends it. :meth:`sensed` returns it.
 
-        Raises:
-            DeviceError: it does not answer.
+        Raises DeviceError: it does not answer.
         """
         ask = self._command_long
         ask(_SET_MESSAGE_INTERVAL, dialect().MAVLINK_MSG_ID_SENSED, 1e6 * every_s)
@@ -326,8 +324,7 @@ class Board(Closing):
     def sensed(self, wait_s: float = 0.0) -> SensorReadings:
         """Let ``wait_s`` pass and return what the converters read since the last call.
 
-        Raises:
-            DeviceError: the board is gone or has restarted.
+        Raises DeviceError: the board is gone or has restarted.
         """
         self._pump(wait_s)
         self._angles.clear()

@@ -108,9 +108,8 @@ class MotionBoard(Closing, Protocol):
     def send(self, command: JointCommand) -> int:
         """Send a motion command and return its number.
 
-        Raises:
-            InputError: a shape, a number that is not finite, or what the board rejects at once.
-            DeviceError: the board is gone.
+        Raises InputError: a shape, a number that is not finite, or what the board rejects at once; DeviceError: the board
+        is gone.
         """
 
     def command(self, command: Command) -> int:

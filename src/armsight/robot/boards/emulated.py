@@ -48,13 +48,10 @@ class Faults(Protocol):
 class EmulatedLink:
     """A board in lock-step, behind the contract of :class:`~armsight.robot.boards.link.Link`; it closes its emulator.
 
-    Args:
-        emulator: runs the firmware.
-        plant: the arm at the board's motors.
-        baud: bits a second towards the board, as its own wire has: it gives a message up that comes much slower.
-        faults: what goes wrong on the wire.
-        advance: lets seconds pass instead, calling ``step`` once a millisecond: for a simulation that owns the time.
-        watch: called with every answer frame (``pil_answer`` as bytes), for traces.
+    ``emulator``: runs the firmware; ``baud``: bits a second towards the board, as its own wire has: it gives a message up
+    that comes much slower; ``faults``: what goes wrong on the wire; ``advance``: lets seconds pass instead, calling
+    ``step`` once a millisecond: for a simulation that owns the time; ``watch``: called with every answer frame
+    (``pil_answer`` as bytes), for traces.
     """
 
     def __init__(

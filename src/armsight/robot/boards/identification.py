@@ -62,14 +62,10 @@ class JointFit(Record):
 def fit_swing(t_s: Array, voltage_v: Array, current_a: Array, angle_rad: Array) -> JointFit:
     """Identify a joint's motor from a swing.
 
-    Args:
-        t_s: (n,) times of the readings, rising, s.
-        voltage_v: (n,) duty times supply, V, positive where it drives the joint towards greater angles.
-        current_a: (n,) current of the motor, A, of the same sign; of one sign only from sensors that know no other.
-        angle_rad: (n,) angles of the joint.
-
-    Raises:
-        InputError: there are too few readings, or the joint did not move, or nothing of it looks like a motor.
+    ``t_s``: (n,) times of the readings, rising, s. ``voltage_v``: (n,) duty times supply, V, positive where it drives the
+    joint towards greater angles. ``current_a``: (n,) current of the motor, A, of the same sign; of one sign only from
+    sensors that know no other. ``angle_rad``: (n,) angles of the joint. Raises InputError: there are too few readings, or
+    the joint did not move, or nothing of it looks like a motor.
     """
     if len(t_s) < _LEAST_READINGS or np.ptp(angle_rad) < _LEAST_SWING_RAD:
         raise InputError(
@@ -107,11 +103,8 @@ def _evenly(t_s: Array, *recorded: Array) -> tuple[float, Array, list[Array]]:
 def fit_spring(t_s: Array, voltage_v: Array, current_a: Array, angle_rad: Array) -> tuple[JointFit, Elasticity] | None:
     """Identify a joint that is read behind a spring, from a swing with duties at :data:`DITHER_HZ`; None if it is rigid.
 
-    Args:
-        t_s: (n,) times of the readings, rising, s; 1.5 s and more.
-        voltage_v: (n,) duty times supply, V, as in :func:`fit_swing`.
-        current_a: (n,) current of the motor, A, with its sign.
-        angle_rad: (n,) angles of the joint.
+    ``t_s``: (n,) times of the readings, rising, s; 1.5 s and more. ``voltage_v``: (n,) duty times supply, V, as in
+    :func:`fit_swing`. ``current_a``: (n,) current of the motor, A, with its sign. ``angle_rad``: (n,) angles of the joint.
     """
     if (
         len(t_s) < _LEAST_READINGS

@@ -35,10 +35,8 @@ class Plant(Protocol):
     def step(self, duty: Array, awake: bool, braked: bool = False) -> None:
         """Let 1 ms pass with these duties (6,), -1 to 1, held.
 
-        Args:
-            duty: zeros brake the motors, by their own windings.
-            awake: False: the drivers are switched off, and the motors' circuits are open.
-            braked: whether the board closes the brakes, where there are any.
+        ``duty``: zeros brake the motors, by their own windings; ``awake``: False: the drivers are switched off, and the
+        motors' circuits are open; ``braked``: whether the board closes the brakes, where there are any.
         """
         ...
 

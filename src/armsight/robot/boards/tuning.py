@@ -10,10 +10,9 @@ bandwidth w, the faster one at v = w / 0.35 (or another ratio), ``(s^2 + 2 z w s
 
 (t as if D were 0. Only half of what the motor damps by itself is counted: it is known to 15 % at first, and kd also says
 how hard a joint is held against a push.) For the noise that a potentiometer puts into the duty, a filter within the loop
-lets the bandwidth be half again as great as one beside it.
-The feed-forward gives what the motion itself takes, so that nothing is left to the error: ``kv = D / S + kd``,
-``ka = J / S - kd t``, ``kf = C / S``; t is by how much the filtered speed is late, which damps the less while the motion
-accelerates.
+lets the bandwidth be half again as great as one beside it. The feed-forward gives what the motion itself takes, so that
+nothing is left to the error: ``kv = D / S + kd``, ``ka = J / S - kd t``, ``kf = C / S``; t is by how much the filtered
+speed is late, which damps the less while the motion accelerates.
 
 A load that changes by P N m a second leaves the error ``P / (S ki)``: :func:`quiet_gains` looks for the greatest ki that
 the noise of the readings admits. (Åström and Murray, "Feedback Systems", 2008, sections 10.2 and 10.5; Ellis, "Control
@@ -78,18 +77,9 @@ def tuned_gains(
 ) -> Array:
     """Return the gains of a joint by the rule above.
 
-    Args:
-        motor: its motor.
-        supply_v: nominal supply, V.
-        bandwidth_rad_s: natural frequency of the slower pair of poles, rad/s.
-        damping: of both pairs, of critical.
-        pairs: natural frequency of the slower pair over that of the faster one, 0 to 1.
-
-    Returns:
-        (8,) kp, ki, kd, kv, ka, kf, derivative filter, anti-windup.
-
-    Raises:
-        InputError: a number is not positive.
+    ``supply_v``: nominal supply, V; ``bandwidth_rad_s``: natural frequency of the slower pair of poles, rad/s; ``damping``:
+    of both pairs, of critical; ``pairs``: natural frequency of the slower pair over that of the faster one, 0 to 1. Returns
+    (8,) kp, ki, kd, kv, ka, kf, derivative filter, anti-windup. Raises InputError: a number is not positive.
     """
     needed = {"supply_v": supply_v, "bandwidth_rad_s": bandwidth_rad_s, "damping": damping}
     needed |= {name: getattr(motor, name) for name in ("resistance_ohm", "constant_v_s", "inertia_kg_m2")}
@@ -130,14 +120,9 @@ def elastic_gains(motor: MotorFigures, supply_v: float, elastic: Elasticity, noi
     Hutchinson and Vidyasagar, "Robot Modeling and Control", 2006, section 6.5). Backlash that opens is a softer spring, the
     softer the smaller the swing (Gelb and Vander Velde, "Multiple-Input Describing Functions", 1968, chapter 2).
 
-    Args:
-        motor: its motor; the inertia is that of motor and joint together.
-        supply_v: nominal supply, V.
-        elastic: its spring.
-        noise_rad: standard deviation of a reading.
-
-    Returns:
-        (8,) as those of :func:`tuned_gains`; None where the joint is too soft: no bandwidth from 5 rad/s on is stable.
+    ``motor``: its motor; the inertia is that of motor and joint together. ``supply_v``: nominal supply, V. ``elastic``: its
+    spring. ``noise_rad``: standard deviation of a reading. Returns (8,) as those of :func:`tuned_gains`; None where the
+    joint is too soft: no bandwidth from 5 rad/s on is stable.
     """
     best: Array | None = None
     springs = [(share, elastic.damping_n_m_s, _LEAST_MARGIN) for share in _STIFFNESSES]

@@ -101,8 +101,7 @@ class Arm(Record):
     def __post_init__(self) -> None:
         """Check the numbers and pack them for the kernels.
 
-        Raises:
-            InputError: a wrong shape, a value that is not finite, or a limit that is not positive.
+        Raises InputError: a wrong shape, a value that is not finite, or a limit that is not positive.
         """
         joints = mode(np.size(getattr(self, name)) for name in ("a", "d", "alpha", "q_min", "q_max"))
         if not FEWEST_JOINTS <= joints <= MOST_JOINTS:
@@ -186,14 +185,8 @@ class Arm(Record):
     def forward(self, q: ArrayLike) -> Array:
         """Return the pose T_base_tool of the tool.
 
-        Args:
-            q: (n,) joint angles, rad, or (N, n) of them.
-
-        Returns:
-            (4, 4) T_base_tool, m, or (N, 4, 4).
-
-        Raises:
-            InputError: wrong shape, NaN, or angles that are no radians.
+        ``q``: (n,) joint angles, rad, or (N, n) of them. Returns (4, 4) T_base_tool, m, or (N, 4, 4). Raises InputError:
+        wrong shape, NaN, or angles that are no radians.
         """
         angles = self._angles(q)
         if angles.ndim == 1:
@@ -209,12 +202,8 @@ class Arm(Record):
     def links(self, q: ArrayLike) -> Array:
         """Return the frames of all links.
 
-        Args:
-            q: (n,) joint angles, rad.
-
-        Returns:
-            (n + 2, 4, 4) in the base, m: the table's frame 0, the frames of links 1 to n by the arm's own convention, the
-            tool.
+        ``q``: (n,) joint angles, rad. Returns (n + 2, 4, 4) in the base, m: the table's frame 0, the frames of links 1 to n
+        by the arm's own convention, the tool.
         """
         angles = self._angles(q, batch=False)
         Ts = np.empty((self.joints + 2, 4, 4))
@@ -226,12 +215,8 @@ class Arm(Record):
     def jacobian(self, q: ArrayLike, frame: Axes = "base") -> Array:
         """Return the geometric Jacobian: [velocity of the tool's point, m/s; angular velocity, rad/s] = J @ qd.
 
-        Args:
-            q: (n,) joint angles, rad, or (N, n) of them.
-            frame: the axes in which the velocities are given, "base" or "tool".
-
-        Returns:
-            (6, n) J_base or J_tool, or (N, 6, n).
+        ``q``: (n,) joint angles, rad, or (N, n) of them; ``frame``: the axes in which the velocities are given, "base" or
+        "tool". Returns (6, n) J_base or J_tool, or (N, 6, n).
         """
         angles, in_tool_axes = self._angles(q), _in_tool_axes(frame)
         if angles.ndim == 1:
@@ -247,13 +232,8 @@ class Arm(Record):
     def jacobian_rate(self, q: ArrayLike, qd: ArrayLike, frame: Axes = "base") -> Array:
         """Return the time derivative of :meth:`jacobian`.
 
-        Args:
-            q: (n,) joint angles, rad.
-            qd: (n,) joint speeds, rad/s.
-            frame: as in :meth:`jacobian`.
-
-        Returns:
-            (6, n) the derivative of each entry by time, 1/s.
+        ``q``: (n,) joint angles, rad; ``qd``: (n,) joint speeds, rad/s; ``frame``: as in :meth:`jacobian`. Returns (6, n)
+        the derivative of each entry by time, 1/s.
         """
         angles, speeds = self._angles(q, batch=False), self.coupling @ checked(qd, (self.joints,), "qd")
         J = np.empty((6, self.joints))
@@ -266,11 +246,7 @@ class Arm(Record):
 
         For fewer than six joints it is sqrt(det(J^T J)): 0 where some joints together do not move the tool.
 
-        Args:
-            q: (n,) joint angles, rad, or (N, n) of them.
-
-        Returns:
-            () or (N,).
+        ``q``: (n,) joint angles, rad, or (N, n) of them. Returns () or (N,).
         """
         if self.joints == 6:
             return np.asarray(np.abs(np.linalg.det(self.jacobian(q))))
@@ -282,21 +258,16 @@ class Arm(Record):
         Of six joints: all of up to eight, exact to rounding, where the table has a closed form (``kinematics.structure``
         says which do); else those that damped least squares finds from many starts. Of another number of joints: one
         solution within the limits, the first that is found from ``near`` and then from other starts
-        (``kinematics.numeric``).
-        Seven joints leave a motion free: it keeps near ``near``, or the middle of the limits, and away from the limits.
-        Fewer than six reach few poses exactly: the position comes first, then the direction of the tool's z axis, then the
-        rotation
-        about it; ``residual_rad`` says what is left. Nothing is raised for a pose out of reach or singular: the result says
-        so.
+        (``kinematics.numeric``). Seven joints leave a motion free: it keeps near ``near``, or the middle of the limits, and
+        away from the limits. Fewer than six reach few poses exactly: the position comes first, then the direction of the
+        tool's z axis, then the rotation about it; ``residual_rad`` says what is left. Nothing is raised for a pose out of
+        reach or singular: the result says so.
 
-        Args:
-            T_base_tool: (4, 4) where the tool shall be, m. A rotation off by up to 1e-6 is made orthonormal.
-            near: (n,) joint angles, rad: solutions are sorted by their distance from these (the root of the sum of
-                squares), the revolution nearest to them is taken, and a joint that is not determined gets its value
-                of these. Without: the revolution nearest 0, and 0.
-
-        Raises:
-            InputError: not a rigid motion, wrong shape, NaN, or ``near`` in what are no radians.
+        ``T_base_tool``: (4, 4) where the tool shall be, m. A rotation off by up to 1e-6 is made orthonormal. ``near``: (n,)
+        joint angles, rad: solutions are sorted by their distance from these (the root of the sum of squares), the
+        revolution nearest to them is taken, and a joint that is not determined gets its value of these. Without: the
+        revolution nearest 0, and 0. Raises InputError: not a rigid motion, wrong shape, NaN, or ``near`` in what are no
+        radians.
         """
         T = poses_of(T_base_tool, 2)
         if self.joints != 6 or self._coupled:
@@ -317,9 +288,8 @@ class Arm(Record):
     def inverse_batch(self, Ts_base_tool: ArrayLike, near: ArrayLike | None = None) -> ManySolutions:
         """Return all joint angles for many poses, without reasons and nearest poses.
 
-        Args:
-            Ts_base_tool: (N, 4, 4) where the tool shall be, m.
-            near: (n,) joint angles, rad: what a joint that is not determined is given, 0 by default; the order stays.
+        ``Ts_base_tool``: (N, 4, 4) where the tool shall be, m. ``near``: (n,) joint angles, rad: what a joint that is not
+        determined is given, 0 by default; the order stays.
         """
         Ts = poses_of(Ts_base_tool, 3)
         if self.joints != 6:

@@ -30,12 +30,9 @@ _A, _D, _COS, _SIN, _OFFSET, _DIRECTION = range(6)
 def recognised(table: Array) -> tuple[Array, bool]:
     """Find the structure of a table.
 
-    Args:
-        table: (102,) packed table.
-
-    Returns:
-        (102,) the table that the closed-form inverse works on, its kind at KIND (NEITHER where there is none): the same arm
-        written with its parallel axes pointing one way, or the nearest that has a structure; and whether it is exact.
+    ``table``: (102,) packed table. Returns (102,) the table that the closed-form inverse works on, its kind at KIND
+    (NEITHER where there is none): the same arm written with its parallel axes pointing one way, or the nearest that has a
+    structure; and whether it is exact.
     """
     for near_rad, near_m, exact in ((1e-12, 1e-12, True), (_NEAR_RAD, _NEAR_M, False)):
         squared = _squared(table, near_rad)

@@ -53,16 +53,10 @@ def follow(
 ) -> PathMotion:
     """Plan to travel a path of the tool that begins where ``q_start`` puts it, in the configuration of the start.
 
-    Args:
-        arm: the arm.
-        path: the path.
-        q_start: (n,) angles to start from, rad.
-        duration_s: how long it is to take, s; None for as short as the limits allow.
-        cruises: (C, 2) shares between which the pace is to be steady: the bends of the path. None for none.
-
-    Raises:
-        MotionRejected: the path leaves the reach or the joint limits, or meets a singularity.
-        InputError: bad numbers, or a duration that cannot be met.
+    ``q_start``: (n,) angles to start from, rad. ``duration_s``: how long it is to take, s; None for as short as the limits
+    allow. ``cruises``: (C, 2) shares between which the pace is to be steady: the bends of the path. None for none. Raises
+    MotionRejected: the path leaves the reach or the joint limits, or meets a singularity; InputError: bad numbers, or a
+    duration that cannot be met.
     """
     check_duration(duration_s)
     guide, obstacle = walk(arm, path, inside(arm, q_start, "q_start"), np.zeros((0, 2)) if cruises is None else cruises)

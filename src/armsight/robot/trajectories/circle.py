@@ -85,16 +85,10 @@ def arc(
 ) -> PathMotion:
     """Plan the arc of the tool from where it is through a point to a pose, the orientation rotating evenly (slerp).
 
-    Args:
-        arm: the arm.
-        q_start: (n,) angles to start from, rad; their configuration is kept.
-        via_base: (3,) a point on the arc between start and goal, m, base frame.
-        T_base_goal: (4, 4) pose of the tool to end at.
-        duration_s: how long it is to take, s; None for as short as the limits allow.
-
-    Raises:
-        MotionRejected: the arc leaves the reach or the joint limits, or meets a singularity.
-        InputError: bad numbers, three points on one line, or a duration that cannot be met.
+    ``q_start``: (n,) angles to start from, rad; their configuration is kept. ``via_base``: (3,) a point on the arc between
+    start and goal, m, base frame. ``T_base_goal``: (4, 4) pose of the tool to end at. ``duration_s``: how long it is to
+    take, s; None for as short as the limits allow. Raises MotionRejected: the arc leaves the reach or the joint limits, or
+    meets a singularity; InputError: bad numbers, three points on one line, or a duration that cannot be met.
     """
     T_base_start = arm.forward(q_start)
     goal = checked_pose(T_base_goal, "T_base_goal")

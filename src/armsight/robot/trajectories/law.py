@@ -133,10 +133,7 @@ class _Plan(NamedTuple):
 def fit_chain(arm: Arm, guide: Walk, cruises: Array) -> Law:
     """Return the share over time, from rest, that just keeps the limits by the walk's derivatives.
 
-    Args:
-        arm: the arm, for its limits.
-        guide: the joints along the way.
-        cruises: (C, 2) shares between which the bends lie.
+    ``guide``: the joints along the way; ``cruises``: (C, 2) shares between which the bends lie.
     """
     within, plan = 1 - CLOSE / 2, _first(arm, guide, cruises)
     for _ in range(CHAIN_ROUNDS):

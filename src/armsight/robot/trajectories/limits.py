@@ -103,8 +103,7 @@ def _ratios(arm: Arm, t_s: Array, joints: Joints) -> list[tuple[str, str, Array,
 def check_limits(arm: Arm, trajectory: Trajectory) -> None:
     """Check a motion in joints against every limit of the arm at 1 kHz.
 
-    Raises:
-        MotionRejected: at the first instant outside the joint limits, or where another limit is passed.
+    Raises MotionRejected: at the first instant outside the joint limits, or where another limit is passed.
     """
     for t_s in pieces(check_times(trajectory.duration_s)):
         joints = trajectory.at(t_s)

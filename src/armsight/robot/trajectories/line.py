@@ -46,15 +46,10 @@ class LinePath(Record):
 def line(arm: Arm, q_start: ArrayLike, T_base_goal: ArrayLike, *, duration_s: float | None = None) -> PathMotion:
     """Plan a straight line of the tool from where it is.
 
-    Args:
-        arm: the arm.
-        q_start: (n,) angles to start from, rad; their configuration is kept.
-        T_base_goal: (4, 4) pose of the tool to end at.
-        duration_s: how long it is to take, s; None for as short as the limits allow.
-
-    Raises:
-        MotionRejected: the line leaves the reach or the joint limits, or meets a singularity.
-        InputError: bad numbers, nothing to travel, or a duration that cannot be met.
+    ``q_start``: (n,) angles to start from, rad; their configuration is kept. ``T_base_goal``: (4, 4) pose of the tool to
+    end at. ``duration_s``: how long it is to take, s; None for as short as the limits allow. Raises MotionRejected: the
+    line leaves the reach or the joint limits, or meets a singularity; InputError: bad numbers, nothing to travel, or a
+    duration that cannot be met.
     """
     path = LinePath.between(arm.forward(q_start), checked_pose(T_base_goal, "T_base_goal"))
     return follow(arm, path, q_start, duration_s=duration_s)

@@ -131,14 +131,8 @@ def singular_values(arm: Arm, q: Array) -> tuple[Array, Array]:
 def walk(arm: Arm, path: Path, q_start: Array, bends: Array) -> tuple[Walk, Obstacle | None]:
     """Walk along a path as far as it can be travelled.
 
-    Args:
-        arm: the arm.
-        path: the path.
-        q_start: (n,) joint angles at its start, rad.
-        bends: (C, 2) shares between which steps are to be smaller.
-
-    Returns:
-        The walk up to the first obstacle, and that; None where there is none.
+    ``q_start``: (n,) joint angles at its start, rad; ``bends``: (C, 2) shares between which steps are to be smaller.
+    Returns the walk up to the first obstacle, and that; None where there is none.
     """
     if arm.joints < 6:
         raise InputError(

@@ -27,17 +27,10 @@ def point_to_point(
 
     From rest the joints move in proportion, straight in joint space; from a moving state they only arrive together.
 
-    Args:
-        arm: the arm, for its limits.
-        q_start: (n,) angles to start from, rad.
-        q_goal: (n,) angles to end at, rad.
-        qd_start: (n,) speeds to start with, rad/s; None for rest.
-        qdd_start: (n,) accelerations to start with, rad/s^2; None for none.
-        duration_s: how long it is to take, s; None for as short as the limits allow.
-
-    Raises:
-        MotionRejected: a moving start carries a joint through its limit before it can reverse.
-        InputError: a state outside the limits, or a duration that cannot be met.
+    ``q_start``: (n,) angles to start from, rad. ``q_goal``: (n,) angles to end at, rad. ``qd_start``: (n,) speeds to start
+    with, rad/s; None for rest. ``qdd_start``: (n,) accelerations to start with, rad/s^2; None for none. ``duration_s``: how
+    long it is to take, s; None for as short as the limits allow. Raises MotionRejected: a moving start carries a joint
+    through its limit before it can reverse; InputError: a state outside the limits, or a duration that cannot be met.
     """
     start = start_state(arm, q_start, qd_start, qdd_start)
     goal = inside(arm, q_goal, "q_goal")

@@ -49,17 +49,11 @@ def plan_profile(
 ) -> Profile:
     """Plan axes to arrive at a goal, together, as fast as their limits allow.
 
-    Args:
-        start: (n,) positions, speeds and accelerations to start from; a speed beyond its limit is braked first.
-        goal: (n,) positions to end at.
-        speed: (n,) limits of the speeds, and ``acceleration`` and ``jerk`` of their derivatives; infinite is allowed.
-        acceleration: see ``speed``.
-        jerk: see ``speed``.
-        duration_s: how long it is to take instead; None for as short as possible.
-        goal_speed: (n,) speeds to arrive with; None for rest.
-
-    Raises:
-        InputError: the duration is shorter than the limits allow, or cannot be met from this moving start.
+    ``start``: (n,) positions, speeds and accelerations to start from; a speed beyond its limit is braked first. ``goal``:
+    (n,) positions to end at. ``speed``: (n,) limits of the speeds, and ``acceleration`` and ``jerk`` of their derivatives;
+    infinite is allowed. ``duration_s``: how long it is to take instead; None for as short as possible. ``goal_speed``: (n,)
+    speeds to arrive with; None for rest. Raises InputError: the duration is shorter than the limits allow, or cannot be met
+    from this moving start.
     """
     n = len(goal)
     asked = ruckig.InputParameter(n)

@@ -73,8 +73,7 @@ def clamped(t_s: float | Array, duration_s: float) -> Array:
 def check_duration(duration_s: float | None, longest_s: float = LONGEST_S) -> float | None:
     """Return a duration that was asked for; None stands for none.
 
-    Raises:
-        InputError: no positive number, or too long to be looked through.
+    Raises InputError: no positive number, or too long to be looked through.
     """
     if duration_s is not None and not (np.isfinite(duration_s) and duration_s > 0):
         raise InputError(

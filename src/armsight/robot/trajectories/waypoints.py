@@ -72,17 +72,12 @@ def waypoints(
 ) -> PathMotion:
     """Plan a path of the tool from where it is past way-points to the last of them, without stopping.
 
-    Args:
-        arm: the arm.
-        q_start: (n,) angles to start from, rad; their configuration is kept.
-        Ts_base_way: (M, 4, 4) poses of the tool, M >= 2; all but the last are passed at a distance (see the module).
-        blend_m: how far before a way-point its blend begins, m; shortened to half the lines beside it. On lines that
-            mostly rotate, a radian counts as 0.25 m.
-        duration_s: how long it is to take, s; None for as short as the limits allow.
-
-    Raises:
-        MotionRejected: the path leaves the reach or the joint limits, or meets a singularity.
-        InputError: bad numbers, a way-point that repeats the one before, or a duration that cannot be met.
+    ``q_start``: (n,) angles to start from, rad; their configuration is kept. ``Ts_base_way``: (M, 4, 4) poses of the tool,
+    M >= 2; all but the last are passed at a distance (see the module). ``blend_m``: how far before a way-point its blend
+    begins, m; shortened to half the lines beside it. On lines that mostly rotate, a radian counts as 0.25 m.
+    ``duration_s``: how long it is to take, s; None for as short as the limits allow. Raises MotionRejected: the path leaves
+    the reach or the joint limits, or meets a singularity; InputError: bad numbers, a way-point that repeats the one before,
+    or a duration that cannot be met.
     """
     try:
         given = list(np.asarray(Ts_base_way, dtype=np.float64))

@@ -1,11 +1,10 @@
 """Read an arm from URDF, the XML in which ROS describes robots (wiki.ros.org/urdf/XML).
 
 In: a URDF file with four to seven rotary joints (revolute or continuous) in a row, and fixed ones anywhere; which joints of
-its tree are the arm's: :mod:`armsight.robot.urdf.tree`.
-Masses and shapes are ignored. An origin's rotation is ``rpy``, or from URDF 1.1 on ``quat_xyzw``: urdfdom 6.0.0 reads that
-where ``<robot version>`` is 1.1 or later and ignores it where it is older or missing, so here the latter is rejected.
-Out: an :class:`Arm` with a standard Denavit-Hartenberg table. What is written, and where that goes beyond plain URDF,
-stands in :mod:`armsight.robot.urdf.write`.
+its tree are the arm's: :mod:`armsight.robot.urdf.tree`. Masses and shapes are ignored. An origin's rotation is ``rpy``, or
+from URDF 1.1 on ``quat_xyzw``: urdfdom 6.0.0 reads that where ``<robot version>`` is 1.1 or later and ignores it where it
+is older or missing, so here the latter is rejected. Out: an :class:`Arm` with a standard Denavit-Hartenberg table. What is
+written, and where that goes beyond plain URDF, stands in :mod:`armsight.robot.urdf.write`.
 
 From a chain of axes to the table: between two axes in space there is always Rz(beta) Tz(d) Tx(a) Rx(alpha) Tz(e) Rz(gamma):
 along the first to the foot of their common normal, over it, and along the second. Rz(gamma) Tz(e) stands at the next

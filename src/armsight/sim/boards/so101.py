@@ -186,11 +186,8 @@ class So101Bus(Wired):
     ) -> So101Bus:
         """Return a bus of six servos; by default as issue 134 measured them, half folded.
 
-        Args:
-            mechanics: what is wrong with the joints.
-            load: returns the torques (6,), N m, at angles (6,), rad.
-            q: (6,) where the joints are, rad by the sensors.
-            options: fields of this class.
+        ``mechanics``: what is wrong with the joints; ``load``: returns the torques (6,), N m, at angles (6,), rad; ``q``:
+        (6,) where the joints are, rad by the sensors.
         """
         q = np.radians([5.0, -40.0, 60.0, 20.0, 0.0, 10.0]) if q is None else q
         return cls(So101Servos(mechanics or So101Mechanics(), load, q), **options)  # type: ignore[arg-type]

@@ -55,10 +55,9 @@ def swapped(first: int, second: int) -> tuple[int, ...]:
 class WorkshopPlant:
     """A wired arm behind the contract :class:`~armsight.robot.boards.link.Plant`, with a hand on it.
 
-    ``wiring`` may be changed at any time; ``bend_counts`` (6,): by how much a potentiometer is off a straight line at
-    most; joints with ``encoders`` are wired rightly. ``load_n_m`` (6,): beside gravity and the hand, which brings a
-    joint to an angle, rad, by ``hold``. ``drives_s``: for how long the drives were on, ``far_rad`` (6,): how far the
-    joints went since.
+    ``wiring`` may be changed at any time; ``bend_counts`` (6,): by how much a potentiometer is off a straight line at most;
+    joints with ``encoders`` are wired rightly. ``load_n_m`` (6,): beside gravity and the hand, which brings a joint to an
+    angle, rad, by ``hold``. ``drives_s``: for how long the drives were on, ``far_rad`` (6,): how far the joints went since.
     """
 
     def __init__(

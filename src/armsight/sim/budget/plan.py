@@ -193,8 +193,7 @@ class RigPlan:
     def read(path: str, **given: Any) -> RigPlan:  # noqa: ANN401
         """Read a TOML file whose keys are the attributes, if there is one; ``given`` replaces what it says.
 
-        Raises:
-            InputError: an unknown key, or a value of another type; the message names it.
+        Raises InputError: an unknown key, or a value of another type; the message names it.
         """
         values = read_toml(path) if path else {}
         for key in {"rig", "body", "preset"} & values.keys():
@@ -406,8 +405,7 @@ class RigPlan:
     def check(self) -> None:
         """Refuse what cannot be built.
 
-        Raises:
-            InputError: one line: what was found, what was expected, and the nearest that can be had.
+        Raises InputError: one line: what was found, what was expected, and the nearest that can be had.
         """
         for key, (least, most) in _RANGES.items():
             value = getattr(self, key)

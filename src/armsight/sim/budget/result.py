@@ -242,13 +242,10 @@ class RigBudget(Record):
 def budget(path: str = "", **plan: Any) -> RigBudget:  # noqa: ANN401
     """Say what a rig will measure before it is bought, what limits it, and what would change it.
 
-    Args:
-        path: a plan file, or nothing.
-        plan: keys of a plan, as its file has them (:class:`~armsight.sim.budget.plan.RigPlan`), such as ``rig="rig.json"``,
-            ``body="plate.toml"``, ``camera="webcam-720p"``, ``distance="0.8m"``; they replace the file's.
-
-    Raises:
-        InputError: an unknown key, a value that cannot be read, or a rig that cannot be built, with the nearest that can.
+    ``path``: a plan file, or nothing. ``plan``: keys of a plan, as its file has them
+    (:class:`~armsight.sim.budget.plan.RigPlan`), such as ``rig="rig.json"``, ``body="plate.toml"``,
+    ``camera="webcam-720p"``, ``distance="0.8m"``; they replace the file's. Raises InputError: an unknown key, a value that
+    cannot be read, or a rig that cannot be built, with the nearest that can.
     """
     found = RigBudget(given := RigPlan.read(path, **plan), planned(given))
     found.check()
@@ -261,12 +258,8 @@ def best(plan: RigPlan, progress: Callable[[str], None] = lambda _: None) -> tup
     What the plan names stays. Both cameras see the body everywhere, in focus, its markers large enough
     (:meth:`~armsight.sim.budget.plan.RigPlan.check`).
 
-    Args:
-        plan: what is wished.
-        progress: called with each class of cameras as text.
-
-    Raises:
-        InputError: none can be built; the message is that of the plan itself.
+    ``plan``: what is wished; ``progress``: called with each class of cameras as text. Raises InputError: none can be built;
+    the message is that of the plan itself.
     """
     found = []
     classes = [name for name, each in catalogue().items() if each.price]

@@ -68,16 +68,10 @@ class SimulatedCamera:
     def expose(self, radiance: Radiance, time_s: float = 0.0, number: int | None = None) -> Image:
         """Return the image of a scene.
 
-        Args:
-            radiance: (H, W) linear light of each pixel, 1 for a white reflector, with the renderer's blur and motion.
-            time_s: middle of the exposure of the middle row, s; flicker follows it.
-            number: of the image; its noise follows from it and the camera's seed. By default images are counted.
-
-        Returns:
-            (H, W) uint8, grey.
-
-        Raises:
-            InputError: the radiance is of another size.
+        ``radiance``: (H, W) linear light of each pixel, 1 for a white reflector, with the renderer's blur and motion.
+        ``time_s``: middle of the exposure of the middle row, s; flicker follows it. ``number``: of the image; its noise
+        follows from it and the camera's seed. By default images are counted. Returns (H, W) uint8, grey. Raises InputError:
+        the radiance is of another size.
         """
         if radiance.shape != (self._height, self._width):
             raise InputError(f"the radiance is {radiance.shape}, must be ({self._height}, {self._width})")

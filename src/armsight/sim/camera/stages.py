@@ -91,8 +91,7 @@ class Lens(Stage):
 class Lamp(Stage):
     """A lamp near a target plane: a smooth gain over the image, cos(angle) / distance^2 of a plane that faces it.
 
-    ``foot``: the point of the image that the lamp is in front of, shares of width and height; ``pixel_mm``: on the
-    plane.
+    ``foot``: the point of the image that the lamp is in front of, shares of width and height; ``pixel_mm``: on the plane.
     """
 
     distance_m: float = _number(0.1, 10)
@@ -174,8 +173,7 @@ class AutoExposure(Stage):
 class Mosaic(Stage):
     """A colour filter array (RGGB) over the sensor, white balance, and the interpolation of colours.
 
-    ``response``: what red, green and blue pixels get of the light, relative to green; ``white_balance``: factors of
-    these.
+    ``response``: what red, green and blue pixels get of the light, relative to green; ``white_balance``: factors of these.
     """
 
     response: tuple[float, float, float] = _number(0.05, 2, count=3)

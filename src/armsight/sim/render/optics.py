@@ -121,14 +121,10 @@ def spread_down(across: Radiance, taps: Radiance, out: Radiance) -> None:
 def blurred(coarse: Array, slot: Slots, fine: Array, sigma: float) -> Radiance:
     """Lay the lens's blur over a painted image.
 
-    Args:
-        coarse: (H, W) values of pixels; those of edge pixels are overwritten with the mean of their parts.
-        slot: (H, W) row of ``fine`` that holds an edge pixel's parts, -1 where there are none.
-        fine: (n, SUB, SUB) the parts.
-        sigma: of the blur, px; 0 for none.
-
-    Returns:
-        (H, W) light on each pixel; beyond the image's border the world is taken to go on as at the border.
+    ``coarse``: (H, W) values of pixels; those of edge pixels are overwritten with the mean of their parts. ``slot``: (H, W)
+    row of ``fine`` that holds an edge pixel's parts, -1 where there are none. ``fine``: (n, SUB, SUB) the parts. ``sigma``:
+    of the blur, px; 0 for none. Returns (H, W) light on each pixel; beyond the image's border the world is taken to go on
+    as at the border.
     """
     taps = part_taps(sigma)
     across = np.zeros((SUB * slot.shape[0], slot.shape[1] + taps.shape[1] - 1), np.float32)

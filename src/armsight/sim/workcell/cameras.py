@@ -159,15 +159,9 @@ def open_rig(name: str, size: tuple[int, int], baseline_m: float = BASELINE_M) -
 def rig_pose(model: Arm, rig: StereoRig, T_tool_body: Array, seed: int, distance_m: float = DISTANCE_M) -> Array:
     """Return where the rig's left camera stands, T_base_rig (4, 4), m: it looks at the body of an arm at home.
 
-    Args:
-        model: the nominal arm.
-        rig: the cameras.
-        T_tool_body: (4, 4) where the body is on the tool, m.
-        seed: nobody mounts cameras to the millimetre.
-        distance_m: from the cameras to the body of an arm at home.
-
-    Raises:
-        InputError: cameras cannot stand at this distance.
+    ``model``: the nominal arm; ``T_tool_body``: (4, 4) where the body is on the tool, m; ``seed``: nobody mounts cameras to
+    the millimetre; ``distance_m``: from the cameras to the body of an arm at home. Raises InputError: cameras cannot stand
+    at this distance.
     """
     if not 0.3 <= distance_m <= 3.0:
         raise InputError(f"distance_m is {distance_m}; the cameras must be 0.3 to 3 m from the body")

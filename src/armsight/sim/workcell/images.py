@@ -236,8 +236,7 @@ def _moved(body: PosedBody, t_s: Array) -> Array:
 class LedSeen(Record):
     """A round LED that shines at a camera, or one that does so for a part of an exposure, at a depth, m.
 
-    ``share`` (h, w): of each pixel of the window that it covers, times its light; ``spread``: the same through the
-    lens.
+    ``share`` (h, w): of each pixel of the window that it covers, times its light; ``spread``: the same through the lens.
     """
 
     window: Window
@@ -360,9 +359,8 @@ class WorkcellCamera:
     ) -> Image:
         """Return what the camera hands out, (H, W) uint8.
 
-        ``arm`` None leaves it out; ``bodies`` are flat patterns, posed in the camera's frame in the middle of the
-        exposure of its middle row; noise is that of ``strip`` from ``start`` on
-        (:func:`~armsight.sim.render.optics.noise_strip`).
+        ``arm`` None leaves it out; ``bodies`` are flat patterns, posed in the camera's frame in the middle of the exposure
+        of its middle row; noise is that of ``strip`` from ``start`` on (:func:`~armsight.sim.render.optics.noise_strip`).
         """
         seen, window, core = self._seen(arm, bodies, shutter, led)
         still = self._room.grey
@@ -530,15 +528,8 @@ def picture(
 ) -> Image:
     """Return the workcell as it is now.
 
-    Args:
-        size_px: (width, height).
-        plant: the arm.
-        body: the patterns on the tool, and T_tool_body (4, 4), m.
-        rig: T_base_rig (4, 4), m, and the cameras.
-        seed: of the clutter.
-
-    Returns:
-        (H, W, 3) BGR, uint8.
+    ``size_px``: (width, height); ``body``: the patterns on the tool, and T_tool_body (4, 4), m; ``rig``: T_base_rig (4, 4),
+    m, and the cameras. Returns (H, W, 3) BGR, uint8.
     """
     width, height = size_px
     focal = _FOCAL * width

@@ -374,13 +374,8 @@ def view(
 ) -> StillView:
     """Return what stands still before a camera: a ray a pixel, four more where light changes.
 
-    Args:
-        camera: the camera.
-        rays: (H, W, 3) its pixels'.
-        T_base_camera: (4, 4) where it is, m.
-        seed: of the clutter.
-        foot: the arm's solids; its base stands still.
-        more: boxes (N, BOX) that stand there besides.
+    ``rays``: (H, W, 3) its pixels'. ``T_base_camera``: (4, 4) where it is, m. ``foot``: the arm's solids; its base stands
+    still. ``more``: boxes (N, BOX) that stand there besides.
     """
     boxes, (ends, radius, albedo) = furniture(seed)
     if more is not None:
@@ -418,10 +413,8 @@ def _tiled(height: int, width: int) -> Ids:
 def arm_capsules(parts: Solids, Ts_base_link: Array, T_base_camera: Array) -> tuple[Array, Array, Array]:
     """Return the arm's moving solids, but its load, as the rays take them, in a camera's frame.
 
-    Args:
-        parts: what the arm is made of.
-        Ts_base_link: (n + 1, 4, 4) row frames.
-        T_base_camera: (4, 4) where the camera is, m.
+    ``parts``: what the arm is made of; ``Ts_base_link``: (n + 1, 4, 4) row frames; ``T_base_camera``: (4, 4) where the
+    camera is, m.
     """
     shown = np.flatnonzero(parts.link > 0)[:-1]
     Ts = inverse(T_base_camera) @ Ts_base_link[parts.link[shown]]
@@ -435,10 +428,7 @@ _CUBE = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (
 def capsule_boxes(camera: Camera, ends: Array, radius: Array) -> Ids:
     """Return (K, 4) the pixels that capsules can cover: first column, first row, end column, end row.
 
-    Args:
-        camera: the camera.
-        ends: (K, 2, 3), m, its frame.
-        radius: (K,) m.
+    ``ends``: (K, 2, 3), m, its frame; ``radius``: (K,) m.
     """
     corners = ends[:, :, None] + radius[:, None, None, None] * _CUBE
     size = np.array(camera.image_size_px)

@@ -283,10 +283,9 @@ def _driven(
 class Workcell(Closing):
     """An arm, its board, two cameras and a body; :meth:`open` builds one.
 
-    ``model`` is the arm as it is assumed to be: all that an estimator may know of it. ``link`` is the wire to our
-    board, and all of its inside, None where the arm keeps its own controller. ``board`` is configured, its drives off;
-    the arm is at home, held by brakes or its controller. ``timing`` is what the cameras' maker says: rate, exposure,
-    synchronisation.
+    ``model`` is the arm as it is assumed to be: all that an estimator may know of it. ``link`` is the wire to our board,
+    and all of its inside, None where the arm keeps its own controller. ``board`` is configured, its drives off; the arm is
+    at home, held by brakes or its controller. ``timing`` is what the cameras' maker says: rate, exposure, synchronisation.
     """
 
     def __init__(self, parts: _Parts) -> None:

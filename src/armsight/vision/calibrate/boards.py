@@ -585,13 +585,9 @@ def calibrate_recording(
     at given cameras; with rho its correlation with them an error shrinks by rho^2 each round, so the sigma of both is that
     over sqrt(1 - shrinkage).
 
-    Returns:
-        As :func:`calibrate_boards`, with the skew in the rig where there is one; a note says so, or why it was not found.
-        ``pairs`` are in the order of ``t_s``, (N,) the times of the shots, s, rising.
-
-    Raises:
-        CalibrationError: fewer than three usable pairs, or views that do not determine the cameras.
-        InputError: the times do not rise.
+    Returns as :func:`calibrate_boards`, with the skew in the rig where there is one; a note says so, or why it was not
+    found. ``pairs`` are in the order of ``t_s``, (N,) the times of the shots, s, rising. Raises CalibrationError: fewer
+    than three usable pairs, or views that do not determine the cameras; InputError: the times do not rise.
     """
     seen = [pair for pair in pairs if min(len(pair.left.ids), len(pair.right.ids)) >= LEAST_CORNERS]
     if len(seen) < LEAST_PAIRS:

@@ -58,19 +58,10 @@ def calibrate_bodies(
 ) -> Calibration:
     """Find the relative pose of two cameras from detections of a known body.
 
-    Args:
-        body: the body's points, m, of its drawing.
-        shots: the detections of both cameras in every shot.
-        cameras: the cameras with their known intrinsics.
-        refine_body: estimate how the body differs from its drawing.
-        folds: how many parts the shots are split into for the held-out errors.
-        progress: called with a line about what is being done.
-
-    Returns:
-        The rig, the body as estimated, held-out errors, and what was not used.
-
-    Raises:
-        CalibrationError: too few shots, or no relative pose that they agree on.
+    ``body``: the body's points, m, of its drawing; ``shots``: the detections of both cameras in every shot; ``cameras``:
+    the cameras with their known intrinsics; ``refine_body``: estimate how the body differs from its drawing; ``folds``: how
+    many parts the shots are split into for the held-out errors. Returns the rig, the body as estimated, held-out errors,
+    and what was not used. Raises CalibrationError: too few shots, or no relative pose that they agree on.
     """
     require_choice(folds)
     progress("looking for the body in every image")

@@ -119,12 +119,8 @@ class Budget(Record):
     def cov(self, *, moving: bool = True, loop: bool = False, of: str = "", scaled: str = "", by: float = 1.0) -> Array:
         """Return covariances (G, 6, 6).
 
-        Args:
-            moving: with what motion costs.
-            loop: with hand-eye and arm.
-            of: one cause alone; or "precision" or "trueness".
-            scaled: a cause whose standard deviation is multiplied ``by`` so much.
-            by: how much.
+        ``moving``: with what motion costs. ``loop``: with hand-eye and arm. ``of``: one cause alone; or "precision" or
+        "trueness". ``scaled``: a cause whose standard deviation is multiplied ``by`` so much.
         """
         total, together = np.zeros((len(self.p_left), 6, 6)), np.zeros((len(self.p_left), 6, 6))
         for name, F in self.factors.items():
@@ -192,15 +188,9 @@ def volume_views(
 def pose_budget(rig: StereoRig, points: Array, normals: Array, views: list[PredictedView], given: Conditions) -> Budget:
     """Return what each cause costs a body's pose.
 
-    Args:
-        rig: the cameras; their own covariance is not used, ``given.cov_calibration`` is.
-        points: (M, 3) points of the body, m.
-        normals: (M, 3) out of their faces; NaN where unknown.
-        views: where the body is.
-        given: what is not known.
-
-    Raises:
-        InputError: at none of the positions do both cameras see enough of the body.
+    ``rig``: the cameras; their own covariance is not used, ``given.cov_calibration`` is. ``points``: (M, 3) points of the
+    body, m. ``normals``: (M, 3) out of their faces; NaN where unknown. ``views``: where the body is. ``given``: what is not
+    known. Raises InputError: at none of the positions do both cameras see enough of the body.
     """
     found: list[dict[str, Array]] = []
     at, lost, forward = [], list[float](), np.zeros(3)
@@ -374,12 +364,9 @@ def calibration_covariance(
 
     Without noise its loss would discount nothing, and the covariance would be too small by a sixth.
 
-    Args:
-        rig: the cameras.
-        board: (M, 3) corners of the board, m.
-        Ts_left_board: (S, 4, 4) where it is to be shown, all of it in both images.
-        sigma_px: standard deviation of a corner, px.
-        bent_m: of a corner of the board from its drawing along each axis, m, smoothly; it is estimated, too.
+    ``board``: (M, 3) corners of the board, m. ``Ts_left_board``: (S, 4, 4) where it is to be shown, all of it in both
+    images. ``sigma_px``: standard deviation of a corner, px. ``bent_m``: of a corner of the board from its drawing along
+    each axis, m, smoothly; it is estimated, too.
     """
     model, (S, M) = rigid_board(board), (len(Ts_left_board), len(board))
     if bent_m > 0:

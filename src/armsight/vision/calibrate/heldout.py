@@ -101,11 +101,8 @@ def pair_errors(
 def middles(rig: StereoRig, body: Array, seen: Correspondences, disc_radius_m: float) -> Correspondences:
     """Convert centres of the ellipses of a board's discs to images of their middles, at the pose that both cameras show.
 
-    Args:
-        rig: the calibrated pair.
-        body: (M, 3) the discs' middles, m.
-        seen: correspondences that both cameras have.
-        disc_radius_m: radius of the discs, m.
+    ``body``: (M, 3) the discs' middles, m; ``seen``: correspondences that both cameras have; ``disc_radius_m``: radius of
+    the discs, m.
     """
     centres = seen
     for _ in range(_BIAS_ROUNDS):
@@ -178,16 +175,10 @@ def cross_validate(
 ) -> PairErrors:
     """Fit on all folds but one and measure that one, for every fold.
 
-    Args:
-        fit: rows of the shots to use -> the rig they give, the body as they show it (M, 3), m, and how far it moved
-            between the exposures.
-        drawing: (M, 3) points of the perfect body, m.
-        observations: all detections, bad ones included: a measurement meets them too.
-        folds: number of folds, at most the number of shots.
-        disc_radius_m: as in :func:`pair_errors`.
-
-    Returns:
-        The held-out errors of every shot.
+    ``fit``: rows of the shots to use -> the rig they give, the body as they show it (M, 3), m, and how far it moved between
+    the exposures; ``drawing``: (M, 3) points of the perfect body, m; ``observations``: all detections, bad ones included: a
+    measurement meets them too; ``folds``: number of folds, at most the number of shots; ``disc_radius_m``: as in
+    :func:`pair_errors`. Returns the held-out errors of every shot.
     """
     parts = []
     for held in folds_of(observations.shot_count, folds):

@@ -1,8 +1,6 @@
 """Calibrate two cameras from the images of a source.
 
-from armsight import calibrate
-calibration = calibrate("chessboard:9x6:25mm", "recording")
-calibration.rig.save("rig.json")
+from armsight import calibrate calibration = calibrate("chessboard:9x6:25mm", "recording") calibration.rig.save("rig.json")
 """
 
 from __future__ import annotations
@@ -34,20 +32,12 @@ def calibrate(
 
     ``armsight calibrate`` looks for the skew of a recording's moving board as well.
 
-    Args:
-        board: the board, or its text as the command line takes it.
-        source: the pairs, or what :func:`~armsight.vision.sources.open_source` opens; a source that was open stays open.
-        models: distortion models to choose from by held-out error.
-        flat: hold the board to its drawing.
-        folds: how many parts the pairs are split into for the held-out errors.
-        progress: called with a line about what is being done.
-
-    Returns:
-        The rig, its held-out errors, and what was rejected.
-
-    Raises:
-        InputError: a text is wrong, or images that cannot be read or differ in size.
-        CalibrationError: fewer than three usable pairs, or views that do not determine the cameras.
+    ``board``: the board, or its text as the command line takes it. ``source``: the pairs, or what
+    :func:`~armsight.vision.sources.open_source` opens; a source that was open stays open. ``models``: distortion models to
+    choose from by held-out error. ``flat``: hold the board to its drawing. ``folds``: how many parts the pairs are split
+    into for the held-out errors. Returns the rig, its held-out errors, and what was rejected. Raises InputError: a text is
+    wrong, or images that cannot be read or differ in size; CalibrationError: fewer than three usable pairs, or views that
+    do not determine the cameras.
     """
     if isinstance(board, str | Path):
         if Path(board).is_dir():

@@ -77,9 +77,7 @@ class ExposureMotion(Record):
     def seen_from(self, T_camera_board: Array, middle: Array) -> Array:
         """Return the (6, 6) covariance of a new pair's motion as a tangent [translation; rotation] in a camera's frame.
 
-        Args:
-            T_camera_board: (4, 4) pose of the board.
-            middle: (3,) middle of the board in its own frame, m.
+        ``T_camera_board``: (4, 4) pose of the board; ``middle``: (3,) middle of the board in its own frame, m.
         """
         R, centre = T_camera_board[:3, :3], transform(T_camera_board, middle)
         A = np.block([[R, skew(centre) @ R], [np.zeros((3, 3)), R]])

@@ -96,8 +96,7 @@ class Calibration(Record):
     def plot(self) -> Any:  # noqa: ANN401 - matplotlib is no dependency
         """Draw the errors of every pair when it was left out of the fit, mm and px; return matplotlib's figure.
 
-        Raises:
-            InputError: matplotlib is not installed.
+        Raises InputError: matplotlib is not installed.
         """
         figure, axes = new_figure(2, 1, sharex=True)
         axes[0].bar(self.errors.pair, 1e3 * self.errors.rigid_m)

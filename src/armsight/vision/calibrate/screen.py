@@ -79,16 +79,9 @@ def screen(
 ) -> Screened:
     """Adjust robustly and reject gross corners and bad pairs until no more are found.
 
-    Args:
-        model: the board.
-        start: a start for all pairs.
-        observations: all detections.
-        names: (S,) names of the pairs.
-        sigma_px: standard deviation of a detection to begin with, px.
-        known: pairs that are known to be bad, and why.
-
-    Returns:
-        The detections that remain.
+    ``start``: a start for all pairs; ``observations``: all detections; ``names``: (S,) names of the pairs; ``sigma_px``:
+    standard deviation of a detection to begin with, px; ``known``: pairs that are known to be bad, and why. Returns the
+    detections that remain.
     """
     rejected = [RejectedPair(names[j], reason) for j, reason in (known or {}).items()]
     kept = np.setdiff1d(np.arange(observations.shot_count), list(known or ()))

@@ -73,13 +73,9 @@ def _apart(a: Array, b: Array, scale_m: float = 1.0) -> Array:
 def relative_poses(left: list[list[Array]], right: list[list[Array]]) -> list[Array]:
     """Return the relative poses of two cameras that most shots agree on.
 
-    Args:
-        left: per shot, candidate poses T_left_body.
-        right: per shot, candidate poses T_right_body.
-
-    Returns:
-        A few different T_left_right (4, 4), the one with the widest agreement first; none where no shot has candidates
-        in both cameras.
+    ``left``: per shot, candidate poses T_left_body; ``right``: per shot, candidate poses T_right_body. Returns a few
+    different T_left_right (4, 4), the one with the widest agreement first; none where no shot has candidates in both
+    cameras.
     """
     # The usual distance of the body makes rotations and translations comparable.
     scale_m = float(np.median([T[2, 3] for views in (*left, *right) for T in views] or [1.0]))
@@ -145,15 +141,10 @@ def agreed_symmetries(
     A camera that is mounted upside down sees the other end of a symmetric board as its first. One order of each pair gives
     the relative pose that the others give, too; wrong ones give another one wherever the board is.
 
-    Args:
-        points: (M, 3) points of the board, m.
-        sizes: image size of the left and of the right camera, px.
-        observations: the detections of all shots.
-        symmetries: permutations (M,) under which the board looks the same.
-        model: distortion model of the cameras.
-
-    Returns:
-        Shot -> the permutation that sorts its right detections into the left's order.
+    ``points``: (M, 3) points of the board, m; ``sizes``: image size of the left and of the right camera, px;
+    ``observations``: the detections of all shots; ``symmetries``: permutations (M,) under which the board looks the same;
+    ``model``: distortion model of the cameras. Returns shot -> the permutation that sorts its right detections into the
+    left's order.
     """
     cameras = [
         pinhole(sizes[side], _focal_candidates(points, sizes[side], observations, side, model)[0], model)
@@ -183,17 +174,10 @@ def start_board(
 ) -> BundleSolution:
     """Calibrate two cameras from nothing, roughly: the start for every later adjustment.
 
-    Args:
-        points: (M, 3) points of the board, m.
-        sizes: image size of the left and of the right camera, px.
-        observations: the detections of all shots; every shot has four or more in both cameras.
-        model: distortion model of the adjustment.
-
-    Returns:
-        The best minimum found, under a noise of one pixel.
-
-    Raises:
-        CalibrationError: no start leads anywhere.
+    ``points``: (M, 3) points of the board, m. ``sizes``: image size of the left and of the right camera, px.
+    ``observations``: the detections of all shots; every shot has four or more in both cameras. ``model``: distortion model
+    of the adjustment. Returns the best minimum found, under a noise of one pixel. Raises CalibrationError: no start leads
+    anywhere.
     """
     focals = [_focal_candidates(points, sizes[side], observations, side, model) for side in (0, 1)]
     plain = BundleModel(points, np.zeros((0, len(points), 3)), 1.0, True)

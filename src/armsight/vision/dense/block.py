@@ -1,13 +1,12 @@
 """Local matching over square windows: the least cost summed over a window, winner takes all.
 
 A byte per pixel and disparity holds the cost of a match: twice the number of bits in which two census words of eight
-neighbours differ (Zabih and Woodfill, ECCV 1994; every other pixel of a 5 x 5 window), and half of the absolute
-difference of the grey levels, cut off: the order of grey levels is robust to light, their values help where the order
-is ambiguous (Mei et al., "On building an accurate stereo matching system on graphics hardware", 2011). Costs are summed
-along the row, and then by a running sum down the columns, so that the work for a pixel does not grow with the window's
-height. Pixels of a row lie side by side, and the loop over disparities is outside: the least so far, of the left pixel
-and of the right one, needs no search across a vector. No cost volume is kept, only the sums of as many rows as the
-window is high.
+neighbours differ (Zabih and Woodfill, ECCV 1994; every other pixel of a 5 x 5 window), and half of the absolute difference
+of the grey levels, cut off: the order of grey levels is robust to light, their values help where the order is ambiguous
+(Mei et al., "On building an accurate stereo matching system on graphics hardware", 2011). Costs are summed along the row,
+and then by a running sum down the columns, so that the work for a pixel does not grow with the window's height. Pixels of a
+row lie side by side, and the loop over disparities is outside: the least so far, of the left pixel and of the right one,
+needs no search across a vector. No cost volume is kept, only the sums of as many rows as the window is high.
 
 First the planes of a pair and the compiled kernels, then the method :class:`Block`.
 """
@@ -136,8 +135,7 @@ def _add_row(
 ) -> None:
     """Move the windows down by a row of the widened images; with ``choose`` find the least totals.
 
-    Pixels from which a disparity leads out of the right image do not choose it, nor do columns beyond the left one's
-    end.
+    Pixels from which a disparity leads out of the right image do not choose it, nor do columns beyond the left one's end.
     """
     stride, along = len(buffers.least), buffers.along
     slot = row % (2 * REACH + 1) * count * stride

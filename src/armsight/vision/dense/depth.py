@@ -34,10 +34,7 @@ class Depth(Record):
 def calibration_share(rectification: Rectification, uv: Array, disparity: Array) -> Array:
     """Return the relative standard deviation (N,) of depths that the rig's covariance causes.
 
-    Args:
-        rectification: of the pair.
-        uv: (N, 2) pixels of the rectified left image.
-        disparity: (N,) px.
+    ``uv``: (N, 2) pixels of the rectified left image; ``disparity``: (N,) px.
     """
     rig = rectification.rig
     raw = (

@@ -72,13 +72,8 @@ class Method(Protocol):
     def match(self, left: Image, right: Image, search: Search) -> Disparity:
         """Match a rectified pair.
 
-        Args:
-            left: (H, W) uint8.
-            right: (H, W) uint8; what is at column u - d in row v here is at column u in row v of the left image.
-            search: which disparities to try.
-
-        Returns:
-            A disparity for every pixel, measured or filled. It is the same for any number of threads. What cannot be
-            matched is ``Disparity.none(reason)``, never an exception.
+        ``left``: (H, W) uint8. ``right``: (H, W) uint8; what is at column u - d in row v here is at column u in row v of
+        the left image. ``search``: which disparities to try. Returns a disparity for every pixel, measured or filled. It is
+        the same for any number of threads. What cannot be matched is ``Disparity.none(reason)``, never an exception.
         """
         ...

@@ -49,13 +49,8 @@ def read_pfm(path: str | Path) -> NDArray[np.float32]:
 def write_pfm(path: str | Path, image: NDArray[np.floating[Any]], scale: float = 1.0) -> None:
     """Write a grey PFM file (H, W), little-endian; NaN becomes infinity, the benchmark's "unknown".
 
-    Args:
-        path: where to.
-        image: (H, W).
-        scale: factor of the values written, such as 1000 for mm instead of m.
-
-    Raises:
-        InputError: the file cannot be written.
+    ``image``: (H, W); ``scale``: factor of the values written, such as 1000 for mm instead of m. Raises InputError: the
+    file cannot be written.
     """
     height, width = image.shape
     with replacing(path, "wb") as file:

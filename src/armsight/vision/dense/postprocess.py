@@ -110,13 +110,8 @@ def _mean_of(
 def aligned_to_edges(disparity: Singles, state: NDArray[np.uint8], image: Image) -> tuple[Singles, NDArray[np.uint8]]:
     """Align depth breaks and gaps to the edges of the image.
 
-    Args:
-        disparity: (H, W) px, filled.
-        state: (H, W) the state of each.
-        image: (H, W) uint8, the left image.
-
-    Returns:
-        The same two, aligned; a measured pixel that moves to another surface is FILLED.
+    ``disparity``: (H, W) px, filled; ``state``: (H, W) the state of each; ``image``: (H, W) uint8, the left image. Returns
+    the same two, aligned; a measured pixel that moves to another surface is FILLED.
     """
     doubtful, median = _doubtful(disparity, state), np.empty_like(disparity)
     alike = np.exp(-np.arange(256) / _EDGE_ALIKE).astype(np.float32)
@@ -260,13 +255,8 @@ def _columns(
 def smoothed(disparity: Singles, image: Image) -> tuple[Singles, NDArray[np.float32]]:
     """Smooth measured disparities.
 
-    Args:
-        disparity: (H, W) px; NaN where nothing was measured.
-        image: (H, W) uint8, the left image.
-
-    Returns:
-        (H, W) px, NaN where it was; and (H, W) the share of each pixel's neighbours, each by its weight, that lie on
-        its surface.
+    ``disparity``: (H, W) px; NaN where nothing was measured. ``image``: (H, W) uint8, the left image. Returns (H, W) px,
+    NaN where it was; and (H, W) the share of each pixel's neighbours, each by its weight, that lie on its surface.
     """
     height = disparity.shape[0]
     share, half, out = np.empty_like(disparity), np.empty_like(disparity), disparity
@@ -296,10 +286,9 @@ _LEAST_SHARE = 0.005
 class SigmaModel:
     """The uncertainty of a method: sigma^2 = floor^2 + (gain * least / curvature)^2, px.
 
-    The second term is the noise of a minimum: the cost that remains is noise, and the curvature of the costs converts
-    it to pixels. The first is independent of the costs: the pull towards whole disparities, slants, the smoothing. Both
-    are set so that 1.96 sigma covers about 95% of the errors on four rendered scenes; others, and real ones, then check
-    it.
+    The second term is the noise of a minimum: the cost that remains is noise, and the curvature of the costs converts it to
+    pixels. The first is independent of the costs: the pull towards whole disparities, slants, the smoothing. Both are set
+    so that 1.96 sigma covers about 95% of the errors on four rendered scenes; others, and real ones, then check it.
     """
 
     floor_px: float
@@ -357,12 +346,8 @@ def _write_sigmas(
 def finished(found: Winners, left: Image, search: Search, sigma_model: SigmaModel, *, edges: bool = False) -> Disparity:
     """Convert the winners of a method to a result.
 
-    Args:
-        found: the winners.
-        left: (H, W) uint8, the left image.
-        search: which disparities were tried.
-        sigma_model: the uncertainty of the method.
-        edges: whether depth breaks are aligned to the edges of the image.
+    ``left``: (H, W) uint8, the left image; ``search``: which disparities were tried; ``sigma_model``: the uncertainty of
+    the method; ``edges``: whether depth breaks are aligned to the edges of the image.
     """
     sure = without_speckles(found)
     if np.count_nonzero(sure == sure) < _LEAST_SHARE * sure.size:  # NaN is not even itself

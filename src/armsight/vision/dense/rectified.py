@@ -116,18 +116,10 @@ def match_pair(
 ) -> Disparity:
     """Check a rectified pair and match it.
 
-    Args:
-        method: the dense method.
-        left: (H, W) or (H, W, 3) BGR; uint8, uint16, or floats of 0 to 255.
-        right: the same.
-        search: which disparities to try.
-        note: called with a remark on a pair that is slightly off.
-
-    Returns:
-        The disparities; empty, with the reason, where there is nothing to match.
-
-    Raises:
-        InputError: not images, not of one size, exchanged, not rectified, or a search that leaves the image.
+    ``left``: (H, W) or (H, W, 3) BGR; uint8, uint16, or floats of 0 to 255. ``right``: the same. ``search``: which
+    disparities to try. ``note``: called with a remark on a pair that is slightly off. Returns the disparities; empty, with
+    the reason, where there is nothing to match. Raises InputError: not images, not of one size, exchanged, not rectified,
+    or a search that leaves the image.
     """
     a, b = plain_grey(left, "left"), plain_grey(right, "right")
     check_sizes(a, b)

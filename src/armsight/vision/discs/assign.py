@@ -45,17 +45,10 @@ def assign(
 ) -> Correspondences | Missed:
     """Identify the discs of a body whose pose is known approximately.
 
-    Args:
-        rig: the calibrated pair.
-        target: the discs.
-        T_left_body: (4, 4) approximate pose: predicted, or from its coded markers.
-        cov: (6, 6) covariance of its tangent.
-        left: the discs detected in the left image.
-        right: the discs detected in the right image.
-
-    Returns:
-        Ellipse centres by rows of the target's body; discs for which detections compete are dropped by name. Missed
-        where nothing is left.
+    ``T_left_body``: (4, 4) approximate pose: predicted, or from its coded markers; ``cov``: (6, 6) covariance of its
+    tangent; ``left``: the discs detected in the left image; ``right``: the discs detected in the right image. Returns
+    ellipse centres by rows of the target's body; discs for which detections compete are dropped by name. Missed where
+    nothing is left.
     """
     view = DiscView.of(rig, target, left, right)
     found = settle(view, T_left_body, cov, np.full((len(target.radii_m), 2), -1))
@@ -81,11 +74,8 @@ def correspondences(view: DiscView, found: Assigned) -> Correspondences:
 def settle(view: DiscView, T_left_body: Array, cov: Array, rows: Ids) -> Assigned:
     """Assign detections to discs by a pose, the unambiguous ones first.
 
-    Args:
-        view: the discs that both cameras detected.
-        T_left_body: (4, 4) approximate pose.
-        cov: (6, 6) covariance of its tangent.
-        rows: (M, 2) detections already assigned, which the pose includes; -1 elsewhere.
+    ``view``: the discs that both cameras detected. ``T_left_body``: (4, 4) approximate pose. ``cov``: (6, 6) covariance of
+    its tangent. ``rows``: (M, 2) detections already assigned, which the pose includes; -1 elsewhere.
     """
     T, rows = T_left_body, rows.copy()
     while True:

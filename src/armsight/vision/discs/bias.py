@@ -245,16 +245,10 @@ def _each(
 def project_discs(camera: Camera, p: Array, normals: Array, radii_m: Array) -> tuple[Array, Array, Array, Array]:
     """Project discs to the ellipses that a camera shows, and their centres.
 
-    Args:
-        camera: the camera.
-        p: (N, 3) centres of the discs, m, camera's frame.
-        normals: (N, 3) unit normals of the discs, camera's frame; the sign does not matter.
-        radii_m: (N,) radii, m.
-
-    Returns:
-        (N, 2) centres of the ellipses, raw px; (N, 3) S11, S12, S22 of the ellipses, px^2; (N, 2, 3) derivative of the
-        centres by p; (N, 2, 3) by the normals. NaN where a disc is not all in front of the camera or seen edge-on. The
-        derivatives leave out the lens's curvature over the ellipse.
+    ``p``: (N, 3) centres of the discs, m, camera's frame. ``normals``: (N, 3) unit normals of the discs, camera's frame;
+    the sign does not matter. ``radii_m``: (N,) radii, m. Returns (N, 2) centres of the ellipses, raw px; (N, 3) S11, S12,
+    S22 of the ellipses, px^2; (N, 2, 3) derivative of the centres by p; (N, 2, 3) by the normals. NaN where a disc is not
+    all in front of the camera or seen edge-on. The derivatives leave out the lens's curvature over the ellipse.
     """
     p = checked(p, (None, 3), "disc centres")
     normals = checked(normals, p.shape, "disc normals")
@@ -268,14 +262,8 @@ def project_discs(camera: Camera, p: Array, normals: Array, radii_m: Array) -> t
 def disc_bias(camera: Camera, T_camera_board: Array, points: Array, radius_m: float) -> Array:
     """Return by how much the centres of the ellipses of a board's discs are off the images of their middles.
 
-    Args:
-        camera: the camera.
-        T_camera_board: (4, 4) pose of the board, whose discs face along z.
-        points: (N, 3) the discs' middles, m, board frame.
-        radius_m: their radius, m.
-
-    Returns:
-        (N, 2) px; zero where a disc has no ellipse.
+    ``T_camera_board``: (4, 4) pose of the board, whose discs face along z; ``points``: (N, 3) the discs' middles, m, board
+    frame. Returns (N, 2) px; zero where a disc has no ellipse.
     """
     p = transform(T_camera_board, points)
     normals = np.tile(T_camera_board[:3, 2], (len(p), 1))
@@ -285,12 +273,8 @@ def disc_bias(camera: Camera, T_camera_board: Array, points: Array, radius_m: fl
 def apparent_radii(camera: Camera, T_camera_board: Array, points: Array, shape: Array, about_m: float) -> Array:
     """Return (N,) which radius, m, the ellipse of each disc of a board has according to its area.
 
-    Args:
-        camera: the camera.
-        T_camera_board: (4, 4) pose of the board, whose discs face along z.
-        points: (N, 3) the discs' middles, m, board frame.
-        shape: (N, 3) S11, S12, S22 of the ellipses, px^2.
-        about_m: a radius of about the right size.
+    ``T_camera_board``: (4, 4) pose of the board, whose discs face along z; ``points``: (N, 3) the discs' middles, m, board
+    frame; ``shape``: (N, 3) S11, S12, S22 of the ellipses, px^2; ``about_m``: a radius of about the right size.
     """
     p = transform(T_camera_board, points)
     normals = np.tile(T_camera_board[:3, 2], (len(p), 1))
@@ -387,16 +371,10 @@ def expect(rig: StereoRig, target: DiscTarget, T_left_body: Array) -> Expected:
 def centred(rig: StereoRig, target: DiscTarget, T_left_body: Array, seen: Correspondences) -> Correspondences:
     """Convert centres of ellipses to images of the discs' centres: subtract the perspective bias.
 
-    Args:
-        rig: the calibrated pair.
-        target: the discs; ``seen.ids`` are rows of its body.
-        T_left_body: (4, 4) pose of the body, the one that is estimated from the result: an error of it is none of the
-            detections', for the bias follows the estimate.
-        seen: centres of ellipses.
-
-    Returns:
-        The same correspondences less the bias, with the covariance of both, as far as the normals are not known.
-        Detections whose disc would have no image at the pose become NaN.
+    ``target``: the discs; ``seen.ids`` are rows of its body. ``T_left_body``: (4, 4) pose of the body, the one that is
+    estimated from the result: an error of it is none of the detections', for the bias follows the estimate. ``seen``:
+    centres of ellipses. Returns the same correspondences less the bias, with the covariance of both, as far as the normals
+    are not known. Detections whose disc would have no image at the pose become NaN.
     """
     expected = expect(rig, target, T_left_body)
     cov = seen.cov_uv + expected.cov_bias[seen.ids]

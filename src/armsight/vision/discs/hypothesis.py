@@ -74,14 +74,9 @@ class _Fit(Record):
 def hypothesis(view: DiscView, pairs: Pairs, T_left_body: Array, rows: Ids) -> Hypothesis | str:
     """Extend a few named detections to a hypothesis over all discs.
 
-    Args:
-        view: the discs that both cameras detected.
-        pairs: all pairs of discs that may be one disc of the body.
-        T_left_body: (4, 4) the approximate pose.
-        rows: (M, 2) detections of three discs or more, -1 elsewhere.
-
-    Returns:
-        The hypothesis, or the reason why it is rejected.
+    ``view``: the discs that both cameras detected; ``pairs``: all pairs of discs that may be one disc of the body;
+    ``T_left_body``: (4, 4) the approximate pose; ``rows``: (M, 2) detections of three discs or more, -1 elsewhere. Returns
+    the hypothesis, or the reason why it is rejected.
     """
     fit = _fit(view, T_left_body, rows)
     if fit is None:

@@ -149,9 +149,8 @@ def _joined(
 def _triangles(start: Ids, second: Ids, shared: Ids, enough: int, found: Ids) -> int:
     """List triangles of nodes a < b < c that are all shared by ``enough`` of them; return how many there are.
 
-    start (V + 1,) where each node's edges to higher nodes, second (E,), rising, begin; shared (V,) in how many
-    triangles each node is, counted here where ``enough`` is zero; found (T, 5) receives nodes a, b, c and the edges ab
-    and ac.
+    start (V + 1,) where each node's edges to higher nodes, second (E,), rising, begin; shared (V,) in how many triangles
+    each node is, counted here where ``enough`` is zero; found (T, 5) receives nodes a, b, c and the edges ab and ac.
     """
     count = 0
     for a in range(len(start) - 1):

@@ -38,15 +38,10 @@ def symmetries(
 ) -> list[Symmetry]:
     """Find the ways in which discs in view may be taken for others of the same body.
 
-    Args:
-        points: (M, 3) positions of all discs, m.
-        alike: (M, M) whether two discs look alike; discs that do not are never taken for each other.
-        seen: (V,) the discs in view, V >= 3, not all on one line.
-        tolerance_m: largest difference of two distances that counts as equal, m.
-        mirrored: find reflections instead of rotations.
-
-    Returns:
-        Each once, without the identity, the closest first.
+    ``points``: (M, 3) positions of all discs, m. ``alike``: (M, M) whether two discs look alike; discs that do not are
+    never taken for each other. ``seen``: (V,) the discs in view, V >= 3, not all on one line. ``tolerance_m``: largest
+    difference of two distances that counts as equal, m. ``mirrored``: find reflections instead of rotations. Returns each
+    once, without the identity, the closest first.
     """
     p = points * [1.0, 1.0, -1.0] if mirrored else points
     base = _widest(points, seen)

@@ -124,11 +124,9 @@ class Follower:
     def __init__(self, rig: StereoRig, target: Target, apart_s: float = 0.0) -> None:
         """Prepare to follow.
 
-        Args:
-            rig: the calibrated pair.
-            target: a body whose markers are discs and nothing else, with the normals of all known.
-            apart_s: standard deviation of the time between the two exposures of a shot, s: by as much as a moving body
-                moves in it, its images may contradict each other.
+        ``target``: a body whose markers are discs and nothing else, with the normals of all known; ``apart_s``: standard
+        deviation of the time between the two exposures of a shot, s: by as much as a moving body moves in it, its images
+        may contradict each other.
         """
         self.way, self.jump = "lost", None
         self._track: BodyTrack | None = None
@@ -187,11 +185,9 @@ class Follower:
     def measure(self, shot: Shot, expected: Array | None = None, twist: Array | None = None) -> PoseEstimate | Missed:
         """Measure one shot; shots must come in the order of their time.
 
-        Args:
-            shot: the pair of images.
-            expected: T_left_body (4, 4) from another source, such as an arm's joints, used while the body is lost: it
-                is searched there, and in the whole image only once in several shots, for that takes long.
-            twist: (6,) velocity of the body there, m/s and rad/s, in its own axes; at rest by default.
+        ``shot``: the pair of images. ``expected``: T_left_body (4, 4) from another source, such as an arm's joints, used
+        while the body is lost: it is searched there, and in the whole image only once in several shots, for that takes
+        long. ``twist``: (6,) velocity of the body there, m/s and rad/s, in its own axes; at rest by default.
         """
         self._count += 1
         t_s = float(self._count) if shot.t_s is None else shot.t_s

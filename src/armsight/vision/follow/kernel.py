@@ -4,9 +4,8 @@ Discs are searched only where a predicted pose expects them, so the time for a p
 with the image. The pose minimises the whitened distance of the ellipses' centres to where the discs' ellipses would
 have theirs: the perspective bias is in the model, not corrected afterwards.
 
-The file follows a pair: the records (:class:`DiscScene` for what is constant, :class:`DiscMeasurement` for the result),
-the minimum and its covariance, the points, then the search for each disc, and last :func:`follow_pair`, which calls
-them all.
+The file follows a pair: the records (:class:`DiscScene` for what is constant, :class:`DiscMeasurement` for the result), the
+minimum and its covariance, the points, then the search for each disc, and last :func:`follow_pair`, which calls them all.
 """
 
 from __future__ import annotations

@@ -65,8 +65,7 @@ def board_in_view(image: Grey) -> CalibrationBoard | None:
 def kalibr_spec(path: str) -> str:
     """Return the spec of the board that one of Kalibr's target files describes.
 
-    Raises:
-        InputError: missing, no target file, or one whose squares are no squares; the message names file and key.
+    Raises InputError: missing, no target file, or one whose squares are no squares; the message names file and key.
     """
     from armsight.tables.document import read_document  # not above: YAML takes as long to import as a pair of images
 
@@ -99,12 +98,8 @@ def kalibr_spec(path: str) -> str:
 def open_board(spec: str | Path) -> CalibrationBoard:
     """Make the board that a spec names.
 
-    Args:
-        spec: kind and fields, separated by colons; lengths carry a unit (mm, cm, m, in); or the name of Kalibr's target
-            file (.yaml).
-
-    Raises:
-        InputError: unknown kind or malformed fields; the message shows the form and the known kinds.
+    ``spec``: kind and fields, separated by colons; lengths carry a unit (mm, cm, m, in); or the name of Kalibr's target
+    file (.yaml). Raises InputError: unknown kind or malformed fields; the message shows the form and the known kinds.
     """
     spec = str(spec)
     if Path(spec).suffix.lower() in KALIBR and Path(spec).suffix != spec:

@@ -112,8 +112,7 @@ def _unit(marker: Marker, key: str) -> Array:
 def read_body_file(path: str | Path, kinds: Collection[str]) -> tuple[str, tuple[Marker, ...]]:
     """Read a body file of markers of known kinds: its name (the file's, where none is given) and its markers.
 
-    Raises:
-        InputError: missing, not TOML, or not a body; the message names the file and the entry.
+    Raises InputError: missing, not TOML, or not a body; the message names the file and the entry.
     """
     document = read_toml(path)
     unknown = set(document) - {"version", "name", "markers"}
@@ -185,13 +184,8 @@ _OPPOSED = -0.5
 def check_discs(markers: Sequence[Marker], radii_m: Sequence[float]) -> None:
     """Reject discs of one body that cannot all exist.
 
-    Args:
-        markers: their entries in the body file.
-        radii_m: their radii, m.
-
-    Raises:
-        InputError: a radius or a distance that suggests a wrong unit, or two discs at one position; the message names
-            file and entry.
+    ``markers``: their entries in the body file; ``radii_m``: their radii, m. Raises InputError: a radius or a distance that
+    suggests a wrong unit, or two discs at one position; the message names file and entry.
     """
     positions = np.array([marker.position for marker in markers])
     away = np.linalg.norm(positions - positions[0], axis=1)
@@ -245,9 +239,8 @@ HEADERS = (
 def load_body_csv(path: str | Path) -> Body:
     """Read a body from a table of its points: CSV with a header of HEADERS and a line for each point.
 
-    Raises:
-        InputError: missing, malformed, not numbers, a name twice, fewer than three points, or a size that suggests a
-            wrong unit; the message names the file and the line.
+    Raises InputError: missing, malformed, not numbers, a name twice, fewer than three points, or a size that suggests a
+    wrong unit; the message names the file and the line.
     """
     rows = read_table(path)
     if not rows or tuple(field.strip().lower() for field in rows[0]) not in HEADERS:

@@ -274,9 +274,8 @@ class Fits(Record):
 def odd_sized(theta: Array, factor: float) -> NDArray[np.bool_]:
     """(N,) whether a disc's area is far from what the others' areas, linear over the image, let expect.
 
-    Args:
-        theta: (N, 10) discs of one grid.
-        factor: by which an area may be larger or smaller, beyond what is usual among them.
+    ``theta``: (N, 10) discs of one grid; ``factor``: by which an area may be larger or smaller, beyond what is usual among
+    them.
     """
     area, uv = -0.5 * np.log(np.maximum(theta[:, 2] * theta[:, 4] - theta[:, 3] ** 2, 1e-300)), theta[:, :2]
     keep = np.ones(len(area), bool)
@@ -295,8 +294,7 @@ def odd_sized(theta: Array, factor: float) -> NDArray[np.bool_]:
 def contrasts(image: Grey, theta: Array, sign: int) -> tuple[Array, NDArray[np.bool_]]:
     """Compare grey inside and outside of ellipses theta (N, 10); ``sign`` 1 for bright discs, -1 for dark ones.
 
-    Return (N,) contrast in grey levels, 0 where the rim is not closed; (N,) whether the middle has the surround's
-    level.
+    Return (N,) contrast in grey levels, 0 where the rim is not closed; (N,) whether the middle has the surround's level.
     """
     contrast, hollow = np.empty(len(theta)), np.empty(len(theta), bool)
     _each_contrast(np.ascontiguousarray(image), np.ascontiguousarray(theta), sign, contrast, hollow)

@@ -186,12 +186,8 @@ def _beside(cell: Cell) -> list[Cell]:
 def extrapolated(cell: Cell, known: Mapping[Cell, complex]) -> tuple[complex, float] | None:
     """Predict where a cell of a lattice is from the positions of cells nearby.
 
-    Args:
-        cell: the cell.
-        known: positions u + iv, px, of cells.
-
-    Returns:
-        The position, px, and the step from its neighbours, px; None where nothing beside it is known.
+    ``known``: positions u + iv, px, of cells. Returns the position, px, and the step from its neighbours, px; None where
+    nothing beside it is known.
     """
     x, y = cell
     guesses: list[complex] = []
@@ -338,9 +334,8 @@ def skips_line(cells: Ids, theta: Array) -> bool:
     Three lines left of four fit a projection as well, one numbered wrongly. Steps are measured by the discs they lead to:
     in coordinates in which these are unit circles, one across a line that is missing is twice as long as others.
 
-    Args:
-        cells: (N, 2) the lattice's cells.
-        theta: (N, 10) its discs, as in :class:`~armsight.vision.markers.circle_blobs.Blobs`.
+    ``cells``: (N, 2) the lattice's cells; ``theta``: (N, 10) its discs, as in
+    :class:`~armsight.vision.markers.circle_blobs.Blobs`.
     """
     at = {(x, y): i for i, (x, y) in enumerate(cells.tolist())}
     steps: dict[tuple[int, int], list[float]] = {}
@@ -362,13 +357,8 @@ def shown_size(cells: Ids, *, staggered: bool, like: tuple[int, int]) -> tuple[i
     Outer lines that lack more than a tenth of the discs of the next ones (in a staggered grid the next but one) are not of
     the grid.
 
-    Args:
-        cells: (N, 2) the lattice's cells.
-        staggered: whether the lattice lies diagonally in the grid.
-        like: columns and rows of the board.
-
-    Returns:
-        None where the lattice fills no grid.
+    ``cells``: (N, 2) the lattice's cells; ``staggered``: whether the lattice lies diagonally in the grid; ``like``: columns
+    and rows of the board. Returns None where the lattice fills no grid.
     """
     x, y = cells.T
     at, step = np.stack([x - y, x + y] if staggered else [x, y], axis=1), 2 if staggered else 1
@@ -398,13 +388,8 @@ def positions(cells: Ids, uv: Array) -> dict[Cell, complex]:
 def expected(cells: Ids, theta: Array, size_px: tuple[int, int]) -> tuple[Ids, Array]:
     """Predict where discs next to those of a lattice would be, as far as they would be in the image.
 
-    Args:
-        cells: (N, 2) the lattice's cells.
-        theta: (N, 10) its discs.
-        size_px: width and height of the image.
-
-    Returns:
-        (K, 2) further cells; (K, 2) where they would be, px.
+    ``cells``: (N, 2) the lattice's cells; ``theta``: (N, 10) its discs; ``size_px``: width and height of the image. Returns
+    (K, 2) further cells; (K, 2) where they would be, px.
     """
     seen = positions(cells, theta[:, :2])
     radius_px = float(np.median(theta[:, 2] * theta[:, 4] - theta[:, 3] ** 2) ** -0.25)

@@ -5,14 +5,13 @@ Around a corner the image is modelled as the product of two edges under an illum
 
     I(x) = (1 + k . d) (a + b M),   M = E1(u1) E2(u2) + C(u1, u2),   d = x - c,   u_i = n_i . (d - h_i t_i^2).
 
-u_i is the distance from edge i, h_i t_i^2 the edge's bow from lens distortion (known from the neighbouring corners).
-E_i is a step seen through Gaussian blur s_i and a pixel: across the edge a pixel is a box as wide as the longer of its
-two shadows, and the shorter one joins the blur. Sharp cameras blur by less than a pixel, so this matters. C corrects
-the product where the edges are not square to each other: the expectation of sgn(u1 + e1) sgn(u2 + e2) for blur of
-correlation rho = n1 . n2 by the first terms of Mehler's series (Abramowitz and Stegun 26.3.29). Levenberg-Marquardt
-finds c, the edges' angles, s, a, b and k; the covariance of c is that of the linearised fit with the noise that the
-residuals at the edges show. An X corner has a point symmetry that gamma, bleeding print, blur and sharpening keep, so
-none of them moves it.
+u_i is the distance from edge i, h_i t_i^2 the edge's bow from lens distortion (known from the neighbouring corners). E_i is
+a step seen through Gaussian blur s_i and a pixel: across the edge a pixel is a box as wide as the longer of its two
+shadows, and the shorter one joins the blur. Sharp cameras blur by less than a pixel, so this matters. C corrects the
+product where the edges are not square to each other: the expectation of sgn(u1 + e1) sgn(u2 + e2) for blur of correlation
+rho = n1 . n2 by the first terms of Mehler's series (Abramowitz and Stegun 26.3.29). Levenberg-Marquardt finds c, the edges'
+angles, s, a, b and k; the covariance of c is that of the linearised fit with the noise that the residuals at the edges
+show. An X corner has a point symmetry that gamma, bleeding print, blur and sharpening keep, so none of them moves it.
 
 First the window about a corner: which pixels a fit uses, and the moments of those on plain squares. Then the fit of
 every corner of an image; its kernels are in ``crossing.py``.
@@ -352,14 +351,10 @@ def _pixels(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
 def crossing_signs(image: NDArray[np.uint8], uv: Array, squares: Array) -> Array:
     """Find where squares of two colours may meet crosswise, by a quick test.
 
-    Args:
-        image: (H, W) grey image.
-        uv: (N, 2) raw pixels, right to a quarter of a square.
-        squares: (N, 2, 2) the two sides of the square at each position, px.
-
-    Returns:
-        (N,) 1 where a patch in the square between the first and the second side, and one in the opposite square, are
-        both brighter than those in the other two, -1 where they are darker, 0 elsewhere.
+    ``image``: (H, W) grey image; ``uv``: (N, 2) raw pixels, right to a quarter of a square; ``squares``: (N, 2, 2) the two
+    sides of the square at each position, px. Returns (N,) 1 where a patch in the square between the first and the second
+    side, and one in the opposite square, are both brighter than those in the other two, -1 where they are darker, 0
+    elsewhere.
     """
     out = np.zeros(len(uv))
     _quick_signs(_pixels(image), uv, squares, out)

@@ -20,9 +20,8 @@ def grid_points(columns: int, rows: int, pitch_m: float) -> Array:
 def rotations(points: Array) -> tuple[tuple[int, Ids], ...]:
     """Find the rotations by 90, 180 and 270 degrees in the plane that map a set of points (M, 3) onto itself.
 
-    Returns:
-        Pairs of the multiple of 90 degrees (1, 2, 3) and the permutation (M,): point i moves to where point perm[i]
-        was.
+    Returns Pairs of the multiple of 90 degrees (1, 2, 3) and the permutation (M,): point i moves to where point perm[i]
+    was.
     """
     p = points[:, :2] - 0.5 * (points[:, :2].min(axis=0) + points[:, :2].max(axis=0))
     rows, squares = np.empty(len(p), np.int64), np.empty(len(p))
@@ -46,10 +45,9 @@ def rightwards(points: Array, uv: Array) -> float:
 def local_squares(uv: Array) -> tuple[Array, Array]:
     """Estimate the squares around each point of a detected grid uv (rows, columns, 2), NaN where unknown.
 
-    Returns:
-        (rows, columns, 2, 2) the vectors to the next column and to the next row, as long as the shorter of the two
-        sides that meet, from a homography where neighbours are missing; (rows, columns, 2, 2) the bow of the grid's
-        lines, 1/px: a point t px along a line lies ``t^2 * bow`` off its tangent; zero where it is not known.
+    Returns (rows, columns, 2, 2) the vectors to the next column and to the next row, as long as the shorter of the two
+    sides that meet, from a homography where neighbours are missing; (rows, columns, 2, 2) the bow of the grid's lines,
+    1/px: a point t px along a line lies ``t^2 * bow`` off its tangent; zero where it is not known.
     """
     squares, bows = np.empty((*uv.shape, 2)), np.empty((*uv.shape, 2))
     if _read_squares(np.ascontiguousarray(uv, dtype=np.float64), squares, bows):

@@ -47,12 +47,9 @@ class Target(Protocol):
     def detect(self, image: Image) -> Detections:
         """Find the coded points of the body in one grey image; discs are identified by both cameras together.
 
-        Args:
-            image: (H, W) uint8.
-
-        Returns:
-            The points found: rows of ``body.points``, raw pixels ((0, 0) is the centre of the top-left pixel), and the
-            covariance that the image itself supports. Nothing found is ``Detections.none(reason)``, never an exception.
+        ``image``: (H, W) uint8. Returns the points found: rows of ``body.points``, raw pixels ((0, 0) is the centre of the
+        top-left pixel), and the covariance that the image itself supports. Nothing found is ``Detections.none(reason)``,
+        never an exception.
         """
 
 

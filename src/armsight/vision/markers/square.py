@@ -1,8 +1,7 @@
 """Corners of square code markers (AprilTag, ArUco) by a fit of the whole printed pattern, with covariance.
 
-A grey image, a marker's cells and its rough corners go in; its four corners and their covariance come out. The marker
-is modelled as what it is, a grid of dark and bright cells in a white surround, seen through a homography, blur and
-pixels:
+A grey image, a marker's cells and its rough corners go in; its four corners and their covariance come out. The marker is
+modelled as what it is, a grid of dark and bright cells in a white surround, seen through a homography, blur and pixels:
 
     I(x) = (1 + k . d) (a + b M + c (1 - M^2)),   M = sum of the cells' colours, each edge blurred as in ``normal.py``.
 

@@ -96,11 +96,8 @@ def read_layout(path: str | Path) -> Composite:
 def open_target(spec: str | Path) -> Target:
     """Make a target that can be found in images.
 
-    Args:
-        spec: a board such as ``chessboard:9x6:25mm``, a TOML body file, or a TOML board file of ``calibrate``.
-
-    Raises:
-        InputError: neither, malformed, or a CSV body, which has points but no description of its markers.
+    ``spec``: a board such as ``chessboard:9x6:25mm``, a TOML body file, or a TOML board file of ``calibrate``. Raises
+    InputError: neither, malformed, or a CSV body, which has points but no description of its markers.
     """
     kind = _kind(spec := str(spec))
     if kind == ".csv":
@@ -119,8 +116,7 @@ def open_target(spec: str | Path) -> Target:
 def open_fixed(specs: Sequence[str], target: str) -> tuple[Target, ...]:
     """Make the targets that do not move, beside the one that is measured.
 
-    Raises:
-        InputError: as :func:`open_target`, or two are given of which one would be taken for the other.
+    Raises InputError: as :func:`open_target`, or two are given of which one would be taken for the other.
     """
     opened = {f"--target {target}": open_target(target)} if specs else {}
     for spec in specs:
@@ -176,8 +172,7 @@ def _distances(points: Array) -> Array:
 def open_body(spec: str | Path) -> Body:
     """Return the body that a board's spec, a TOML body file or a CSV of points describes.
 
-    Raises:
-        InputError: none of these, or malformed.
+    Raises InputError: none of these, or malformed.
     """
     return load_body_csv(spec) if _kind(str(spec)) == ".csv" else open_target(spec).body
 

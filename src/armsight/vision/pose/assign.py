@@ -54,15 +54,9 @@ def instances(
 ) -> list[tuple[Array, Correspondences]]:
     """Find the bodies in one shot.
 
-    Args:
-        points: (M, 3) points of the body, m.
-        rig: the cameras and their relative pose.
-        shot: the detections of both cameras.
-        found: what :func:`candidates` returns, where it is known.
-
-    Returns:
-        T_left_body (4, 4) and the correspondences of every body, the one with most detections first; no detection is
-        used twice.
+    ``points``: (M, 3) points of the body, m; ``rig``: the cameras and their relative pose; ``shot``: the detections of both
+    cameras; ``found``: what :func:`candidates` returns, where it is known. Returns T_left_body (4, 4) and the
+    correspondences of every body, the one with most detections first; no detection is used twice.
     """
     left, right = candidates(points, rig.cameras, shot) if found is None else found
     starts = [c.T_camera_body for c in left] + [rig.T_left_right @ c.T_camera_body for c in right]

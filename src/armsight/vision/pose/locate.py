@@ -43,13 +43,9 @@ def implausible(
 ) -> str | None:
     """Return the reason why a fit is not a plausible measurement of the body, or None.
 
-    Args:
-        rig: the calibrated pair.
-        body: the body's points, m.
-        points: triangulated points, three or more, not all on one line.
-        fit: the pose's plain fit.
-        used: the observations that were fitted, all of the points' or fewer.
-        rigid: (4, 4) T_left_body of the rigid fit to all points.
+    ``body``: the body's points, m; ``points``: triangulated points, three or more, not all on one line; ``fit``: the pose's
+    plain fit; ``used``: the observations that were fitted, all of the points' or fewer; ``rigid``: (4, 4) T_left_body of
+    the rigid fit to all points.
     """
     everything = len(used.point) == np.count_nonzero(points.seen.seen)
     count = np.bincount(used.point, minlength=len(body.points))
@@ -160,14 +156,9 @@ _SUSPECT, _TRIPLES, _TRIED = 4.0, 60, 3
 def locate(rig: StereoRig, body: Body, points: Points) -> PoseEstimate | Missed:
     """Estimate the pose of a body in one shot.
 
-    Args:
-        rig: the calibrated pair.
-        body: the body's points, m.
-        points: the shot's triangulated points, with the correspondences they came from.
-
-    Returns:
-        The pose of the body in the left camera's frame, or why there is none: fewer than three points, points on one
-        line, no pose that most detections agree with, or detections that do not look like the body.
+    ``body``: the body's points, m; ``points``: the shot's triangulated points, with the correspondences they came from.
+    Returns the pose of the body in the left camera's frame, or why there is none: fewer than three points, points on one
+    line, no pose that most detections agree with, or detections that do not look like the body.
     """
     reason = _unlocatable(body, points)
     if reason is not None:

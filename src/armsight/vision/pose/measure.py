@@ -1,8 +1,7 @@
 """Measure a body's pose from one shot: detect, match, triangulate, locate.
 
-from armsight import StereoRig, measure, open_source, open_target
-rig, target = StereoRig.load("rig.json"), open_target("chessboard:9x6:25mm")
-estimate = measure(rig, target, open_source("recording").read())
+from armsight import StereoRig, measure, open_source, open_target rig, target = StereoRig.load("rig.json"),
+open_target("chessboard:9x6:25mm") estimate = measure(rig, target, open_source("recording").read())
 
 Plain discs are identified, their perspective bias is subtracted, and all points are located together:
 
@@ -46,16 +45,8 @@ _RADIUS_SHARE, _RADIUS_PX = 0.1, 0.7
 def measure(rig: StereoRig, target: Target, shot: Shot) -> PoseEstimate | Missed:
     """Measure one shot.
 
-    Args:
-        rig: the calibrated pair.
-        target: the body to find.
-        shot: two simultaneous images.
-
-    Returns:
-        The pose of the target's body in the left camera's frame, or why there is none.
-
-    Raises:
-        InputError: an argument has another type.
+    ``target``: the body to find; ``shot``: two simultaneous images. Returns the pose of the target's body in the left
+    camera's frame, or why there is none. Raises InputError: an argument has another type.
     """
     require_arguments("measure(rig, target, shot)", rig=rig, target=target, shot=shot)
     if shot.problem is not None or shot.left is None or shot.right is None:

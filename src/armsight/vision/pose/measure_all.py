@@ -1,7 +1,6 @@
 """Measure a target in all shots of a source.
 
-from armsight import measure_all
-table = measure_all("rig.json", "chessboard:9x6:25mm", "recording")
+from armsight import measure_all table = measure_all("rig.json", "chessboard:9x6:25mm", "recording")
 """
 
 from __future__ import annotations
@@ -27,18 +26,11 @@ def measure_all(
 ) -> ShotPoses:
     """Measure every shot by itself, until the source ends.
 
-    Args:
-        rig: the calibrated pair, or its file.
-        target: the body to find, or its text as the command line takes it.
-        source: the shots, or what :func:`~armsight.vision.sources.open_source` opens; a source that was open stays open.
-        progress: called after each shot with how many are done, and how many there are (None: not known).
-
-    Returns:
-        A row a shot, missed ones included, each with its reason.
-
-    Raises:
-        InputError: a file or text is wrong, an argument has another type, or all shots were read before.
-        DeviceError: a camera is gone.
+    ``rig``: the calibrated pair, or its file. ``target``: the body to find, or its text as the command line takes it.
+    ``source``: the shots, or what :func:`~armsight.vision.sources.open_source` opens; a source that was open stays open.
+    ``progress``: called after each shot with how many are done, and how many there are (None: not known). Returns a row a
+    shot, missed ones included, each with its reason. Raises InputError: a file or text is wrong, an argument has another
+    type, or all shots were read before; DeviceError: a camera is gone.
     """
     rig = StereoRig.load(rig) if isinstance(rig, str | Path) else rig
     target = open_target(target) if isinstance(target, str | Path) else target

@@ -98,16 +98,10 @@ def whitened(
 ) -> tuple[Array, Array, Array]:
     """Differentiate the projections of all observations, in standard deviations of each.
 
-    Args:
-        cameras: left and right.
-        T_left_right: (4, 4) pose of the right camera in the left one's frame.
-        points: (M, 3) points of the body, m.
-        observations: N detections.
-        T_left_body: (4, 4) the pose, with every point before its camera.
-
-    Returns:
-        (N, 2, 2) matrices W, W^T W being the inverse of a detection's covariance; (2N, 6) W times the derivative by the
-        pose's tangent (perturbation on the right); (2N, P) W times that by the parameters of the rig.
+    ``T_left_right``: (4, 4) pose of the right camera in the left one's frame; ``points``: (M, 3) points of the body, m;
+    ``observations``: N detections; ``T_left_body``: (4, 4) the pose, with every point before its camera. Returns (N, 2, 2)
+    matrices W, W^T W being the inverse of a detection's covariance; (2N, 6) W times the derivative by the pose's tangent
+    (perturbation on the right); (2N, P) W times that by the parameters of the rig.
     """
     n, counts = len(observations.point), np.array([camera.distortion.size for camera in cameras])
     W, by_pose, by_rig = np.zeros((n, 2, 2)), np.empty((2 * n, 6)), np.zeros((2 * n, 8 + counts.sum() + 6))

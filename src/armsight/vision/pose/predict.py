@@ -52,13 +52,9 @@ class PredictedView(Record):
 def look_direction(points: Array, normals: Array) -> Array:
     """Return the unit vector (3,), body frame, from which most of a body's faces are seen.
 
-    Args:
-        points: (M, 3) points, m.
-        normals: (M, 3) out of their faces; NaN where unknown.
-
-    Returns:
-        The direction from the body to who looks at it; where no normal is known, perpendicular to the flattest plane
-        through the points, on the side of -z.
+    ``points``: (M, 3) points, m. ``normals``: (M, 3) out of their faces; NaN where unknown. Returns the direction from the
+    body to who looks at it; where no normal is known, perpendicular to the flattest plane through the points, on the side
+    of -z.
     """
     known = normals[np.isfinite(normals).all(axis=1)]
     if not len(known):
@@ -171,10 +167,7 @@ class PoseDerivatives(Record):
 def pose_derivatives(rig: StereoRig, points: Array, seen: PredictedView) -> PoseDerivatives | None:
     """Differentiate the pose that two cameras measure; None where the visible points do not determine one.
 
-    Args:
-        rig: the cameras.
-        points: (M, 3) points, m.
-        seen: the body's pose and which points are visible.
+    ``points``: (M, 3) points, m; ``seen``: the body's pose and which points are visible.
     """
     rows, sides = np.nonzero(seen.seen)
     if len(seen.paired) < 3:
@@ -198,14 +191,9 @@ def pose_derivatives(rig: StereoRig, points: Array, seen: PredictedView) -> Pose
 def pose_covariance(rig: StereoRig, points: Array, seen: PredictedView, sigma_px: float) -> Array | None:
     """Predict the covariance (6, 6) of a body's pose, [translation m; rotation rad], perturbation on the right.
 
-    Args:
-        rig: the cameras; the share of their calibration is included where the rig's covariance is known.
-        points: (M, 3) points, m.
-        seen: the body's pose and which points are visible.
-        sigma_px: standard deviation of a measured pixel position, px.
-
-    Returns:
-        The covariance, or None where the visible points do not determine a pose.
+    ``rig``: the cameras; the share of their calibration is included where the rig's covariance is known. ``points``: (M, 3)
+    points, m. ``seen``: the body's pose and which points are visible. ``sigma_px``: standard deviation of a measured pixel
+    position, px. Returns the covariance, or None where the visible points do not determine a pose.
     """
     found = pose_derivatives(rig, points, seen)
     return None if found is None else found.noise(sigma_px) + found.by_rig @ rig.cov @ found.by_rig.T

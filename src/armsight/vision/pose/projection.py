@@ -233,9 +233,8 @@ def derivatives(model: BundleModel, state: BundleState, observations: Observatio
 def predict(model: BundleModel, state: BundleState, observations: Observations) -> tuple[Array, Array, Array]:
     """Project every observation and differentiate by all that is shared.
 
-    Returns:
-        (N, 2) pixels; (N, 2, Q) derivative by the shared parameters; (N, 2, 6) derivative by the tangent of the shot's
-        pose (perturbation on the right), or (N, 2, 12) by that and the shot's motion.
+    Returns (N, 2) pixels; (N, 2, Q) derivative by the shared parameters; (N, 2, 6) derivative by the tangent of the shot's
+    pose (perturbation on the right), or (N, 2, 12) by that and the shot's motion.
     """
     uv, J = derivatives(model, state, observations)
     left, right = (camera.parameters.size for camera in state.cameras)
@@ -252,8 +251,7 @@ def _ellipses(
 ) -> tuple[Array, Array, Array]:
     """Project discs instead of their middles: centres of the ellipses (N, 2), derivatives by p and by normals (N, 2, 3).
 
-    p (N, 3): middles, m, camera's frame; uv (N, 2): their images, which stay where a disc has no ellipse; J_p:
-    derivative.
+    p (N, 3): middles, m, camera's frame; uv (N, 2): their images, which stay where a disc has no ellipse; J_p: derivative.
     """
     centres, _, J_disc, J_normal = project_discs(camera, p, np.ascontiguousarray(normals), np.full(len(p), radius_m))
     seen = np.isfinite(centres[:, 0])

@@ -226,11 +226,8 @@ class ShotPoses:
     def columns(self, lengths: str = "m") -> dict[str, Array | list[str | None]]:
         """Return the columns by name: (N,) numbers, NaN where a shot was missed; lists of text.
 
-        Args:
-            lengths: "m", the columns of ``armsight measure -o``; "mm": lengths in mm, as x_mm and sigma_x_mm.
-
-        Raises:
-            InputError: another unit.
+        ``lengths``: "m", the columns of ``armsight measure -o``; "mm": lengths in mm, as x_mm and sigma_x_mm. Raises
+        InputError: another unit.
         """
         if lengths not in ("m", "mm"):
             raise InputError(f'columns({lengths!r}): lengths are in "m" or "mm"')
@@ -251,11 +248,7 @@ class ShotPoses:
         }
 
     def write_csv(self, path: str | Path) -> None:
-        """Write the file that ``armsight measure -o`` writes.
-
-        Raises:
-            InputError: it cannot be written; then nothing is.
-        """
+        """Write the file that ``armsight measure -o`` writes. Raises InputError: it cannot be written; then nothing is."""
         write_text(Path(path), csv_text(self.poses))
 
     def __arrow_c_stream__(self, requested_schema: object | None = None) -> object:
@@ -267,11 +260,7 @@ class ShotPoses:
     def to_pandas(self, lengths: str = "m") -> Any:  # noqa: ANN401 - pandas is no dependency
         """Return pandas' DataFrame of the columns.
 
-        Args:
-            lengths: "m" or "mm", as :meth:`columns` takes it.
-
-        Raises:
-            InputError: pandas is not installed, or another unit.
+        ``lengths``: "m" or "mm", as :meth:`columns` takes it. Raises InputError: pandas is not installed, or another unit.
         """
         try:
             return importlib.import_module("pandas").DataFrame(self.columns(lengths))
@@ -281,8 +270,7 @@ class ShotPoses:
     def plot(self) -> Any:  # noqa: ANN401 - matplotlib is no dependency
         """Draw position, mm, and angles, degrees, over time or shots, with two sigmas; return matplotlib's figure.
 
-        Raises:
-            InputError: matplotlib is not installed, or no shot was measured.
+        Raises InputError: matplotlib is not installed, or no shot was measured.
         """
         figure, axes = new_figure(3, 2, sharex=True)
         good = [each for each in self.poses if each.ok]

@@ -81,10 +81,8 @@ class Motion(Record):
 def motions(t_s: Array, Ts: Array, covs: Array) -> list[Motion | None]:
     """Fit the motion about each of N poses to those around it; None where there are fewer than three.
 
-    Args:
-        t_s: (N,) rising times, s.
-        Ts: (N, 4, 4) T_left_body.
-        covs: (N, 6, 6) covariance of each, perturbation on the right.
+    ``t_s``: (N,) rising times, s; ``Ts``: (N, 4, 4) T_left_body; ``covs``: (N, 6, 6) covariance of each, perturbation on
+    the right.
     """
     found: list[Motion | None] = [None] * len(t_s)
     widest = _GAP * float(np.median(np.diff(t_s))) if len(t_s) > 1 else 0.0
@@ -121,18 +119,11 @@ def estimate_shutters(
 ) -> Shutters | Missed:
     """Estimate the skew of two cameras, and the readout time of their rolling shutters, from a moving body.
 
-    Args:
-        rig: the calibrated pair.
-        body: what moves.
-        shots: in the order of their time; InputError where their times do not rise.
-        known: the readout that is given, and where to begin; nothing by default.
-        readout: estimate the readout too.
-        sigma_most: largest sigma that counts as found, as a share of the median time between shots.
-        calibrated: whether the rig is; residuals of one that is not yet are its own errors, not those of the detections,
-            and what persists of them is in no sigma.
-
-    Returns:
-        Both with covariance, or why they cannot be found: too few shots that move, or too slow.
+    ``shots``: in the order of their time; InputError where their times do not rise. ``known``: the readout that is given,
+    and where to begin; nothing by default. ``readout``: estimate the readout too. ``sigma_most``: largest sigma that counts
+    as found, as a share of the median time between shots. ``calibrated``: whether the rig is; residuals of one that is not
+    yet are its own errors, not those of the detections, and what persists of them is in no sigma. Returns both with
+    covariance, or why they cannot be found: too few shots that move, or too slow.
     """
     start = known or Shutters(0.0, 0.0, np.zeros((2, 2)))
     t_s = _times(shots)
@@ -571,19 +562,9 @@ def measure_moving(
 ) -> list[tuple[PoseEstimate | Missed, bool]]:
     """Measure a moving body with every observation moved to its shot's time.
 
-    Args:
-        rig: the calibrated pair.
-        body: what moves.
-        shots: in the order of their time.
-        shutters: when the cameras expose.
-
-    Returns:
-        Of each shot the pose at its own time, or why there is none, and whether its observations were moved: not where
-        too few neighbours show the motion. The covariance holds that of the shutters, common to all shots, and of the
-        motion.
-
-    Raises:
-        InputError: the times do not rise.
+    ``shots``: in the order of their time; ``shutters``: when the cameras expose. Returns of each shot the pose at its own
+    time, or why there is none, and whether its observations were moved: not where too few neighbours show the motion. The
+    covariance holds that of the shutters, common to all shots, and of the motion. Raises InputError: the times do not rise.
     """
     return [
         (_measured(rig, body, shot.seen, alignment, shutters), alignment.motion is not None)

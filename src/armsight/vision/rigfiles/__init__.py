@@ -104,8 +104,7 @@ def recognised(documents: Sequence[Mapping[str, object]]) -> str | None:
 def export_rig(rig: StereoRig, name: str, paths: Sequence[str | Path]) -> tuple[str, ...]:
     """Write a rig for another program and return what its files cannot hold, a line each.
 
-    Raises:
-        InputError: unknown format, one that is only read, a rig that does not fit it, or a file that cannot be written.
+    Raises InputError: unknown format, one that is only read, a rig that does not fit it, or a file that cannot be written.
     """
     write = open_format(name).write
     if write is None:

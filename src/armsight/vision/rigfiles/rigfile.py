@@ -197,16 +197,8 @@ def imported(
 ) -> StereoRig:
     """Assemble an imported rig, its uncertainty unknown, with a provenance that says so.
 
-    Args:
-        cameras: left and right.
-        T_left_right: (4, 4), its translation in the file's unit.
-        options: what the user added.
-        paths: the files.
-        notes: what was assumed and left behind.
-        unit_m: of the file, where the user gave none, m.
-
-    Raises:
-        InputError: both cameras at one position, or a baseline that cannot be.
+    ``T_left_right``: (4, 4), its translation in the file's unit; ``notes``: what was assumed and left behind; ``unit_m``:
+    of the file, where the user gave none, m. Raises InputError: both cameras at one position, or a baseline that cannot be.
     """
     left, right = cameras
     notes = list(dict.fromkeys(notes))

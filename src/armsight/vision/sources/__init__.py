@@ -64,8 +64,7 @@ LIVE = ("usb:", "url:")
 def check_source(spec: str) -> None:
     """Reject a text that can never be a source; what it names may come later.
 
-    Raises:
-        InputError: neither a known kind nor a folder.
+    Raises InputError: neither a known kind nor a folder.
     """
     kind, colon, _ = spec.partition(":")
     if not (colon and kind in SOURCES) and not os.path.isdir(os.path.expanduser(spec)):
@@ -86,15 +85,11 @@ def check_source(spec: str) -> None:
 def open_source(spec: str | Path) -> Source:
     """Open a source.
 
-    Args:
-        spec: ``folder:DIR`` or the path of a folder, ``pairs:LEFT_GLOB,RIGHT_GLOB``, ``video:LEFT,RIGHT`` or
-            ``video:SIDE_BY_SIDE``, ``bag:FILE``, ``lerobot:DIR``, ``url:URL_LEFT,URL_RIGHT``,
-            ``usb:LEFT,RIGHT[@WIDTHxHEIGHT][@FPS][,exposure=5ms]``. Without cameras:
-            ``armsight.sim.example_rig.demo_recording`` writes a small recording and its target; its rig is returned.
-
-    Raises:
-        InputError: an unknown kind, or what is named is not there or not usable.
-        DeviceError: a camera does not answer.
+    ``spec``: ``folder:DIR`` or the path of a folder, ``pairs:LEFT_GLOB,RIGHT_GLOB``, ``video:LEFT,RIGHT`` or
+    ``video:SIDE_BY_SIDE``, ``bag:FILE``, ``lerobot:DIR``, ``url:URL_LEFT,URL_RIGHT``,
+    ``usb:LEFT,RIGHT[@WIDTHxHEIGHT][@FPS][,exposure=5ms]``. Without cameras: ``armsight.sim.example_rig.demo_recording``
+    writes a small recording and its target; its rig is returned. Raises InputError: an unknown kind, or what is named is
+    not there or not usable; DeviceError: a camera does not answer.
     """
     check_source(spec := str(spec))
     kind, colon, rest = spec.partition(":")
@@ -104,8 +99,7 @@ def open_source(spec: str | Path) -> Source:
 def open_rig(spec: str | Path) -> StereoRig:
     """Read a rig: a rig file, or ``bag:FILE`` for the camera_info of a recording.
 
-    Raises:
-        InputError: it is not there, damaged, or the recording holds no stereo pair.
+    Raises InputError: it is not there, damaged, or the recording holds no stereo pair.
     """
     text = str(spec)
     if not text.startswith("bag:"):

@@ -116,8 +116,7 @@ class PairsSource(StoredSource):
     def of(text: str) -> PairsSource:
         """Open LEFT,RIGHT, as :func:`two_globs` reads it.
 
-        Raises:
-            InputError: not two globs, no files, or files that do not pair up.
+        Raises InputError: not two globs, no files, or files that do not pair up.
         """
         return PairsSource.open(*two_globs(text))
 

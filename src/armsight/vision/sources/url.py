@@ -4,8 +4,7 @@ In: two addresses. Out: shots from the newest frames of both, paired by the time
 the network's delay). Each stream has a thread that keeps its newest frame, so a slow user gets fresh shots and not a
 growing lag. Frames without a partner within half a frame period are skipped.
 
-MJPEG is multipart/x-mixed-replace (RFC 2046): a boundary line, a header that may give the length, a JPEG file, and
-again.
+MJPEG is multipart/x-mixed-replace (RFC 2046): a boundary line, a header that may give the length, a JPEG file, and again.
 """
 
 from __future__ import annotations

@@ -104,8 +104,7 @@ class VideoSource(Source):
     def open(left: str | Path, right: str | Path | None = None) -> VideoSource:
         """Open a file for each camera, or with no ``right`` one of both images side by side.
 
-        Raises:
-            InputError: a file is missing or not a video, both are the same, or a side-by-side frame has an odd width.
+        Raises InputError: a file is missing or not a video, both are the same, or a side-by-side frame has an odd width.
         """
         if right is not None and Path(left).resolve() == Path(right).resolve():
             raise InputError(f"{left}: given as both left and right video; a side-by-side video is video:{left}")

@@ -82,9 +82,8 @@ class FeetechBoard(PolledBoard):
         Without calibration 0 rad is count 2048; ``begin_s``: when its own time begins, on the bus's clock, s, by
         default now.
 
-        Raises:
-            DeviceError: one does not answer, is of another model, is not a position servo, or has another homing offset
-                than the calibration.
+        Raises DeviceError: one does not answer, is of another model, is not a position servo, or has another homing offset
+        than the calibration.
         """
         try:
             ids = tuple(range(1, len(NAMES) + 1)) if calibration is None else calibration.ids

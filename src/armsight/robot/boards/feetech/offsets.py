@@ -36,14 +36,9 @@ class OffsetChange(NamedTuple):
 def corrected_offsets(bus: ServoBus, calibration: ServoCalibration, further_rad: Array) -> list[OffsetChange]:
     """Return the offsets that make joints report what they really are at; nothing is written.
 
-    Args:
-        bus: the servos.
-        calibration: which servo drives which joint.
-        further_rad: (n,) true angle less reported one of each joint, rad.
-
-    Raises:
-        InputError: a correction that is no number, or one that the register does not hold.
-        DeviceError: a servo does not answer.
+    ``calibration``: which servo drives which joint; ``further_rad``: (n,) true angle less reported one of each joint, rad.
+    Raises InputError: a correction that is no number, or one that the register does not hold; DeviceError: a servo does not
+    answer.
     """
     further = np.asarray(further_rad, float)
     count = len(calibration.ids)
@@ -65,9 +60,8 @@ def corrected_offsets(bus: ServoBus, calibration: ServoCalibration, further_rad:
 def doubts(changes: list[OffsetChange], calibration: ServoCalibration) -> list[str]:
     """Return why changes look like mistakes, a sentence each; none where they do not.
 
-    Args:
-        changes: of the offsets.
-        calibration: the ranges of the joints, counts. One that has the whole revolution has no ends that are known.
+    ``changes``: of the offsets. ``calibration``: the ranges of the joints, counts. One that has the whole revolution has no
+    ends that are known.
     """
     said = []
     for change in changes:
@@ -106,9 +100,8 @@ def require_released(bus: ServoBus, changes: list[OffsetChange]) -> None:
 def write_changes(bus: ServoBus, changes: list[OffsetChange]) -> None:
     """Write the offsets that change, and read each back; where one fails, those before it get their old values again.
 
-    Raises:
-        InputError: a torque is on; nothing was written.
-        DeviceError: a servo does not answer, or does not keep the value.
+    Raises InputError: a torque is on; nothing was written. DeviceError: a servo does not answer, or does not keep the
+    value.
     """
     require_released(bus, changes)
     written: list[OffsetChange] = []

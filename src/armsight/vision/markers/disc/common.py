@@ -116,15 +116,12 @@ def _rim_noise(n: int, discs: Array) -> None:
 def common(image: NDArray[np.uint8], n: int, work: FitBuffers, shared: Array) -> None:
     """Fill what the first n discs of ``work.discs`` have in common.
 
-    Args:
-        image: (H, W) grey.
-        n: number of discs.
-        work: what they show; power and its third column become ratios, see :func:`_rim_noise`.
-        shared: (SHARED,) filled: mean square of the deviations of the rims' sectors beyond white noise, px^2; the
-            vignetting a and its standard deviation, 1/px^2; at LEVEL how level surrounds are, the share of their gradients
-            that is noise, as half of them show it; from FIELDS on c (2), px, and k of the shift c + k x that
-            skewed edges make together at a pixel x, one standard deviation; from VIGNETTING on the same of an error of
-            a, for discs of about the same size. Medians, so that a few discs that are none do not count.
+    ``image``: (H, W) grey. ``n``: number of discs. ``work``: what they show; power and its third column become ratios, see
+    :func:`_rim_noise`. ``shared``: (SHARED,) filled: mean square of the deviations of the rims' sectors beyond white noise,
+    px^2; the vignetting a and its standard deviation, 1/px^2; at LEVEL how level surrounds are, the share of their
+    gradients that is noise, as half of them show it; from FIELDS on c (2), px, and k of the shift c + k x that skewed edges
+    make together at a pixel x, one standard deviation; from VIGNETTING on the same of an error of a, for discs of about the
+    same size. Medians, so that a few discs that are none do not count.
     """
     discs = work.discs
     shared[:] = 0.0
@@ -228,13 +225,9 @@ def correct(
     centre as much. So may an edge that is steeper on one side: where its middle is depends on the profile, and sharpening
     or blur that is the same on all sides moves it; here as far as it moves this disc otherwise than all.
 
-    Args:
-        image: (H, W) grey.
-        noise_sigma: of the image, grey levels.
-        disc: (SHOWN,) what the disc's fit shows; the parameters in it are replaced.
-        shared: (SHARED,) of :func:`common`.
-        cov: (2, 2) covariance of the centre, px^2, of the fit, replaced.
-        work: buffers.
+    ``image``: (H, W) grey. ``noise_sigma``: of the image, grey levels. ``disc``: (SHOWN,) what the disc's fit shows; the
+    parameters in it are replaced. ``shared``: (SHARED,) of :func:`common`. ``cov``: (2, 2) covariance of the centre, px^2,
+    of the fit, replaced.
     """
     theta, factor = disc[PARAMETERS : PARAMETERS + UNKNOWNS], _factor(disc)
     u, v = _from_middle(image, disc, 0), _from_middle(image, disc, 1)

@@ -464,9 +464,8 @@ def rim_power(n: int, theta: Array, x0: float, y0: float, variance: float, work:
     discs alike, and moves no centre with them. What exceeds white noise, of ``variance`` as the residuals have it, is
     raised where it is shorter than the noise's blur.
 
-    Returns:
-        Their power, px^3: the variance of the rim's displacement, px^2, times the length of rim that moves as one, but for
-        a factor; and how many times smaller it is than the variance of the residuals where they are white, 1/px^3.
+    Returns Their power, px^3: the variance of the rim's displacement, px^2, times the length of rim that moves as one, but
+    for a factor; and how many times smaller it is than the variance of the residuals where they are white, 1/px^3.
     """
     px, py, J, left = work.px, work.py, work.J, work.left
     cx, cy, r00 = F(theta[0] - x0), F(theta[1] - y0), F(np.sqrt(theta[2]))
@@ -738,8 +737,7 @@ def _step(
 ) -> tuple[float, float]:
     """Make one Gauss-Newton step on the first n pixels.
 
-    Returns:
-        How far the centre moved, px, -1 where no step is possible; the sum of the squared residuals after the step.
+    Returns how far the centre moved, px, -1 where no step is possible; the sum of the squared residuals after the step.
     """
     H, g, L, scale, x, at = work.H, work.g, work.L, work.scale, work.x, work.at
     for a in range(UNKNOWNS):
@@ -806,16 +804,10 @@ def minimise(
 def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, work: FitBuffers) -> int:
     """Fit one disc.
 
-    Args:
-        image: (H, W) grey.
-        noise_sigma: the image's noise as far as it is known beforehand, grey levels; used to reject what is not a disc.
-        theta: (10,) start: centre (raw px), M (1/px^2), blur (px), contrast, base, gradient (1/px); replaced by the
-            result.
-        cov: (2, 2) covariance of the centre, px^2; filled.
-        work: what :func:`workspace` returns; ``work.shown`` is filled.
-
-    Returns:
-        0, or the reason why it is not a disc (REASONS).
+    ``image``: (H, W) grey. ``noise_sigma``: the image's noise as far as it is known beforehand, grey levels; used to reject
+    what is not a disc. ``theta``: (10,) start: centre (raw px), M (1/px^2), blur (px), contrast, base, gradient (1/px);
+    replaced by the result. ``cov``: (2, 2) covariance of the centre, px^2; filled. ``work``: what :func:`workspace`
+    returns; ``work.shown`` is filled. Returns 0, or the reason why it is not a disc (REASONS).
     """
     sectors = work.sectors
     n, sample = gather(image, theta, work)

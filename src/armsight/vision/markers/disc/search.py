@@ -176,8 +176,7 @@ def _ellipse(radii: Array, room: Room, without: int) -> tuple[float, float, floa
 
     With weights 1 / radius^2 the normal equations are sums of powers of the radii, times those of the rays' directions.
 
-    Returns:
-        Its centre, from that of the rays, px; 1 + the centre's distance in it, squared, -1 where there is no ellipse.
+    Returns Its centre, from that of the rays, px; 1 + the centre's distance in it, squared, -1 where there is no ellipse.
     """
     H, g, _, L, scale, p = room
     q0, q1, q2, q3, q4, c0, c1, c2, c3, g3, g4 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -519,8 +518,7 @@ def _note(n: int, starts: Array, cells: NDArray[np.int16]) -> None:
 def _strongest(image: Grey, y: int, i: int, sign: int, left: np.uint64) -> tuple[np.uint64, int, int]:
     """Take the first run of marked pixels of word i of a row, which is one candidate.
 
-    Returns:
-        The marks that are left; the column where the two pixels, eight apart, differ most, and by how many levels.
+    Returns the marks that are left; the column where the two pixels, eight apart, differ most, and by how many levels.
     """
     byte, best, x = 0, -1, 0
     while (left >> np.uint64(8 * byte)) & _MARK == _EMPTY:
@@ -617,9 +615,8 @@ def find(
     with ``n`` 0 the image is searched for them. In the end the discs come first, then the rejected candidates; ``cov`` (N,
     2, 2) are the covariances of the discs' centres, px^2, and ``shape`` (N, 3) their ellipses, px^2.
 
-    Returns:
-        The number of discs, and of candidates in all; whether the search found that there may be a disc too large for it;
-        the image's noise, grey levels.
+    Returns the number of discs, and of candidates in all; whether the search found that there may be a disc too large for
+    it; the image's noise, grey levels.
     """
     noise, large = noise_of(image), False
     if n == 0:

@@ -147,13 +147,8 @@ class Pairing:
 def pair(left: Stamps, right: Stamps, allowed_s: float | None = None) -> Pairing:
     """Pair two topics.
 
-    Args:
-        left: of the left camera.
-        right: of the right camera.
-        allowed_s: how far apart a pair may be, s; by default half the period of the faster topic.
-
-    Raises:
-        InputError: no two messages are close enough.
+    ``allowed_s``: how far apart a pair may be, s; by default half the period of the faster topic. Raises InputError: no two
+    messages are close enough.
     """
     if allowed_s is None:
         allowed_s = min(_APART_S, left.period_s / 2, right.period_s / 2)
