@@ -14,7 +14,7 @@ import numpy as np
 from armsight.app.show.messages import Note
 from armsight.app.show.page import PAGE
 from armsight.app.show.plotting import Figure, subplots
-from armsight.app.show.report import Fact, Grade, Plot, Report, Section, figure_files
+from armsight.app.show.report import Fact, Grade, Lines, Plot, Report, Section, figure_files
 from armsight.app.show.table import TextTable
 from armsight.sim.budget.plan import KEYS, PRICES, RigPlan, catalogue
 from armsight.sim.budget.result import AT_REST, NOT_MODELLED, RigBudget
@@ -62,7 +62,7 @@ def budget_report(found: RigBudget, alternatives: Sequence[RigBudget] = (), run:
     sections: dict[str, Section] = {
         "result": ("Result", [Fact(shares), Fact(others), table, more, *_compared(alternatives), *beside]),
         "map": ("Over the volume", [Plot("volume", partial(_map, found.found), caption, title)]),
-        "missing": ("Not in the budget", [Fact(f"not in the budget: {why}") for why in NOT_MODELLED]),
+        "missing": ("Not in the budget", [Lines(NOT_MODELLED, "not in the budget:")]),
     }
     notes, cameras = [f"chosen: {_chosen(plan)}"], f"{plan.cameras.text}; {plan.baseline} apart"
     if plan.rig:

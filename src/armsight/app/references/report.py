@@ -162,7 +162,7 @@ def _check(entry: Entry) -> tuple[dict[str, Any], list[str], list[str]]:
     axes = ["_".join(column.split("_")[:2]) for column in COLUMNS[type(entry.reference)]]
     values["saturated"] = [axes[k] for k in stream.saturated]
     lines = [
-        f"{name}: {len(t_s)} readings, {stream.rate_hz:.4g} Hz, jitter {1e3 * stream.jitter_s:.2g} ms, "
+        f"{name}: {len(t_s)} readings, {stream.rate_hz:.4g} Hz, jitter {round(1e3 * stream.jitter_s, 4):.2g} ms, "
         f"{stream.gaps} gaps, the longest {1e3 * stream.longest_gap_s:.0f} ms"
     ]
     for unit, scale in (("ms", 1e3), ("us", 1e6), ("ns", 1e9)):
@@ -185,8 +185,8 @@ def _check(entry: Entry) -> tuple[dict[str, Any], list[str], list[str]]:
         (unit, scale, most, why), key = RESTS[channel], CHANNELS[channel][0].lower()
         if channel == "range" and (ratio := float(noise[0]) / entry.noise_m) > NOISY:
             weak.append(
-                f"{name}: never at rest: its noise is not determined; or it is {ratio:.2g} times noise_m, "
-                f"{1e3 * entry.noise_m:.2g} mm: give that as it is, and the right unit"
+                f"{name}: never at rest, or its noise, {1e3 * noise[0]:.2g} mm, is {ratio:.2g} times noise_m: "
+                "correct noise_m or the unit"
             )
             return values | {"rest_s": 0.0}, lines, weak
         values |= {f"noise_{key}": noise, f"drift_{key}": drifts}
