@@ -240,7 +240,6 @@ def _step(arm: Arm, q: Array, points: PathPoints, V_ref: Array, row: int, scale:
 
 
 def _motion(run: _Run, qd_start: Array) -> TrackedMotion:
-    """Return a run as a trajectory."""
     row = int(np.argmin(run.least))
     spline = CubicSpline(run.t_s, run.q, bc_type=((1, qd_start), (1, np.zeros_like(qd_start))))
     return TrackedMotion(

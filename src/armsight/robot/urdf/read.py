@@ -344,7 +344,6 @@ def _parallel(C: Array) -> Decomposition:
 
 
 def _gamma(C: Array, beta: float, alpha: float) -> float:
-    """Return gamma."""
     R = _motion(Decomposition(beta, 0, 0, alpha, 0, 0))[:3, :3].T @ C[:3, :3]
     return float(np.arctan2(R[1, 0], R[0, 0]))
 

@@ -106,7 +106,6 @@ class Tree:
         return chain
 
     def _up(self, link: str, above: dict[str, Joint]) -> list[Joint]:
-        """Return the joints from the base to a link."""
         found: list[Joint] = []
         while link in above:
             if above[link] in found:

@@ -278,7 +278,6 @@ class CameraPipeline:
 
     @classmethod
     def _from_tables(cls, path: str | Path) -> Self:
-        """Return what a file says."""
         tables = read_toml(path)
         base = tables.pop("preset", None)
         if base is not None:
@@ -344,7 +343,6 @@ def preset_names() -> tuple[str, ...]:
 
 
 def _stage(path: str | Path, name: str, values: object) -> Stage:
-    """Return a stage from its table."""
     if name not in STAGES:
         raise InputError(f"{path}: unknown stage {name!r}; known are preset, {', '.join(STAGES)}")
     if not isinstance(values, dict):

@@ -95,7 +95,6 @@ def _links(arm: Arm, parts: Solids, motors: Motors) -> str:
 
 
 def _pose_text(T: Array) -> str:
-    """Write a pose."""
     return f'pos="{_row(T[:3, 3])}" quat="{_row(quaternion_wxyz(T[:3, :3]))}"'
 
 

@@ -217,7 +217,6 @@ class _Parts(NamedTuple):
 def _standing(
     rig: StereoRig, T_base_rig: Array, plant: ArmPlant | ControlledArm, seed: int, sensor: Sensor, psf_sigma_px: float
 ) -> tuple[WorkcellCamera, WorkcellCamera]:
-    """Return a rig's cameras where they stand."""
     stand = partial(WorkcellCamera, foot=plant.parts, seed=seed, sensor=sensor, psf_sigma_px=psf_sigma_px)
     return stand(rig.left, T_base_rig), stand(rig.right, T_base_rig @ rig.T_left_right)
 

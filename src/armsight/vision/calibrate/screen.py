@@ -134,7 +134,6 @@ def merged_notes(notes: Sequence[str]) -> list[str]:
 
 
 def _of_shots(model: BundleModel, kept: NDArray[np.int64]) -> BundleModel:
-    """Return the model of some of the shots."""
     return replace(model, motion_sigmas=model.motion_sigmas[kept]) if len(model.motion_sigmas) else model
 
 

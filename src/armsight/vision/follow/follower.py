@@ -147,7 +147,6 @@ class Follower:
         self._work, self._outline = workspace(), search.workspace()
 
     def _describe(self, rig: StereoRig) -> None:
-        """Set the rig."""
         discs = self.target.discs
         assert discs is not None
         self.rig = rig

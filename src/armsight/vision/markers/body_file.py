@@ -271,7 +271,6 @@ def load_body_csv(path: str | Path) -> Body:
 
 
 def _coordinate(where: str, text: str) -> float:
-    """Read one coordinate."""
     value = number(text)
     if value is None:
         raise InputError(f"{where}: {text.strip()!r} is not a number")

@@ -179,7 +179,6 @@ def _spread(blobs: Blobs, seed: int, sides: tuple[int, int]) -> dict[Cell, int]:
 
 
 def _beside(cell: Cell) -> list[Cell]:
-    """Return the four cells beside a cell."""
     return [(cell[0] + dx, cell[1] + dy) for dx, dy in _SIDES]
 
 

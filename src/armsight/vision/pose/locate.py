@@ -324,7 +324,6 @@ def _thinned(
 
 
 def _chosen(observations: PixelObservations, good: NDArray[np.bool_]) -> PixelObservations:
-    """Return the good ones."""
     return observations if good.all() else observations.select(good)
 
 

@@ -135,7 +135,6 @@ def _is_focal(name: str, value: Foreign) -> bool:
 
 
 def _is_distortion(name: str, value: Foreign) -> bool:
-    """Say whether a value is called a distortion."""
     words = _words(name)
     return bool(_DISTORTION_WORDS & set(words) or _stem(name) in DISTORTION) and not {"model", "type"} & set(words)
 

@@ -142,7 +142,6 @@ class ServoBus:
         return answers
 
     def _heard(self, question: bytes, wait_s: float) -> bytes:
-        """Return all bytes that a question is answered with."""
         self._link.read(0.0)
         self._link.write(question)
         for _ in range(round(wait_s / _POLL_S)):

@@ -368,7 +368,6 @@ def _mcap_decoded(
 
 
 def _mcap_decoder(schema: _McapRecord, channel: _McapRecord) -> Callable[[bytes], Decoded]:
-    """Return what decodes the messages of a channel."""
     if channel.message_encoding == "protobuf":
         from mcap_protobuf.decoder import DecoderFactory
 
