@@ -20,6 +20,7 @@ import numpy as np
 from armsight.data import Array, JointCommand, JointStates
 from armsight.errors import DeviceError, InputError
 from armsight.firmware import dialect
+from armsight.robot.boards import reports
 from armsight.robot.boards.codes import Command, Reaction, Rejection, SensorKind
 from armsight.robot.boards.configuration import (
     CONFIG,
@@ -32,16 +33,6 @@ from armsight.robot.boards.configuration import (
 )
 from armsight.robot.boards.contract import STOPS, WRAP, Abilities, Closing
 from armsight.robot.boards.link import Link
-from armsight.robot.boards.reports import (
-    BoardStatus,
-    JointReport,
-    SensorReadings,
-    Welcome,
-    joints_of,
-    readings_of,
-    status_of,
-    welcome_of,
-)
 from armsight.robot.boards.wire import BOARD_COMPONENT, BOARD_SYSTEM, Message, Wire
 
 #: A board that sends nothing for so long is gone: its slowest message comes every few hundredths of a second.
@@ -67,9 +58,9 @@ _SLOW_ANGLES_US = 20000
 class Board(Closing):
     """A board behind a link, connected by :meth:`connect`; the link is closed with it."""
 
-    welcome: Welcome  #: who it is
-    status: BoardStatus  #: its newest status
-    joints: JointReport  #: its newest report of how the joints are driven
+    welcome: reports.Welcome  #: who it is
+    status: reports.BoardStatus  #: its newest status
+    joints: reports.JointReport  #: its newest report of how the joints are driven
     abilities: Abilities  #: what it can do
 
     def __init__(self, link: Link, name: str) -> None:
@@ -164,9 +155,9 @@ class Board(Closing):
             case "ANGLES":
                 self._angles.append((self._time_s(message.tick), message.angle_rad))
             case "JOINTS":
-                self.joints = joints_of(message, self._time_s(message.tick))
+                self.joints = reports.joints_of(message, self._time_s(message.tick))
             case "BOARD_STATUS":
-                self._take_status(status_of(message, self._time_s(message.tick)))
+                self._take_status(reports.status_of(message, self._time_s(message.tick)))
             case "WELCOME":
                 self._greeting = message
             case "SENSED":
@@ -176,7 +167,7 @@ class Board(Closing):
             case "CONFIG_PART":
                 self._parts[message.offset] = bytes(message.bytes[: message.length])
 
-    def _take_status(self, status: BoardStatus) -> None:
+    def _take_status(self, status: reports.BoardStatus) -> None:
         """Keep a status; where it newly rejects commands because no hello came, the board has restarted."""
         if self._started and status.rejection == Rejection.NO_HELLO:
             before = self.status
@@ -211,7 +202,7 @@ class Board(Closing):
         )
 
     def _meet(self, message: Message, ours: int) -> None:
-        self.welcome = welcome = welcome_of(message)
+        self.welcome = welcome = reports.welcome_of(message)
         theirs, config = message.dialect_version, message.config_version
         if (theirs, config) != (ours, CONFIG_VERSION):
             raise DeviceError(
@@ -321,7 +312,7 @@ class Board(Closing):
         # Both at full rate would fill the wire.
         ask(_SET_MESSAGE_INTERVAL, dialect().MAVLINK_MSG_ID_ANGLES, _SLOW_ANGLES_US if every_s else 0)
 
-    def sensed(self, wait_s: float = 0.0) -> SensorReadings:
+    def sensed(self, wait_s: float = 0.0) -> reports.SensorReadings:
         """Let ``wait_s`` pass and return what the converters read since the last call.
 
         Raises DeviceError: the board is gone or has restarted.
@@ -329,7 +320,7 @@ class Board(Closing):
         self._pump(wait_s)
         self._angles.clear()
         taken, self._sensed = self._sensed, []
-        return readings_of([message for message, _ in taken], [t_s for _, t_s in taken])
+        return reports.readings_of([message for message, _ in taken], [t_s for _, t_s in taken])
 
     def restart(self) -> None:
         """Start the board anew, with the drives off or DeviceError, and say hello again: what was stored is in use."""
@@ -381,7 +372,7 @@ class Board(Closing):
         return self._sequence
 
 
-def _check_abilities(config: Configuration, welcome: Welcome) -> None:
+def _check_abilities(config: Configuration, welcome: reports.Welcome) -> None:
     """Raise InputError where a configuration asks for more than the board has."""
     has = welcome.abilities
     if has is None:

@@ -7,16 +7,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from armsight.data import Array, Record
-from armsight.robot.boards.codes import (
-    Alarm,
-    BoardState,
-    ConfigSource,
-    Fault,
-    Limited,
-    Rejection,
-    SensorKind,
-    faults_in,
-)
+from armsight.robot.boards import codes
 from armsight.robot.boards.wire import Message
 
 _NO_JOINT = 255
@@ -27,7 +18,7 @@ class BoardAbilities:
     """What a board has for joints."""
 
     joints: int  #: how many
-    sensors: tuple[SensorKind, ...]  #: the kinds of sensors it reads
+    sensors: tuple[codes.SensorKind, ...]  #: the kinds of sensors it reads
     quadrature_inputs: int  #: how many quadrature encoders it counts: inputs 1 to so many
 
 
@@ -39,7 +30,7 @@ class Welcome:
     firmware: str  #: its firmware's version
     ticks_per_s: int  #: how many ticks its clock has a second; 0 where it has none and the host stamps its readings
     baud: int  #: bits a second on its wire
-    config_source: ConfigSource | None  #: where its configuration came from; None where it has none of ours
+    config_source: codes.ConfigSource | None  #: where its configuration came from; None where it has none of ours
     crash: tuple[int, ...] | None = None  #: where the firmware crashed before it started: exception, pc, lr and CFSR
     abilities: BoardAbilities | None = None  #: what it has for joints; None where it does not say
 
@@ -48,7 +39,7 @@ class Welcome:
 class JointFault:
     """A latched fault."""
 
-    fault: Fault | Alarm  #: which
+    fault: codes.Fault | codes.Alarm  #: which
     joint: int | None = None  #: of which joint, from 0; None where it belongs to none
 
     def __str__(self) -> str:
@@ -61,7 +52,7 @@ class BoardStatus:
     """The status of a board; what it does not count is 0."""
 
     t_s: float  #: when, s on the board's clock
-    state: BoardState  #: what it does with its drives
+    state: codes.BoardState  #: what it does with its drives
     faults: tuple[JointFault, ...]  #: all that are latched
     first_fault: JointFault | None  #: the one that came first since the last clear
     supply_v: float  #: motor supply, V; NaN where nobody measures it
@@ -69,7 +60,7 @@ class BoardStatus:
     acknowledged_count: int  #: how many were
     rejected_sequence: int = 0  #: number of the last command rejected
     rejected_count: int = 0  #: how many were
-    rejection: Rejection = Rejection.NONE  #: why that one was
+    rejection: codes.Rejection = codes.Rejection.NONE  #: why that one was
     crc_errors: int = 0  #: messages from the host that were broken
     lost_bytes: int = 0  #: bytes from the host that belonged to no message
     overrun_bytes: int = 0  #: bytes from the host for which there was no room
@@ -86,7 +77,7 @@ class BoardStatus:
     @property
     def drives_on(self) -> bool:
         """Whether the motors are driven."""
-        return self.state in (BoardState.ENABLED, BoardState.STOPPING, BoardState.HOLDING)
+        return self.state in (codes.BoardState.ENABLED, codes.BoardState.STOPPING, codes.BoardState.HOLDING)
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +89,7 @@ class JointReport(Record):
     reference_rad: Array  #: (n,) where the joints are to be
     reference_rad_s: Array  #: (n,) how fast they are to move
     duty: Array  #: (n,) to the motors, -1 to 1
-    limited: tuple[Limited, ...]  #: what holds each joint back without being a fault
+    limited: tuple[codes.Limited, ...]  #: what holds each joint back without being a fault
     temperature_c: Array | None = None  #: (n,) of the motors, degrees Celsius; None where nothing measures it
 
 
@@ -114,13 +105,13 @@ class SensorReadings(Record):
 
 def welcome_of(message: Message) -> Welcome:
     """Return what a WELCOME says."""
-    sensors = tuple(kind for kind in SensorKind if message.sensors >> kind & 1)
+    sensors = tuple(kind for kind in codes.SensorKind if message.sensors >> kind & 1)
     return Welcome(
         board=_text(message.board),
         firmware=_text(message.firmware),
         ticks_per_s=message.ticks_per_s,
         baud=message.baud,
-        config_source=ConfigSource(message.config_source),
+        config_source=codes.ConfigSource(message.config_source),
         crash=tuple(map(int, message.crash)) if any(message.crash) else None,
         abilities=BoardAbilities(message.joints, sensors, message.quadrature_inputs) if sensors else None,
     )
@@ -131,15 +122,15 @@ def status_of(message: Message, t_s: float) -> BoardStatus:
     first = None
     if message.first_fault:
         joint = None if message.first_joint == _NO_JOINT else message.first_joint
-        first = JointFault(Fault(message.first_fault), joint)
+        first = JointFault(codes.Fault(message.first_fault), joint)
     names = [each.name for each in fields(BoardStatus)]
     return BoardStatus(
         t_s,
-        BoardState(message.state),
+        codes.BoardState(message.state),
         _faults(message.faults, message.joint_faults),
         first,
         message.supply_mv * 1e-3,
-        rejection=Rejection(message.rejection),
+        rejection=codes.Rejection(message.rejection),
         **{name: getattr(message, name) for name in names[names.index("supply_v") + 1 :] if name != "rejection"},
     )
 
@@ -149,7 +140,7 @@ def joints_of(message: Message, t_s: float) -> JointReport:
     speed, reference, reference_speed, duty = (
         np.array(each) for each in (message.speed_rad_s, message.reference_rad, message.reference_rad_s, message.duty)
     )
-    return JointReport(t_s, speed, reference, reference_speed, duty, tuple(map(Limited, message.limited)))
+    return JointReport(t_s, speed, reference, reference_speed, duty, tuple(map(codes.Limited, message.limited)))
 
 
 def readings_of(messages: list[Message], times_s: list[float]) -> SensorReadings:
@@ -163,9 +154,9 @@ def readings_of(messages: list[Message], times_s: list[float]) -> SensorReadings
 
 def _faults(bits: int, joint_bits: list[int]) -> tuple[JointFault, ...]:
     """Return the latched faults, those of the joints first."""
-    of_joints = [JointFault(fault, j) for j, own in enumerate(joint_bits) for fault in faults_in(own)]
+    of_joints = [JointFault(fault, j) for j, own in enumerate(joint_bits) for fault in codes.faults_in(own)]
     of_named_joints = {each.fault for each in of_joints}
-    return tuple(of_joints + [JointFault(fault) for fault in faults_in(bits) if fault not in of_named_joints])
+    return tuple(of_joints + [JointFault(fault) for fault in codes.faults_in(bits) if fault not in of_named_joints])
 
 
 def _text(field: object) -> str:

@@ -101,7 +101,8 @@ class Wire:
             if message.get_type() == _BAD:
                 self.broken += 1
                 if message.data[0] in _MARKERS:
-                    self._search_on(message.data)
+                    # A false frame goes back into the parser's buffer, without its first byte.
+                    mav.buf, mav.buf_index = bytearray(message.data[1:]) + mav.buf[mav.buf_index :], 0
             # Of a kind that nobody knows nothing says what its CRC begins with: it is left out, and missed in the count.
             elif message.get_msgId() in self._kinds:
                 self._count_frame(message.get_seq())
@@ -135,9 +136,3 @@ class Wire:
         if self._count is not None:
             self.lost += (number - self._count) % _COUNTS
         self._count = (number + 1) % _COUNTS
-
-    def _search_on(self, false_frame: bytes) -> None:
-        """Put a false frame back into the parser's buffer, without its first byte."""
-        mav = self._mav
-        mav.buf = bytearray(false_frame[1:]) + mav.buf[mav.buf_index :]
-        mav.buf_index = 0

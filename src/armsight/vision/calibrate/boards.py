@@ -28,20 +28,7 @@ from numpy.typing import NDArray
 from armsight.data import Array, Body, Detections, Ids, Missed, Record
 from armsight.errors import CalibrationError
 from armsight.geometry.pose import inverse
-from armsight.vision.calibrate import FOLDS, MODELS
-from armsight.vision.calibrate.heldout import (
-    ROUGHLY,
-    STEPS,
-    Trial,
-    adjusted,
-    assessed,
-    concluded,
-    cross_validate,
-    freed,
-    require_choice,
-    rig_of,
-    summary,
-)
+from armsight.vision.calibrate import FOLDS, MODELS, heldout
 from armsight.vision.calibrate.motion import ExposureMotion, other_size
 from armsight.vision.calibrate.result import Calibration, HeldOutErrors, RejectedPair
 from armsight.vision.calibrate.screen import LEAST_CORNERS, MOTION_EASE, Screened, noise_px, robust_sigma, screen
@@ -124,10 +111,10 @@ def motion_of(model: BundleModel, screened: Screened, count: int) -> tuple[Expos
     """
     guess = ExposureMotion.guessed(model.points, len(screened.kept))
     still, observations = screened.solution, screened.observations
-    before = noise_px(still, observations, freed(model, still))
+    before = noise_px(still, observations, heldout.freed(model, still))
     solution = minimise(replace(model, motion_sigmas=guess.sigmas), still.state, observations, before)
     motion, taken = guess.updated(solution)
-    if noise_px(solution, observations, freed(model, solution) + taken) > (1 - MOTION_WORTH) * before:
+    if noise_px(solution, observations, heldout.freed(model, solution) + taken) > (1 - MOTION_WORTH) * before:
         return None
     furthest = int(np.argmin(motion.weights))
     way = solution.state.motions[furthest]
@@ -181,7 +168,9 @@ class LensModelSearch(Record):
     sizes: tuple[tuple[int, int], tuple[int, int]]  #: image size of the left and of the right camera, px
     progress: Callable[[str], None]  #: called with a line about what is being done
 
-    def best(self, models: tuple[str, ...], second: Second | None = None) -> tuple[Trial, dict[str, HeldOutErrors]]:
+    def best(
+        self, models: tuple[str, ...], second: Second | None = None
+    ) -> tuple[heldout.Trial, dict[str, HeldOutErrors]]:
         """Return the first model that no later one beats by more than WORTH, and the held-out errors of those tried.
 
         After the first, only those that may be worth it are tried.
@@ -203,11 +192,11 @@ class LensModelSearch(Record):
                 chosen, least = trial, score
         return chosen, {name: trial.heldout for name, trial in trials.items()}
 
-    def _trials(self, models: tuple[str, ...], second: Second | None) -> dict[str, Trial | None]:
+    def _trials(self, models: tuple[str, ...], second: Second | None) -> dict[str, heldout.Trial | None]:
         """Return the trial of each model; a second process takes the next one as soon as it is free, as this one does."""
-        waiting, found = deque(models), dict[str, Trial | None]()
+        waiting, found = deque(models), dict[str, heldout.Trial | None]()
 
-        def take(trial: Callable[[str], Trial | None]) -> None:
+        def take(trial: Callable[[str], heldout.Trial | None]) -> None:
             while True:
                 try:
                     name = waiting.popleft()
@@ -229,13 +218,13 @@ class LensModelSearch(Record):
             others.result()
         return found
 
-    def trial(self, distortion: str) -> Trial | None:
+    def trial(self, distortion: str) -> heldout.Trial | None:
         """Adjust and cross-validate one distortion model; None where its adjustment fails."""
         try:
-            model, motion, solution = adjusted(
+            model, motion, solution = heldout.adjusted(
                 self.model, self._converted(distortion), self.screened.observations, _START_PX, self.motion
             )
-            errors = cross_validate(
+            errors = heldout.cross_validate(
                 lambda rows: self._fold(model, motion, solution, rows),
                 model.points,
                 self.screened.unscreened,
@@ -244,7 +233,7 @@ class LensModelSearch(Record):
             )
         except (CalibrationError, np.linalg.LinAlgError):
             return None
-        return Trial(model, motion, solution, errors, summary(errors, self.folds, motion))
+        return heldout.Trial(model, motion, solution, errors, heldout.summary(errors, self.folds, motion))
 
     def _converted(self, distortion: str) -> BundleState:
         """Return the screened state with cameras of another distortion model."""
@@ -269,10 +258,12 @@ class LensModelSearch(Record):
             motion = motion.shots(rows)
             model, state = replace(model, motion_sigmas=motion.sigmas), replace(state, motions=state.motions[rows])
         seen = self.screened.observations.shots(rows)
-        solution = minimise(model, state, seen, full.sigma_px, max_steps=STEPS, least_decrease=ROUGHLY, damping=NEAR)
+        solution = minimise(
+            model, state, seen, full.sigma_px, max_steps=heldout.STEPS, least_decrease=heldout.ROUGHLY, damping=NEAR
+        )
         if motion is not None:
             motion = motion.updated(solution)[0]
-        return rig_of(solution), model.body(solution.state.shape), motion
+        return heldout.rig_of(solution), model.body(solution.state.shape), motion
 
 
 LEAST_PAIRS = 3
@@ -322,7 +313,7 @@ def calibrate_boards(
     Raises:
         CalibrationError: fewer than three usable pairs, or views that do not determine the cameras.
     """
-    require_choice(folds, models)
+    heldout.require_choice(folds, models)
     points = board.body.points
     usable, rejected = _usable(pairs)
     _enough(len(usable), len(pairs), rejected)
@@ -362,7 +353,7 @@ def calibrate_boards(
                 tried = {**tried, lens: trial.heldout}
     rejected += screened.rejected
     names = tuple(usable[j].name for j in screened.kept if j < pair_count)
-    calibration = concluded(
+    calibration = heldout.concluded(
         board.body,
         trial,
         screened.observations,
@@ -408,7 +399,7 @@ def _disc_radius(
         views = [(state.cameras[side], T_cameras[side] @ state.Ts_left_body[j], found) for side, j, found in seen]
         about_m, problem = seen_radius(board, views, about_m)
         model = replace(rigid_board(board.body.points), disc_radius_m=about_m)
-        first = minimise(model, state, observations, 1.0, max_steps=STEPS, least_decrease=ROUGHLY)
+        first = minimise(model, state, observations, 1.0, max_steps=heldout.STEPS, least_decrease=heldout.ROUGHLY)
     if problem is not None:
         raise CalibrationError(problem)
     return board.disc_radius_m or about_m, first
@@ -523,7 +514,7 @@ class _Selection(Record):
 
     def chosen(
         self, start: BundleState, models: tuple[str, ...], second: Second | None = None
-    ) -> tuple[Screened, Trial, dict[str, HeldOutErrors]]:
+    ) -> tuple[Screened, heldout.Trial, dict[str, HeldOutErrors]]:
         """Reject gross errors, then return the best model's trial and the held-out errors of all."""
         start = replace(start, shape=np.zeros(len(self.model.modes)))
         screened, motion = self._screened(self.model, start), None
@@ -615,7 +606,7 @@ def calibrate_recording(
         notes=(*calibration.notes, used, said),
         recorded=True,
     )
-    return assessed(calibration)
+    return heldout.assessed(calibration)
 
 
 def _shown(pairs: Sequence[Pair]) -> list[Ids]:
@@ -709,7 +700,9 @@ class _Recording(Record):
         radius_m = self.first.disc_radius_m or 0.0
         model = replace(rigid_board(self.body.points), disc_radius_m=radius_m, free_cameras=free_cameras)
         state = BundleState(rig.cameras, rig.T_left_right, np.array([T for _, T in chosen]), np.zeros(0))
-        state = minimise(model, state, observations, rig.sigma_px, max_steps=STEPS, least_decrease=ROUGHLY).state
+        state = minimise(
+            model, state, observations, rig.sigma_px, max_steps=heldout.STEPS, least_decrease=heldout.ROUGHLY
+        ).state
         return replace(rig, left=state.cameras[0], right=state.cameras[1], T_left_right=state.T_left_right)
 
     def moved(self, rig: StereoRig, shots: dict[int, TimedShot], later: int, shutters: Shutters) -> list[Pair]:

@@ -21,27 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array, Body, Detections, Ids, Record
+from armsight.vision.markers import circle_blobs, circle_grid
 from armsight.vision.markers.chessboard import KEPT_SHARE
-from armsight.vision.markers.circle_blobs import (
-    Blobs,
-    contrasts,
-    find_blobs,
-    fit_discs,
-    like_neighbours,
-    odd_sized,
-    without_holes,
-)
-from armsight.vision.markers.circle_grid import (
-    GridLayout,
-    Lattice,
-    expected,
-    extrapolated,
-    grow_lattices,
-    number_cells,
-    positions,
-    shown_size,
-    skips_line,
-)
 from armsight.vision.markers.disc.search import Grey
 from armsight.vision.markers.grid import grid_points, rightwards, rotations
 from armsight.vision.markers.marker import CalibrationBoard, Target
@@ -105,14 +86,15 @@ class CircleGrid(Record, CalibrationBoard):
     def in_view(image: Grey, pitch_m: float) -> CircleGrid | None:
         """Return the grid of discs that a grey image shows whole, square or staggered; None where there is none."""
         best: list[tuple[int, CircleGrid]] = []
-        for sign, blobs in zip((-1, 1), find_blobs(image, True, True), strict=True):
-            for grid in grow_lattices(blobs, len(blobs.theta))[:_GRIDS]:
+        for sign, blobs in zip((-1, 1), circle_blobs.find_blobs(image, True, True), strict=True):
+            for grid in circle_grid.grow_lattices(blobs, len(blobs.theta))[:_GRIDS]:
                 size = (image.shape[1], image.shape[0])
                 cells, theta, _ = _completed(image, grid.cells, blobs.theta[grid.blobs], sign, size, rings=False)
                 if not _are_apart(image, cells, theta[:, :2]):
                     continue
                 for staggered, like in _USUAL.items():
-                    if (shown := shown_size(cells, staggered=staggered, like=like)) is not None and min(shown) >= 3:
+                    shown = circle_grid.shown_size(cells, staggered=staggered, like=like)
+                    if shown is not None and min(shown) >= 3:
                         best.append((len(cells), CircleGrid(*shown, pitch_m, staggered)))
         return max(best, key=lambda each: each[0], default=(0, None))[1]
 
@@ -150,11 +132,11 @@ class CircleGrid(Record, CalibrationBoard):
         return tuple(perm for _, perm in rotations(self.body.points) if (ring[perm] == ring).all())
 
     @cached_property
-    def _layout(self) -> GridLayout:
+    def _layout(self) -> circle_grid.GridLayout:
         """The discs on a square lattice; that of a staggered grid lies diagonally."""
         x, y = np.rint(self.body.points[:, :2] / self.pitch_m).astype(np.int64).T
         cells = np.stack([(x + y) // 2, (y - x) // 2] if self.staggered else [x, y], axis=1)
-        return GridLayout(cells, self._ring, self.symmetries)
+        return circle_grid.GridLayout(cells, self._ring, self.symmetries)
 
     def detect(self, image: NDArray[np.uint8]) -> Detections:
         """Find the board in one grey image; see :class:`~armsight.vision.markers.marker.Target`."""
@@ -171,9 +153,9 @@ class CircleGrid(Record, CalibrationBoard):
     def _found(self, image: Grey, dark: bool, light: bool) -> Detections:
         """Find the board by its dark discs, its light ones, or whichever make the board."""
         least = max(4, int((_KEPT_WITH_RINGS if self.rings else KEPT_SHARE) * len(self._ring)))
-        grids: list[tuple[float, bool, Blobs, Lattice]] = []
-        for polarity, blobs in zip((False, True), find_blobs(image, light, dark), strict=True):
-            lattices = grow_lattices(blobs, len(self._ring))
+        grids: list[tuple[float, bool, circle_blobs.Blobs, circle_grid.Lattice]] = []
+        for polarity, blobs in zip((False, True), circle_blobs.find_blobs(image, light, dark), strict=True):
+            lattices = circle_grid.grow_lattices(blobs, len(self._ring))
             grids += [(g.weight, polarity, blobs, g) for g in lattices if len(g.blobs) >= least]
         problem = f"no {self.body.name} found"
         for n, (_, polarity, blobs, grid) in enumerate(sorted(grids, key=lambda g: -g[0])[:_GRIDS]):
@@ -183,7 +165,9 @@ class CircleGrid(Record, CalibrationBoard):
             problem = problem if n else f"{self.body.name}: {found}"
         return Detections.none(problem)
 
-    def _measured(self, image: Grey, blobs: Blobs, grid: Lattice, light: bool, least: int) -> Detections | str:
+    def _measured(
+        self, image: Grey, blobs: circle_blobs.Blobs, grid: circle_grid.Lattice, light: bool, least: int
+    ) -> Detections | str:
         """Number the discs of a grid and fit them; the reason where they do not make the board."""
         sign, size = (1 if light else -1), (image.shape[1], image.shape[0])
         cells, starts, hollow = _completed(
@@ -191,19 +175,19 @@ class CircleGrid(Record, CalibrationBoard):
         )
         if len(cells) < least:
             return f"{len(cells)} of its discs were found"
-        if skips_line(cells, starts):
+        if circle_grid.skips_line(cells, starts):
             return f"{len(cells)} of its discs were found, but between them a whole row or column was not"
         own = (self.columns, self.rows)
-        shown = shown_size(cells, staggered=self.staggered, like=own)
+        shown = circle_grid.shown_size(cells, staggered=self.staggered, like=own)
         if shown is not None and (shown[0] > own[0] or shown[1] > own[1]):
             return f"its discs make a grid of {shown[0]}x{shown[1]}: count columns x rows"
-        placement = number_cells(cells, starts, hollow, self._layout, size)
+        placement = circle_grid.number_cells(cells, starts, hollow, self._layout, size)
         if isinstance(placement, str):
             return placement + self._other_grid(cells, shown)
         seen = placement.ids >= 0
         starts, hollow = starts[seen], hollow[seen]
         ids = self._upright(placement.ids[seen], starts[:, :2])
-        fits = fit_discs(without_holes(image, starts[hollow]), starts)
+        fits = circle_blobs.fit_discs(circle_blobs.without_holes(image, starts[hollow]), starts)
         good = fits.kept()
         if good.sum() < least:
             return f"{len(ids)} of its discs were found, but only {good.sum()} can be measured{fits.why_not()}"
@@ -214,7 +198,7 @@ class CircleGrid(Record, CalibrationBoard):
         """Return "; they make a grid of 7x6" where a lattice (N, 2) that is not the board fills another grid."""
         own, kind = (self.columns, self.rows), "grid"
         if shown is None:
-            shown = shown_size(cells, staggered=not self.staggered, like=own)
+            shown = circle_grid.shown_size(cells, staggered=not self.staggered, like=own)
             kind = "square grid (circles)" if self.staggered else "staggered grid (acircles)"
         same = shown is None or (shown == own and kind == "grid")
         return "" if same or shown is None else f"; they make a {kind} of {shown[0]}x{shown[1]}"
@@ -248,15 +232,15 @@ def _completed(
     In and out: cells (N, 2), outlines ``theta`` (N, 10), and whether a disc has a hole (N,). ``sign``: 1 for light
     discs; ``rings``: whether the board has rings, of which a part may have been taken for a disc.
     """
-    kept = ~odd_sized(theta, _ODD_OUTLINE)
+    kept = ~circle_blobs.odd_sized(theta, _ODD_OUTLINE)
     if rings:
         kept &= ~_displaced(cells, theta)
     cells, theta = cells[kept], theta[kept]
-    contrast, hollow = contrasts(image, theta, sign)
+    contrast, hollow = circle_blobs.contrasts(image, theta, sign)
     while len(cells):
-        more, uv = expected(cells, theta, size_px)
-        like = like_neighbours(uv, theta)
-        there, ring = contrasts(image, like, sign)
+        more, uv = circle_grid.expected(cells, theta, size_px)
+        like = circle_blobs.like_neighbours(uv, theta)
+        there, ring = circle_blobs.contrasts(image, like, sign)
         found = there > _LOST_CONTRAST * np.median(contrast)
         if not found.any():
             break
@@ -270,7 +254,7 @@ def _are_apart(image: Grey, cells: Ids, uv: Array) -> bool:
 
     Halfway to the next disc a grid of discs is as between four of them; a chessboard has a corner there.
     """
-    at = positions(cells, uv)
+    at = circle_grid.positions(cells, uv)
     squares = [
         (p, at[x + 1, y], at[x, y + 1], at[x + 1, y + 1])
         for (x, y), p in at.items()
@@ -288,11 +272,11 @@ def _are_apart(image: Grey, cells: Ids, uv: Array) -> bool:
 
 def _displaced(cells: Ids, theta: Array) -> NDArray[np.bool_]:
     """(N,) which outlines, theta (N, 10), are not where those around their cells (N, 2) put them: of a part of a ring."""
-    seen, out = positions(cells, theta[:, :2]), np.zeros(len(cells), bool)
+    seen, out = circle_grid.positions(cells, theta[:, :2]), np.zeros(len(cells), bool)
     radius = (theta[:, 2] * theta[:, 4] - theta[:, 3] ** 2) ** -0.25
     for i, (x, y) in enumerate(cells.tolist()):
         own = seen.pop((x, y))
-        guess = extrapolated((x, y), seen)
+        guess = circle_grid.extrapolated((x, y), seen)
         out[i] = guess is not None and abs(guess[0] - own) > _DISPLACED * radius[i]
         seen[x, y] = own
     return out

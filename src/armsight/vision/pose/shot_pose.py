@@ -114,9 +114,7 @@ class ShotPose(SeenPose):
     @property
     def angle_sigmas_deg(self) -> Array:
         """(3,) one sigma of ``euler_zyx_deg``, degrees; NaN at the singularity."""
-        if self.pitch_singular:
-            return np.full(3, np.nan)
-        return self.sigma_deg
+        return np.full(3, np.nan) if self.pitch_singular else self.sigma_deg
 
     @property
     def status(self) -> str:

@@ -26,18 +26,7 @@ from armsight.tables.document import Foreign
 from armsight.tables.lengths import BASELINE, fitting
 from armsight.vision.camera_file import DISTORTION, MATRIX, SIZE, camera_of, described, found, plain
 from armsight.vision.rig import StereoRig
-from armsight.vision.rigfiles.rigfile import (
-    LOOSEST_ROTATION,
-    Document,
-    ImportOptions,
-    RigFormat,
-    count_paths,
-    imported,
-    not_held,
-    rectification,
-    rigid,
-    write_together,
-)
+from armsight.vision.rigfiles import rigfile
 
 #: Words of a name that say which camera of a pair it is of, left before right.
 _SIDES = [pair.split() for pair in ("left right", "l r", "1 2", "0 1", "first second", "a b", "master slave", "01 02")]
@@ -59,13 +48,13 @@ _TRANSLATIONS = (
 )  # fmt: skip
 
 
-def recognises(documents: Sequence[Document]) -> bool:
+def recognises(documents: Sequence[rigfile.Document]) -> bool:
     """Say whether files hold two camera matrices, or all that is between two cameras."""
     flat = dict(_flat(documents))
     return _pair(flat, _is_matrix) is not None or {"M1", "M2", "R", "T"} & set(flat) >= {"R", "T"}
 
 
-def read(documents: Sequence[Document], paths: Sequence[Path], options: ImportOptions) -> StereoRig:
+def read(documents: Sequence[rigfile.Document], paths: Sequence[Path], options: rigfile.ImportOptions) -> StereoRig:
     """Read any number of files that hold the two cameras together, in any order."""
     flat, where = dict(_flat(documents)), " and ".join(map(str, paths))
     with naming(where):
@@ -92,10 +81,10 @@ def read(documents: Sequence[Document], paths: Sequence[Path], options: ImportOp
                 "OpenCV 4's stereoCalibrate without CALIB_FIX_INTRINSIC stops before its minimum: if it made this, lengths "
                 "may be wrong by 0.1 %"
             )
-    return imported(cameras, inverse(T_right_left), options, paths, notes, unit_m)
+    return rigfile.imported(cameras, inverse(T_right_left), options, paths, notes, unit_m)
 
 
-def _flat(documents: Sequence[Document]) -> Iterator[tuple[str, Foreign]]:
+def _flat(documents: Sequence[rigfile.Document]) -> Iterator[tuple[str, Foreign]]:
     """Yield all names and values, those of mappings within mappings under both names."""
     for document in documents:
         for key, value in document.items():
@@ -127,11 +116,6 @@ def _is_matrix(name: str, value: Foreign) -> bool:
     if K.shape == (3, 3) and K[2].tolist() == [0, 0, 1] and min(K[0, 0], K[1, 1], K[0, 2], K[1, 2]) > 1:
         return True
     return K.ndim > 0 and _stem(name) in MATRIX and name[:1] not in "rR"  # a number k1 is of a distortion
-
-
-def _is_focal(name: str, value: Foreign) -> bool:
-    """Say whether a value is Bouguet's focal lengths."""
-    return "fc" in _words(name) and _numbers(value).size == 2
 
 
 def _is_distortion(name: str, value: Foreign) -> bool:
@@ -166,7 +150,8 @@ def _pair(flat: Mapping[str, Foreign], is_one: Callable[[str, Foreign], bool]) -
 
 def _entries(flat: Mapping[str, Foreign]) -> Iterator[dict[str, Foreign]]:
     """Yield the left and the right camera's entry under the names of :mod:`~armsight.vision.camera_file`."""
-    focal, matrices = _pair(flat, _is_focal), _pair(flat, _is_matrix)
+    focal = _pair(flat, lambda name, value: "fc" in _words(name) and _numbers(value).size == 2)  # Bouguet's
+    matrices = _pair(flat, _is_matrix)
     pairs = {"distortion": _pair(flat, _is_distortion)}
     if focal is not None:
         pairs |= {
@@ -175,13 +160,11 @@ def _entries(flat: Mapping[str, Foreign]) -> Iterator[dict[str, Foreign]]:
         }
     else:
         pairs["K"] = matrices
-    for what, names in (("camera matrix", pairs.get("K", focal)), ("distortion", pairs["distortion"])):
+    for what, ours, names in (
+        ("camera matrix", "M1 and M2, K1 and K2, camera_matrix_left and .._right", pairs.get("K", focal)),
+        ("distortion", "D1 and D2, dist_left and .._right", pairs["distortion"]),
+    ):
         if names is None:
-            ours = (
-                "M1 and M2, K1 and K2, camera_matrix_left and .._right"
-                if what == "camera matrix"
-                else "D1 and D2, dist_left and .._right"
-            )
             raise InputError(f"has no {what} of both cameras ({ours}); there are {described(flat)}")
     sizes = _pair(flat, _is_size)
     one = next((value for name, value in flat.items() if _is_size(name, value)), None)
@@ -226,7 +209,7 @@ def _between(flat: Mapping[str, Foreign]) -> tuple[Array, list[str]]:
     R, t = values
     if _numbers(R).size == 3:
         R = exp_so3(_numbers(R).ravel())
-    return rigid(R, np.ravel(np.asarray(t, object)), "R")
+    return rigfile.rigid(R, np.ravel(np.asarray(t, object)), "R")
 
 
 def _is_rotation(name: str, value: Foreign) -> bool:
@@ -234,7 +217,7 @@ def _is_rotation(name: str, value: Foreign) -> bool:
     R = _numbers(value)
     if R.shape != (3, 3) or not np.abs(R).max() < 2 or plain(name) in ("r1", "r2") or _DERIVED & set(_words(name)):
         return False
-    return bool(np.abs(R @ R.T - np.eye(3)).max() < LOOSEST_ROTATION and np.linalg.det(R) > 0)
+    return bool(np.abs(R @ R.T - np.eye(3)).max() < rigfile.LOOSEST_ROTATION and np.linalg.det(R) > 0)
 
 
 def _is_translation(name: str, value: Foreign) -> bool:
@@ -242,7 +225,7 @@ def _is_translation(name: str, value: Foreign) -> bool:
     return _numbers(value).size == 3 and _stem(name).startswith("t")
 
 
-def _unit_m(flat: Mapping[str, Foreign], length: float, options: ImportOptions) -> float:
+def _unit_m(flat: Mapping[str, Foreign], length: float, options: rigfile.ImportOptions) -> float:
     """Return the length of the unit of T, m, from the file or the person, who must agree."""
     if "unit_m" not in flat:
         if options.unit_m is None:
@@ -261,7 +244,7 @@ def _unit_m(flat: Mapping[str, Foreign], length: float, options: ImportOptions) 
 
 def write(rig: StereoRig, paths: Sequence[Path]) -> tuple[str, ...]:
     """Write intrinsics and extrinsics into two files, or both into one."""
-    count_paths(paths, (1, 2), "intrinsics.yml and extrinsics.yml, or one file with both")
+    rigfile.count_paths(paths, (1, 2), "intrinsics.yml and extrinsics.yml, or one file with both")
     left, right = rig.cameras
     if left.image_size_px != right.image_size_px:
         raise InputError("OpenCV's files hold one image size; the two cameras of this rig differ")
@@ -277,10 +260,10 @@ def write(rig: StereoRig, paths: Sequence[Path]) -> tuple[str, ...]:
         "D2": right.distortion.reshape(1, -1),
     }
     extrinsics = {"unit_m": 1.0, "R": T_right_left[:3, :3], "T": T_right_left[:3, 3].reshape(3, 1)}
-    extrinsics |= dict(zip(("R1", "R2", "P1", "P2", "Q"), rectification(rig), strict=True))
+    extrinsics |= dict(zip(("R1", "R2", "P1", "P2", "Q"), rigfile.rectification(rig), strict=True))
     parts = [intrinsics, extrinsics] if len(paths) == 2 else [intrinsics | extrinsics]
-    write_together(paths, [_dump(part) for part in parts])
-    return not_held(rig)
+    rigfile.write_together(paths, [_dump(part) for part in parts])
+    return rigfile.not_held(rig)
 
 
 def _dump(document: dict[str, Foreign]) -> str:
@@ -292,7 +275,7 @@ def _dump(document: dict[str, Foreign]) -> str:
 
 
 FORMATS = {
-    "opencv": RigFormat(
+    "opencv": rigfile.RigFormat(
         "OpenCV's stereo calibration (camera matrices, distortion, R and T)", recognises, read, write, rectifies=True
     )
 }

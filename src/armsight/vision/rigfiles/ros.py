@@ -21,17 +21,7 @@ from armsight.tables.document import Foreign, dump_yaml
 from armsight.vision.camera import Camera
 from armsight.vision.camera_file import camera_of, described, focal_and_centre, found, is_camera
 from armsight.vision.rig import StereoRig
-from armsight.vision.rigfiles.rigfile import (
-    Document,
-    ImportOptions,
-    RigFormat,
-    count_paths,
-    imported,
-    not_held,
-    rectification,
-    rigid,
-    write_together,
-)
+from armsight.vision.rigfiles import rigfile
 
 #: Names of the matrices in the files of camera_calibration, and in printed messages (D K R P, in ROS 2 d k r p).
 _NAMES = {
@@ -44,25 +34,25 @@ _NAMES = {
 MODELS = {"plumb_bob": (0, 4, 5), "rational_polynomial": (8, 12, 14), "equidistant": (4,)}
 
 
-def recognises(documents: Sequence[Document]) -> bool:
+def recognises(documents: Sequence[rigfile.Document]) -> bool:
     """Say whether every file has a camera's matrix and its projection, in files' or messages' names."""
     return all(
         is_camera(document) and found(document, _NAMES["projection_matrix"]) is not None for document in documents
     ) or all(document.get("P") is not None for document in documents)
 
 
-def read(documents: Sequence[Document], paths: Sequence[Path], options: ImportOptions) -> StereoRig:
+def read(documents: Sequence[rigfile.Document], paths: Sequence[Path], options: rigfile.ImportOptions) -> StereoRig:
     """Read the left and the right camera_info file, in this order."""
     if len(paths) == 1 and len(documents) == 1:
         with naming(paths[0]):
             raise InputError(
                 "camera_info of one camera, got 1 file(s); a stereo pair has two: give left.yaml and right.yaml"
             )
-    count_paths(paths, (2,), "two files, left.yaml and right.yaml")
+    rigfile.count_paths(paths, (2,), "two files, left.yaml and right.yaml")
     return rig_of(documents, paths, options)
 
 
-def rig_of(documents: Sequence[Document], paths: Sequence[Path], options: ImportOptions) -> StereoRig:
+def rig_of(documents: Sequence[rigfile.Document], paths: Sequence[Path], options: rigfile.ImportOptions) -> StereoRig:
     """Return the rig of a left and a right camera_info, with the keys of the files; ``paths`` are for messages.
 
     InputError: one is damaged, or they are no stereo pair.
@@ -81,14 +71,14 @@ def rig_of(documents: Sequence[Document], paths: Sequence[Path], options: Import
         )
     T_left_right = inverse(Ts[0]) @ Ts[1]
     notes.append("relative pose recovered from the rectification and projection matrices, which hold it indirectly")
-    return imported(cameras, T_left_right, options, paths, notes)
+    return rigfile.imported(cameras, T_left_right, options, paths, notes)
 
 
 def write(rig: StereoRig, paths: Sequence[Path]) -> tuple[str, ...]:
     """Write the left and the right camera_info file."""
-    count_paths(paths, (2,), "two files, left.yaml and right.yaml")
-    lost = list(not_held(rig))
-    R1, R2, P1, P2, _ = rectification(rig)
+    rigfile.count_paths(paths, (2,), "two files, left.yaml and right.yaml")
+    lost = list(rigfile.not_held(rig))
+    R1, R2, P1, P2, _ = rigfile.rectification(rig)
     documents = []
     for name, camera, R, P in (("left", rig.left, R1, P1), ("right", rig.right, R2, P2)):
         model = {"fisheye": "equidistant", "brown8": "rational_polynomial"}.get(camera.model, "plumb_bob")
@@ -108,11 +98,11 @@ def write(rig: StereoRig, paths: Sequence[Path]) -> tuple[str, ...]:
                 "projection_matrix": _matrix(P),
             }
         )
-    write_together(paths, [dump_yaml(document) for document in documents])
+    rigfile.write_together(paths, [dump_yaml(document) for document in documents])
     return tuple(lost)
 
 
-def _read_one(document: Document, options: ImportOptions) -> tuple[Camera, Array, list[str]]:
+def _read_one(document: rigfile.Document, options: rigfile.ImportOptions) -> tuple[Camera, Array, list[str]]:
     """Return a camera, (4, 4) its T_rect_camera in the unit of the file, and notes."""
     for key in ("camera_matrix", "distortion_coefficients", "rectification_matrix", "projection_matrix"):
         if found(document, _NAMES[key]) is None:
@@ -134,14 +124,14 @@ def _read_one(document: Document, options: ImportOptions) -> tuple[Camera, Array
         )
     if P[2, 3] != 0 or focal_and_centre(P[:, :3], "projection_matrix")[:2].min() <= 0:
         raise InputError("projection_matrix must be [[fx, 0, cx, Tx], [0, fy, cy, Ty], [0, 0, 1, 0]]: uncalibrated?")
-    T_rect_camera, said = rigid(R, -np.linalg.solve(P[:, :3], P[:, 3]), "rectification_matrix")
+    T_rect_camera, said = rigfile.rigid(R, -np.linalg.solve(P[:, :3], P[:, 3]), "rectification_matrix")
     if not word:
         said.append("no distortion_model; plumb_bob assumed, as ROS does")
     camera, windowed = _windowed(camera, document)
     return camera, T_rect_camera, notes + said + windowed
 
 
-def _windowed(camera: Camera, document: Document) -> tuple[Camera, list[str]]:
+def _windowed(camera: Camera, document: rigfile.Document) -> tuple[Camera, list[str]]:
     """Return the camera of the images that a driver publishes, a window of the sensor (roi) and binned, and a note.
 
     A camera_info's size and matrices are those of the sensor's whole image (sensor_msgs/CameraInfo); the window comes off
@@ -171,7 +161,7 @@ def _windowed(camera: Camera, document: Document) -> tuple[Camera, list[str]]:
     return Camera((width_px, height_px), camera.model, np.hstack([fxy, centre]), camera.distortion), [note]
 
 
-def _matrix_of(document: Document, key: str, shape: tuple[int, int]) -> Array:
+def _matrix_of(document: rigfile.Document, key: str, shape: tuple[int, int]) -> Array:
     """Return the numbers of a matrix entry; messages hold them row by row."""
     numbers = np.asarray(found(document, _NAMES[key]), object)
     if numbers.size != shape[0] * shape[1]:
@@ -184,4 +174,4 @@ def _matrix(m: Array) -> dict[str, Foreign]:
     return {"rows": m.shape[0], "cols": m.shape[1], "data": m.ravel().tolist()}
 
 
-FORMATS = {"ros": RigFormat("a pair of ROS camera_info files", recognises, read, write, rectifies=True)}
+FORMATS = {"ros": rigfile.RigFormat("a pair of ROS camera_info files", recognises, read, write, rectifies=True)}

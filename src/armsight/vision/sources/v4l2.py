@@ -82,9 +82,7 @@ def pixel_format(buffer: bytes) -> tuple[str, str]:
 def frame_size(buffer: bytes) -> tuple[int, int, tuple[int, int] | None]:
     """Read struct v4l2_frmsizeenum: width and height, px, and where sizes go in steps the smallest."""
     kind, *n = struct.unpack_from("=8x7I", buffer)
-    if kind == _DISCRETE:
-        return n[0], n[1], None
-    return n[1], n[4], (n[0], n[3])
+    return (n[0], n[1], None) if kind == _DISCRETE else (n[1], n[4], (n[0], n[3]))
 
 
 def frame_rates(buffer: bytes) -> tuple[float, ...]:

@@ -19,18 +19,8 @@ import numpy as np
 
 from armsight.data import Array, JointCommand
 from armsight.errors import DeviceError, InputError
-from armsight.robot.boards.ar4 import lines
+from armsight.robot.boards.ar4 import lines, models
 from armsight.robot.boards.ar4.lines import JOINTS, Ar4Start, Ar4Stopped, Ar4Text, Ar4Values, Heading, LineReader
-from armsight.robot.boards.ar4.models import (
-    DEAD_STEPS,
-    HOMING_GROUPS,
-    MODELS,
-    MOST_ACCELERATION_DEG_S2,
-    MOST_SPEED_DEG_S,
-    SENSE,
-    Ar4Model,
-    ar4_model,
-)
 from armsight.robot.boards.codes import Alarm, BoardState, Command
 from armsight.robot.boards.contract import STOPS, Abilities, PolledBoard
 from armsight.robot.boards.link import Link
@@ -59,10 +49,10 @@ ABILITIES = Abilities(
     RATE_HZ,
     LATENCY_S,
     _RESPONSE_S,
-    tuple(np.radians(1 / MODELS["mk3"].steps_per_deg).tolist()),
+    tuple(np.radians(1 / models.MODELS["mk3"].steps_per_deg).tolist()),
     0.055,
     MOST_SPEED_RAD_S,
-    float(np.radians(MOST_ACCELERATION_DEG_S2)),
+    float(np.radians(models.MOST_ACCELERATION_DEG_S2)),
     takes_duty=False,
     own_controller=True,
     releases=False,
@@ -72,7 +62,9 @@ ABILITIES = Abilities(
 class Ar4Board(PolledBoard):
     """The joints of an AR4; :meth:`connect` makes one."""
 
-    def __init__(self, link: Link, name: str, model: Ar4Model, now: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self, link: Link, name: str, model: models.Ar4Model, now: Callable[[], float] = time.monotonic
+    ) -> None:
         abilities = replace(ABILITIES, steps_rad=tuple(np.radians(1 / model.steps_per_deg).tolist()))
         super().__init__(name, abilities, Welcome(f"ar4 {model.name}", VERSION, 0, BAUD, None), now)
         self.model, self._link = model, link
@@ -95,7 +87,7 @@ class Ar4Board(PolledBoard):
         DeviceError: nothing answers, or a firmware of another kind.
         """
         try:
-            board = cls(link, name, ar4_model(model), now)
+            board = cls(link, name, models.ar4_model(model), now)
             board._start(VERSION)
             board._read_positions()
             board._goal = board._q()
@@ -168,9 +160,9 @@ class Ar4Board(PolledBoard):
 
         DeviceError: a switch was not reached; the Teensy's words.
         """
-        if at_once not in HOMING_GROUPS:
+        if at_once not in models.HOMING_GROUPS:
             raise InputError(f"{at_once} joints at once are not possible; 1, 2, 3 or 6 are")
-        question = lines.home(HOMING_GROUPS[at_once] + "012345")
+        question = lines.home(models.HOMING_GROUPS[at_once] + "012345")
         self._ask(question, Ar4Values, wait_s=_HOMING_S * JOINTS / at_once, tries=1, heading=Heading.HOMED)
         self._t_s = -np.inf  # the encoders were set anew: a jump
         self._read_positions()
@@ -231,15 +223,15 @@ class Ar4Board(PolledBoard):
         else:
             here = np.rint(self._reported * self.model.steps_per_deg)
             off = goal - here
-            near = (off != 0) & (np.abs(off) <= DEAD_STEPS)
+            near = (off != 0) & (np.abs(off) <= models.DEAD_STEPS)
             if self._approached is not None:
                 near &= goal != self._approached
             if near.any():
                 ends = [self.model.reported_deg(np.degrees(end)) for end in self.soft_limits()]
                 low, high = (each * self.model.steps_per_deg for each in (np.minimum(*ends), np.maximum(*ends)))
-                back = here - np.sign(off) * (DEAD_STEPS + 1)
+                back = here - np.sign(off) * (models.DEAD_STEPS + 1)
                 # At a limit there is no way back, and the goal is approached from beyond.
-                back = np.where((back < low) | (back > high), goal + np.sign(off) * (DEAD_STEPS + 1), back)
+                back = np.where((back < low) | (back > high), goal + np.sign(off) * (models.DEAD_STEPS + 1), back)
                 self._approached, self._near, self._back, self._back_s = goal, near, back, now
                 goal = np.where(near, back, goal)
         # Half a step more, as the firmware cuts off what is not a whole one.
@@ -265,7 +257,7 @@ class Ar4Board(PolledBoard):
             if self._possible(reported, t_s):
                 passed = t_s - self._t_s
                 if 0 < passed < 1.0:
-                    self._speed_rad_s = np.radians(SENSE * (reported - self._reported) / passed)
+                    self._speed_rad_s = np.radians(models.SENSE * (reported - self._reported) / passed)
                 self._t_s, self._reported = t_s, reported
                 return
             self._broken += 1
@@ -284,7 +276,7 @@ class Ar4Board(PolledBoard):
         if not self._t_s > 0.0:  # the first reading, or the first after homing
             return True
         passed = t_s - self._t_s
-        return bool(np.all(np.abs(reported - self._reported) <= 2 * MOST_SPEED_DEG_S * passed + _MARGIN_DEG))
+        return bool(np.all(np.abs(reported - self._reported) <= 2 * models.MOST_SPEED_DEG_S * passed + _MARGIN_DEG))
 
     def _ask(
         self,
