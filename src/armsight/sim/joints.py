@@ -157,7 +157,6 @@ def sprung(model: JointModel, resonance_hz: Array, damping: Array, link_share: A
 
 @kernel
 def _sine(cycles: float) -> float:
-    """Return the sine of so many cycles."""
     cycles -= np.floor(cycles + 0.5)
     cycles = 0.5 - cycles if cycles > 0.25 else (-0.5 - cycles if cycles < -0.25 else cycles)
     a = 6.283185307179586 * cycles

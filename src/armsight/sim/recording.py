@@ -135,7 +135,6 @@ def shot_names(count: int) -> tuple[str, ...]:
 
 
 def _file_name(side: str, shot: str) -> str:
-    """Return the name of one image's file."""
     return f"{side}{shot}.png"
 
 

@@ -112,7 +112,6 @@ def detection_times(path: str | Path) -> dict[str, float]:
 
 
 def _number(text: str, path: str | Path, line: int, column: str) -> float:
-    """Read one finite number."""
     value = number(text)
     if value is None:
         raise InputError(f"{path}: line {line}: {column} is {text!r}, it must be a number")
@@ -122,5 +121,4 @@ def _number(text: str, path: str | Path, line: int, column: str) -> float:
 
 
 def _some(names: tuple[str, ...]) -> str:
-    """List a few names."""
     return ", ".join(names[:NAMED]) + (f" ... {names[-1]}" if len(names) > NAMED else "")

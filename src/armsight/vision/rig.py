@@ -358,7 +358,6 @@ def _document(text: str, path: str | Path) -> dict[str, Any]:
 
 
 def _provenance(document: dict[str, Any]) -> dict[str, Any]:
-    """Return where the rig comes from."""
     provenance = document.get("provenance", {})
     if not isinstance(provenance, dict):
         raise InputError(f"provenance must be an object of names and values, got {json.dumps(provenance)[:40]}")

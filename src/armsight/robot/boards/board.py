@@ -367,7 +367,6 @@ class Board(Closing):
         return self._sequence
 
     def _next(self) -> int:
-        """Return the number of the next command."""
         self._sequence = (self._sequence + 1) % WRAP
         return self._sequence
 

@@ -255,7 +255,6 @@ class So101Bus(Wired):
             self._answer([(k, self._bytes(k, *parameters[:2])) for k, own in enumerate(self.ids) if own == each])
 
     def _write_each(self, parameters: bytes) -> None:
-        """Store what SYNC WRITE has for each servo."""
         address, count = parameters[:2]
         for at in range(2, len(parameters) - count, count + 1):
             for k in (k for k, own in enumerate(self.ids) if own == parameters[at]):

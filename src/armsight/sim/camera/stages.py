@@ -40,7 +40,6 @@ def _allowed(value: object, rule: dict[str, Any]) -> bool:
 
 
 def _rule_text(rule: dict[str, Any]) -> str:
-    """Return a field's rule in words."""
     if "choices" in rule:
         return f"one of {', '.join(rule['choices'])}"
     low, high = rule["range"]

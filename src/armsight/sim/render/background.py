@@ -73,7 +73,6 @@ def _box(
 def _rod(
     canvas: NDArray[np.uint8], centre: NDArray[np.float64], size: float, grey: int, rng: np.random.Generator
 ) -> None:
-    """Draw a cable or a rod."""
     bends = centre + rng.normal(0, size, (4, 2)).cumsum(axis=0)
     t = np.linspace(0, 1, 40)[:, None]
     curve = (1 - t) ** 3 * bends[0] + 3 * t * (1 - t) ** 2 * bends[1] + 3 * t**2 * (1 - t) * bends[2] + t**3 * bends[3]

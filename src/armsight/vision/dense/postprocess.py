@@ -217,7 +217,6 @@ def _add(gap: Singles, weight: Singles, sign: np.float32, up: Singles, down: Sin
 def _rows(
     source: Singles, image: Image, tolerance: np.float32, begin: int, end: int, out: Singles, share: Singles
 ) -> None:
-    """Smooth along rows."""
     width = source.shape[1]
     gaps, weights = np.empty(width, np.float32), np.empty(width, np.float32)
     for y in range(begin, end):
@@ -237,7 +236,6 @@ def _rows(
 def _columns(
     source: Singles, image: Image, tolerance: np.float32, begin: int, end: int, out: Singles, share: Singles
 ) -> None:
-    """Smooth along columns."""
     height, width = source.shape
     gap, weight, down = np.empty(width, np.float32), np.empty(width, np.float32), np.empty(width, np.float32)
     for y in range(begin, end):

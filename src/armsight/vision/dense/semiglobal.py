@@ -215,7 +215,6 @@ def _strip(
     p2: Bytes,
     found: Winners,
 ) -> None:
-    """Match the rows from ``begin`` to ``end``."""
     height, width = pair.left.shape
     both_ways = paths == 8
     work = make_work(width, int(size), first + int(size), end - begin if both_ways else 1)

@@ -319,7 +319,6 @@ def follows(target: Target) -> TypeGuard[Composite]:
 
 
 def _buffers(count: int, parameters: int) -> DiscMeasurement:
-    """Return arrays for the results of one pair."""
     return DiscMeasurement(
         np.full((count, 2), NOT_THERE),
         np.zeros((count, 2, 2)),

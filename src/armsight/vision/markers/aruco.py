@@ -44,7 +44,6 @@ def family_name(text: str, known: Sequence[str] = FAMILIES) -> str:
 
 @lru_cache(maxsize=64)
 def _dictionary(family: str) -> cv2.aruco.Dictionary:
-    """Return OpenCV's dictionary of a family."""
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, APRILTAGS.get(family, family)))
 
 

@@ -87,7 +87,6 @@ class BoardTarget(Record, Target):
 
 
 def _checked(spec: str) -> str:
-    """Return a spec that names a board."""
     open_board(spec)
     return spec
 

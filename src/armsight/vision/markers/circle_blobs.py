@@ -147,7 +147,6 @@ def find_blobs(image: Grey, bright: bool, dark: bool) -> tuple[Blobs, Blobs]:
 
 
 def _room() -> tuple[Array, NDArray[np.int64], NDArray[np.int64], Array, Room]:
-    """Return this thread's buffers."""
     if not hasattr(_KEPT, "room"):
         n = MOST_DISCS
         _KEPT.room = np.empty((n, UNKNOWNS)), np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n), workspace()

@@ -235,7 +235,6 @@ _Loss = tuple[float, bool]  # square of the Cauchy loss's scale; whether its cur
 
 
 def _near(model: BundleModel, state: BundleState, observations: Observations, W: Array, robust: bool) -> _Near:
-    """Project and differentiate at a state."""
     uv, J = derivatives(model, state, observations)
     residuals = observations.uv - uv
     white = (W @ residuals[..., None])[..., 0]

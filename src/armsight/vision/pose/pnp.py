@@ -51,7 +51,6 @@ def body_poses(points: Array, camera: Camera, uv: Array) -> list[tuple[Array, fl
 
 
 def _poses(rotations: Sequence[NDArray[Any]], translations: Sequence[NDArray[Any]]) -> list[Array]:
-    """Return OpenCV's rotation vectors and translations as poses."""
     return [
         pose(np.asarray(cv2.Rodrigues(r)[0], np.float64), t.ravel())
         for r, t in zip(rotations, translations, strict=True)

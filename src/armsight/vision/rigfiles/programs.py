@@ -97,7 +97,6 @@ def _mrcal_entries(documents: Sequence[Document], paths: Sequence[Path]) -> Entr
 
 
 def _mrcal_pose(entries: Entries, name: str) -> tuple[Array, list[str]]:
-    """Return a camera's pose."""
     value = entries[name]["pose"]
     rt = checked([] if value is None else value, (6,), f"{name}: extrinsics")
     return pose(exp_so3(rt[:3]), rt[3:]), []
@@ -203,7 +202,6 @@ def _multical_entries(documents: Sequence[Document], paths: Sequence[Path]) -> E
 
 
 def _multical_pose(entries: Entries, name: str) -> tuple[Array, list[str]]:
-    """Return a camera's pose."""
     poses = entries[name]["camera_poses"]
     if name not in poses:
         raise InputError(f"camera_poses has no {name}; there are {', '.join(poses)}")
@@ -281,7 +279,6 @@ SIZES = {
 
 
 def _stereolabs_recognises(documents: Sequence[Document]) -> bool:
-    """Say whether a file has such sections."""
     return any(str(key).upper().startswith(("LEFT_CAM_", "RIGHT_CAM_")) for document in documents for key in document)
 
 
@@ -326,7 +323,6 @@ def _orbslam_recognises(documents: Sequence[Document]) -> bool:
 
 
 def _orbslam_read(documents: Sequence[Document], paths: Sequence[Path], options: ImportOptions) -> StereoRig:
-    """Read both cameras of a settings file."""
     count_paths(paths, (1,), "one settings file")
     (document,), (path,) = documents, paths
     if "LEFT.K" in document:
@@ -377,7 +373,6 @@ def _matlab_inner(document: Document) -> Mapping[str, Foreign] | None:
 
 
 def _matlab_read(documents: Sequence[Document], paths: Sequence[Path], options: ImportOptions) -> StereoRig:
-    """Read both cameras."""
     count_paths(paths, (1,), "one file, of jsonencode(stereoParams)")
     with naming(paths[0]):
         inner = _matlab_inner(documents[0]) or need_named({}, "CameraParameters1")
@@ -464,7 +459,6 @@ def _kalibr_rigid(value: Foreign, name: str) -> tuple[Array, list[str]]:
 
 
 def _kalibr_write(rig: StereoRig, paths: Sequence[Path]) -> tuple[str, ...]:
-    """Write a camchain of two cameras."""
     count_paths(paths, (1,), "one file, camchain.yaml")
     T_right_left = inverse(rig.T_left_right)
     document = {
@@ -477,7 +471,6 @@ def _kalibr_write(rig: StereoRig, paths: Sequence[Path]) -> tuple[str, ...]:
 
 
 def _kalibr_entry(name: str, camera: Camera) -> dict[str, Foreign]:
-    """Return a camera as a camchain holds it."""
     model = {"none": "none", "fisheye": "equidistant"}.get(camera.model, "radtan")
     d = camera.distortion
     if model == "radtan":

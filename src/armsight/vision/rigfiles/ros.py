@@ -170,7 +170,6 @@ def _matrix_of(document: rigfile.Document, key: str, shape: tuple[int, int]) -> 
 
 
 def _matrix(m: Array) -> dict[str, Foreign]:
-    """Return a matrix as camera_info files hold it."""
     return {"rows": m.shape[0], "cols": m.shape[1], "data": m.ravel().tolist()}
 
 

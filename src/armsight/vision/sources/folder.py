@@ -62,7 +62,6 @@ def _matched(folder: Path) -> tuple[StoredPair, ...]:
 
 
 def _indexed(folder: Path) -> list[StoredPair]:
-    """Read the index of a recording."""
     index = folder / INDEX
     rows = _rows(index)
     if next(rows, ("", []))[1] != list(COLUMNS):

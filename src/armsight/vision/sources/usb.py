@@ -220,7 +220,6 @@ def parsed_usb(rest: str) -> tuple[list[str], Settings]:
 
 
 def _v4l2(device: str) -> QuietCapture:
-    """Open a device with OpenCV."""
     if not os.path.exists(device):
         raise DeviceError(f"{device}: no such camera; `armsight cameras` lists those attached")
     if not os.access(device, os.R_OK | os.W_OK):
