@@ -174,7 +174,7 @@ def warmed(rig: StereoRig, given: Conditions, z: Array) -> StereoRig:
     """Return a rig some kelvins later; draws (5,)."""
     moved, n = np.zeros(rig.parameter_count), rig.left.parameters.size
     for first, camera, share in ((0, rig.left, z[0]), (n, rig.right, z[1])):
-        moved[first : first + 2] = given.lens_share * share * camera.intrinsics[:2]
+        moved[first : first + 2] = np.hypot(given.lens_share, given.refocus_share) * share * camera.intrinsics[:2]
     moved[-6:-3] = given.mount_m * z[2:5]
     return rig.perturbed(moved)
 
@@ -267,6 +267,7 @@ NEEDS = {
     "print of the body": ("body_sigma_m", "body_scale", "marker"),
     "warming of the mount": ("mount_m",),
     "warming of the lenses": ("lens_share",),
+    "autofocus": ("refocus_share",),
 }
 
 
@@ -429,7 +430,9 @@ def drawn(plan: RigPlan, count: int, rng: np.random.Generator) -> Array:
         )
         moved += np.append(np.zeros(len(root) - 6), [*(given.mount_m * rng.standard_normal(3)), 0, 0, 0])
         for first in (0, rig.left.parameters.size):
-            moved[first : first + 2] += given.lens_share * rng.standard_normal() * rig.left.intrinsics[:2]
+            moved[first : first + 2] += (
+                np.hypot(given.lens_share, given.refocus_share) * rng.standard_normal() * rig.left.intrinsics[:2]
+            )
         off = given.body_sigma_m[0] * rng.standard_normal(points.shape)[plan.marker_of]
         away = given.body_sigma_m[1] * rng.standard_normal((len(points), 1))[plan.marker_of]
         off += normals * (away - (off * normals).sum(1)[:, None])

@@ -122,6 +122,7 @@ def test_the_best_of_a_class_with_what_to_build(armsight, tmp_path, monkeypatch)
     (only,) = found["alternatives"]
     assert only["baseline"] == "150mm"  # what is named stays
     assert only["level_m"] == found["results"]["moving"]["level_m"] < plain["results"]["moving"]["level_m"]
+    assert "pairs of the board: 20 give" in (tmp_path / "out" / "report.html").read_text()
     rig = StereoRig.load(tmp_path / "out" / "rig.json")
     assert rig.baseline_m == pytest.approx(0.15)
     assert rig.left.intrinsics[0] == pytest.approx(found["focal_px"])

@@ -99,6 +99,13 @@ def test_between_a_chart_that_is_found_and_one_that_is_not_it_is_that_of_the_siz
         ({"volume": "0.1x0.1x0.1m", "distance": "3m"}, "at least 8 are needed"),
         ({"exposure_ms": 50.0}, "longer than a frame at 30 Hz"),
         ({"camera": "machine-vision-5mp", "rate_hz": 60.0}, "one USB controller carries .* at 34.7 Hz at most"),
+        ({"objective": "median"}, "objective 'median': expected worst or mean"),
+        ({"distances": "1m"}, "distances '1m': expected the least and the largest, such as 0.5m,1.2m"),
+        ({"distances": "2m,1m"}, "expected the least and the largest"),
+        (
+            {"distances": "1m,2m", "named": ("distance", "distances")},
+            "^distance 0.8m: the distances that may be are 1 to 2 m",
+        ),
         ({"volume": "0.1x0.1x0.1m", "pairs": 2}, "pairs is 2: expected 3 to 1000"),
     ],
 )
@@ -141,11 +148,15 @@ def test_python_takes_paths_whole_floats_and_numbers_of_numpy():
 def test_the_best_is_at_a_minimum_and_alternatives_are_grouped(monkeypatch):
     two = ("global-shutter-1mp", "machine-vision-2mp")
     monkeypatch.setattr(result, "catalogue", lambda: {name: catalogue()[name] for name in two})
-    found = result.best(RigPlan.read("", volume="0.1x0.1x0.1m", distance="0.6m", speed="0m/s", body_scale=1.0))
+    found = result.best(RigPlan.read("", volume="0.1x0.1x0.1m", distances="0.5m,0.6m", speed="0m/s", body_scale=1.0))
     assert [one.plan.camera for one in found] == list(two)
     near = max(one.mm for one in found) < result.PREDICTED * min(one.mm for one in found)
     assert (found[0].group == found[1].group) == near
     best = found[0]
+    assert 0.5 <= best.plan.distance_m <= 0.6
+    twice = replace(best.plan, pairs=4 * RigPlan.pairs)
+    assert best.plan.pairs < twice.pairs  # as few as differ by less than predictions are off
+    assert result.loss(best.plan) < result.PREDICTED * result.loss(twice)
     for factor in (0.8, 1.25):  # beside the minimum of a search that ends where a step gains less than 1 %
         other = replace(best.plan, baseline=f"{factor * best.plan.baseline_m}m")
         assert result.RigBudget(other, planned(other)).mm > 0.98 * best.mm
@@ -220,6 +231,35 @@ def test_a_camera_of_its_own_has_its_preset_aperture_and_readout(tmp_path):
         RigPlan(preset="raw").check()
     with pytest.raises(InputError, match=r"f_number is 0\.1: expected 0\.5 to 64"):
         RigPlan(f_number=0.1).check()
+
+
+def test_an_autofocus_costs_what_its_class_says_until_it_is_switched_off(monkeypatch):
+    plan = RigPlan(volume="0.2x0.2x0.2m", camera="webcam-1080p-autofocus", speed="0m/s")
+    found = planned(plan)
+    costs, warming = (found.rms(found.cov(of=cause))[0] for cause in ("autofocus", "warming of the lenses"))
+    assert costs / warming == pytest.approx(plan.cameras.refocus_ppm / (plan.lens_ppm_per_k * plan.warming_k))
+    off = "switch the autofocus off"
+    monkeypatch.setattr(result, "CHANGES", {off: result.CHANGES[off]})
+    monkeypatch.setattr(result, "catalogue", dict)
+    (change,) = result.RigBudget(plan, found).changes
+    fixed = planned(replace(plan, refocus_ppm=0.0))
+    assert "autofocus" not in fixed.factors
+    assert change.level_m == pytest.approx(result.RigBudget(plan, fixed).moving.level_m)
+
+
+def test_the_objective_is_the_worst_or_the_mean_position():
+    worst, mean = (armsight.budget(volume="0.2x0.2x0.2m", objective=each) for each in ("worst", "mean"))
+    every = mean.found.at_level(mean.found.cov())[0]
+    assert (worst.mm, mean.mm) == pytest.approx((1e3 * every.max(), 1e3 * every.mean()))
+    assert "95 % at the mean position" in repr(mean)
+
+
+def test_a_distance_that_is_left_out_is_one_that_may_be():
+    assert [RigPlan.read("", distances=each).distance for each in ("1m,2m", "0.3m,50cm", "0.5m,1m")] == [
+        "1m",
+        "0.5m",
+        "0.8m",
+    ]
 
 
 def test_what_is_not_reached_in_motion_is_reached_when_slower():

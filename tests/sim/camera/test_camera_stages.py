@@ -28,7 +28,15 @@ def written(tmp_path, text):
 
 
 def test_presets_load_and_have_what_their_names_say():
-    assert preset_names() == ("clean", "cheap-webcam", "industrial", "webcam-good-light", "webcam-poor-light")
+    webcams = ("webcam-1080p", "webcam-good-light", "webcam-poor-light")
+    assert preset_names() == (
+        "clean",
+        "cheap-webcam",
+        "global-shutter-mjpeg",
+        "industrial",
+        "raspberry-pi-rolling",
+        *webcams,
+    )
     found = {name: CameraPipeline.load(name) for name in preset_names()}
     assert [name for name in STAGES if getattr(found["clean"], name) is not None] == ["white_noise"]
     industrial = found["industrial"]

@@ -16,8 +16,8 @@ from armsight.app.show.page import PAGE
 from armsight.app.show.plotting import Figure, subplots
 from armsight.app.show.report import Fact, Grade, Lines, Plot, Report, Section, figure_files
 from armsight.app.show.table import TextTable
-from armsight.sim.budget.plan import KEYS, PRICES, RigPlan, catalogue
-from armsight.sim.budget.result import AT_REST, NOT_MODELLED, RigBudget
+from armsight.sim.budget.plan import KEYS, PRICES, RigPlan, catalogue, planned
+from armsight.sim.budget.result import AT_REST, NOT_MODELLED, RigBudget, with_pairs
 from armsight.sim.workcell.body import body_text
 from armsight.vision.calibrate.budget import Budget
 
@@ -60,7 +60,7 @@ def budget_report(found: RigBudget, alternatives: Sequence[RigBudget] = (), run:
     )
     caption, title = "95 % of the errors in motion are within, mm.", "Error at 95 % over the volume, seen from above"
     sections: dict[str, Section] = {
-        "result": ("Result", [Fact(shares), Fact(others), table, more, *_compared(alternatives), *beside]),
+        "result": ("Result", [Fact(shares), Fact(others), table, more, *_compared(found, alternatives), *beside]),
         "map": ("Over the volume", [Plot("volume", partial(_map, found.found), caption, title)]),
         "missing": ("Not in the budget", [Lines(NOT_MODELLED, "not in the budget:")]),
     }
@@ -90,8 +90,7 @@ def to_build(found: RigBudget) -> dict[str, str]:
 
 def _asked(plan: RigPlan) -> dict[str, Any]:
     """Return what an optimised plan says, what follows from the rest as numbers."""
-    keys = ("camera", "baseline", "distance", "focal_widths", "verging_deg", "body_scale", "pairs", "exposure_ms")
-    return {key: getattr(plan, key) for key in keys} | {
+    return {key: getattr(plan, key) for key in ("camera", "baseline", "distance", "body_scale", "pairs")} | {
         "focal_widths": round(plan.focal_px / plan.image_size_px[0], 3),
         "focal_mm": round(plan.focal_mm, 1),
         "verging_deg": round(plan.stereo_rig.convergence_deg, 1),
@@ -100,32 +99,39 @@ def _asked(plan: RigPlan) -> dict[str, Any]:
     }
 
 
-def _compared(alternatives: Sequence[RigBudget]) -> list[TextTable]:
+def _compared(found: RigBudget, alternatives: Sequence[RigBudget]) -> list[TextTable | Fact]:
     """Return the tables of alternatives; those of one group differ by less than the prediction is off."""
     if not alternatives:
         return []
     title = "the best of each class, 95 % in motion; those of one group differ by less than predictions are off"
-    reached = []
-    for one in alternatives:
-        at = f"{one.mm:.2g}", f"{one.deg:.2g}", f"{100 * one.moving.lost_share:.0f} %"
-        reached.append((one.plan.camera, str(one.plan.cameras.price), chr(ord("A") + one.group), *at))
+    reached = [
+        (one.plan.camera, str(one.plan.cameras.price), chr(ord("A") + one.group), f"{one.mm:.2g}", f"{one.deg:.2g}",
+         f"{100 * one.moving.lost_share:.0f} %") for one in alternatives
+    ]  # fmt: skip
     build = [_asked(one.plan) for one in alternatives]
+    with_more = [RigBudget(one, planned(one)) for one in with_pairs(replace(found.plan, pairs=RigPlan.pairs))]
+    more = ", ".join(f"{each.plan.pairs} give {each.mm:.2g} mm" for each in with_more)
     return [
         TextTable(title, ("camera", "price class", "group", "mm", "deg", "lost"), tuple(reached)),
         TextTable("what to build for it", tuple(build[0]), tuple(tuple(map(str, each.values())) for each in build)),
+        *(
+            [Fact(f"pairs of the board: {more}; as few as differ by less than predictions are off")]
+            * (len(with_more) > 1)
+        ),
     ]
 
 
 def _answer(found: RigBudget) -> tuple[Grade, str]:
     """Return the answer in two sentences, and its colour."""
     move, rest, requested = found.moving, found.at_rest, found.plan.requested
-    said = f"95 % within {move} at {found.plan.speed}; {rest} at rest"
+    mean = ", the mean over the volume" * (found.plan.objective == "mean")
+    said = f"95 % within {move} at {found.plan.speed}; {rest} at rest{mean}"
     if move.lost_share > _SHOWN:
         lost = f"{100 * move.lost_share:.0f} % of the shots in motion are lost where most are"
         said += f"; {lost}: their two images differ by more than the search allows"
     if loop := found.states.get("closed_loop_at_rest"):
         said += f"; the loop brings the arm to {loop.mm:.2g} mm at rest"
-    costs = f" {(first := found.causes[0].cause).capitalize()} costs {1e3 * found.worst_m(first):.2g} mm"
+    costs = f" {(first := found.causes[0].cause).capitalize()} costs {1e3 * found.level_m(of=first):.2g} mm"
     ways = [one for one in found.changes if one.change != AT_REST and one.change.split(":")[0] not in catalogue()]
     to_do = [min(ways, key=lambda one: one.level_m).change] if ways else []
     to_do += [f"measure slower than {found.slower_m_s:.2g} m/s"] if found.slower_m_s else []
@@ -145,8 +151,8 @@ def _chosen(plan: RigPlan) -> str:
         "verging_deg": f"{plan.stereo_rig.convergence_deg:.0f}",
         "rate_hz": f"{plan.timing['rate']:g}",
         **{f"{name}_ms": f"{1e3 * plan.timing[name]:.2g}" for name in ("skew", "start", "readout", "exposure")},
-        **{name: getattr(plan.cameras, name) for name in ("preset", "f_number")},
-        "body": "tool_body",
+        **{name: getattr(plan.cameras, name) for name in ("preset", "f_number", "refocus_ppm")},
+        **{"body": "tool_body", "distances": ""},
     }
     said = ((key, shown.get(key, getattr(plan, key))) for key in KEYS if key not in (*plan.named, *plan.of_rig))
     return ", ".join(f"{key} {value}" for key, value in said if value != "")

@@ -9,7 +9,7 @@ from __future__ import annotations
 import difflib
 import math
 import re
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, fields, replace
 from functools import cache, cached_property, lru_cache
 from pathlib import Path
@@ -36,7 +36,7 @@ from armsight.vision.calibrate.budget import (
     of_three,
     pose_budget,
     volume_views,
-)
+)  # fmt: skip
 from armsight.vision.camera import Camera
 from armsight.vision.follow.follower import APART_S
 from armsight.vision.markers.aprilgrid import AprilGrid
@@ -72,14 +72,12 @@ _OF_DEFAULT = ("body_scale", "body_depth")  # of the default body alone
 #: Key -> least and most that a plan may say.
 _RANGES = {
     "verging_deg": (0.0, 120.0), "focal_widths": (0.2, 20.0), "body_scale": (0.05, 20.0), "body_depth": (0.0, 2.0),
-    "pairs": (3, 1000),
+    "pairs": (3, 1000), "refocus_ppm": (0.0, 50000.0),
     "board_print": (0.0, 0.1), "body_size": (0.0, 0.1), "warming_k": (0.0, 100.0), "mount_um_per_k": (0.0, 1000.0),
     "lens_ppm_per_k": (0.0, 10000.0), "skew_ms": (0.0, 1000.0), "start_ms": (0.0, 1000.0), "exposure_ms": (0.001, 1000.0),
-    "readout_ms": (0.0, 1000.0), "f_number": (0.5, 64.0),
-    "rate_hz": (0.1, 1000.0), "backlash_deg": (0.0, 10.0),
+    "readout_ms": (0.0, 1000.0), "f_number": (0.5, 64.0), "rate_hz": (0.1, 1000.0), "backlash_deg": (0.0, 10.0),
 }  # fmt: skip
-
-
+_OBJECTIVES: dict[str, Callable[[Array], Any]] = {"worst": np.max, "mean": np.mean}
 #: What a class of price means, euros for a pair of cameras with lenses.
 PRICES = "0 nothing, 1 below 100, 2 to 300, 3 to 800, 4 to 2,000, 5 above, in euros the pair"
 
@@ -100,6 +98,7 @@ class CameraClass:
     least_focus_m: float
     bytes_px: float
     usb: float
+    refocus_ppm: float = 0.0
 
 
 @cache
@@ -155,8 +154,10 @@ class RigPlan:
 
     volume: str = "0.4x0.4x0.3m"  #: width x height x depth, as the cameras see it.
     distance: str = "0.8m"  #: from the cameras to its middle.
+    distances: str = "0.15m,4m"  #: the least and the largest that `--best` may choose.
     speed: str = "0.3m/s"  #: of the body, and its rate of rotation: 0.3m/s or 0.3m/s,20deg/s.
     want: str = ""  #: what 95 % of the errors are to be within: 0.1mm or 0.1mm,0.05deg; empty: nothing is asked.
+    objective: str = "worst"  #: whether the answer is of the worst or of the mean position of the volume.
     camera: str = "webcam-720p"  #: a class of the catalogue.
     preset: str = ""  #: its noise and shutter: a preset of the camera model or a file of one; by default the class's.
     image: str = ""  #: width x height, px; by default the class's.
@@ -179,6 +180,7 @@ class RigPlan:
     warming_k: float = 3.0  #: change of temperature since the calibration.
     mount_um_per_k: float = 5.0  #: of the cameras' distance.
     lens_ppm_per_k: float = 20.0  #: of the focal length.
+    refocus_ppm: float = -1.0  #: of the focal length by an autofocus since the calibration; by default the class's.
     skew_ms: float = -1.0  #: by how much the right exposures are later, uncorrected; by default the preset's.
     start_ms: float = -1.0  #: how far the two exposures begin apart by chance; by default the preset's.
     readout_ms: float = -1.0  #: from the first row to the last, uncorrected; by default the preset's.
@@ -188,6 +190,7 @@ class RigPlan:
     backlash_deg: float = 0.03  #: standard deviation of each of its joints.
     handeye: str = "0.1mm,0.02deg"  #: of the hand-eye calibration: 0.1mm,0.02deg.
     named: tuple[str, ...] = field(default=(), repr=False)  #: keys that were given
+    sets: int = field(default=_SETS, repr=False)  #: of poses of the board
 
     @staticmethod
     def read(path: str, **given: Any) -> RigPlan:  # noqa: ANN401
@@ -205,12 +208,13 @@ class RigPlan:
             if kind is None:
                 raise InputError(f"{of}unknown key {key!r}{meant(key, KEYS)}")
             value = str(value) if isinstance(value, Path) else value.item() if isinstance(value, np.generic) else value
-            given[key] = value = (
-                int(value) if kind is int and isinstance(value, float) and value.is_integer() else value
-            )
+            value = int(value) if kind is int and isinstance(value, float) and value.is_integer() else value
+            given[key] = value
             if not isinstance(value, (int, float) if kind is float else kind) or isinstance(value, bool):
                 raise InputError(f"{of}{key} must be {_KINDS[kind]}, got {value!r}")
-        return RigPlan(**given, named=tuple(given))
+        plan = RigPlan(**given, named=tuple(given))
+        near = float(np.clip(plan.distance_m, *plan.between_m))
+        return replace(plan, distance=plan.distance if "distance" in given else f"{near:g}m")
 
     @cached_property
     def size_m(self) -> Array:
@@ -218,8 +222,9 @@ class RigPlan:
         sides = [side.strip() for side in re.split("[xX]", self.volume)]
         unit = sides[-1].lstrip("0123456789.e- ")  # of the sides that have none
         if len(sides) != 3:
-            form = "width x height x depth with a unit, such as 0.4x0.4x0.3m"
-            raise InputError(f"volume {self.volume!r}: expected {form}")
+            raise InputError(
+                f"volume {self.volume!r}: expected width x height x depth with a unit, such as 0.4x0.4x0.3m"
+            )
         each = (side if side[-1:].isalpha() else side + unit for side in sides)
         size = np.array([length_m(side, f"volume {self.volume!r}: side") for side in each])
         for wrong, text in (
@@ -243,6 +248,20 @@ class RigPlan:
     def distance_m(self) -> float:
         """Distance of the middle."""
         return self._reach_m("distance")
+
+    @cached_property
+    def between_m(self) -> tuple[float, float]:
+        """The least and the largest distance that may be chosen."""
+        found = [length_m(each, "distances") for each in self.distances.split(",")]
+        if len(found) != 2 or not _LEAST_M <= found[0] <= found[1] <= _MOST_M:
+            raise InputError(f"distances {self.distances!r}: expected the least and the largest, such as 0.5m,1.2m")
+        if {"distance", "distances"} <= {*self.named} and not found[0] <= self.distance_m <= found[1]:
+            raise InputError(f"distance {self.distance}: the distances that may be are {found[0]:g} to {found[1]:g} m")
+        return found[0], found[1]
+
+    def overall(self, values: Array) -> float:
+        """Return the worst or the mean of values over the volume."""
+        return float(_OBJECTIVES[self.objective](values))
 
     @cached_property
     def existing(self) -> StereoRig | None:
@@ -281,11 +300,6 @@ class RigPlan:
         if found[0] > _MOST_M:
             raise InputError(f"speed {self.speed}: faster than {_MOST_M:g} m/s: is it in mm/s?")
         return found
-
-    @cached_property
-    def handeye_errors(self) -> tuple[float, float]:
-        """Metres and rad."""
-        return _amounts("handeye", self.handeye, "0.1mm,0.02deg")
 
     @cached_property
     def requested(self) -> tuple[float, float] | None:
@@ -338,8 +352,7 @@ class RigPlan:
     @property
     def _most_hz(self) -> float:
         """Rate that one USB controller carries."""
-        width, height = self.image_size_px
-        return self.cameras.usb * 1e6 / (2 * width * height * self.cameras.bytes_px)
+        return self.cameras.usb * 1e6 / (2 * math.prod(self.image_size_px) * self.cameras.bytes_px)
 
     @cached_property
     def layout(self) -> Composite:
@@ -359,12 +372,10 @@ class RigPlan:
         f, half = self.focal_px, math.atan(self.baseline_m / 2 / self.distance_m)
         half = half if self.verging_deg < 0 else math.radians(self.verging_deg) / 2
         camera = Camera(size, "brown5", np.array([f, f, (width - 1) / 2, (height - 1) / 2]), np.zeros(5))
-        sides = [
-            pose(exp_so3(np.array([0.0, -s * half, 0.0])), np.array([s * self.baseline_m / 2, 0.0, 0.0]))
-            for s in (-1, 1)
-        ]
+        right = pose(exp_so3(np.array([0.0, -half, 0.0])), np.array([self.baseline_m / 2, 0.0, 0.0]))
+        left = np.diag([-1.0, 1.0, 1.0, 1.0]) @ right @ np.diag([-1.0, 1.0, 1.0, 1.0])  # its mirror image
         count = 2 * camera.parameters.size + 6
-        return StereoRig(camera, camera, inverse(sides[0]) @ sides[1], np.zeros((count, count)), 0.0)
+        return StereoRig(camera, camera, inverse(left) @ right, np.zeros((count, count)), 0.0)
 
     @cached_property
     def views(self) -> list[PredictedView]:
@@ -415,8 +426,9 @@ class RigPlan:
                 raise InputError(f"{key} is {value:g}: it is of the default body, not of {self.body}")
         if own := [key for key in self.named if key in self.of_rig]:
             raise InputError(f"{self.rig} has its own {', '.join(own)}: leave out what it says itself")
-        c, size, t, _, _, _ = self.cameras, self.size_m, self.timing, self.speeds, self.requested, self.handeye_errors
+        c, size, t, _, _ = self.cameras, self.size_m, self.timing, self.speeds, self.requested
         near, far = self.distance_m - size[2] / 2, self.distance_m + size[2] / 2
+        _, _ = _amounts("handeye", self.handeye, "0.1mm,0.02deg"), self.between_m
         (width, height), body = self.image_size_px, np.ptp(self.layout.body.points, axis=0).max()
         (kind, px), lost = self.marker(far), sum(len(one.paired) < 3 for one in self.views)
         larger = up(_LEAST_PX[kind] / px)
@@ -424,6 +436,7 @@ class RigPlan:
         needed, seen = size[:2] + body, near * np.array([width, height]) / self.focal_px
         k = int(np.argmax(needed / seen))  # across or up
         for wrong, text in (
+            (self.objective not in _OBJECTIVES, f"objective {self.objective!r}: expected {' or '.join(_OBJECTIVES)}"),
             *((length_m(getattr(self, name), name) > _MOST_OFF_M,
                f"{name} is {getattr(self, name)}: no print is off by more than {1e3 * _MOST_OFF_M:g} mm")
               for name in ("board_bent", "body_print", "body_bent")),
@@ -474,14 +487,15 @@ class RigPlan:
         if self.arm:
             from armsight.robot.arm_file import open_arm  # not above: only the loop needs it
 
-            model, handeye = open_arm(self.arm), self.handeye_errors
+            model, handeye = open_arm(self.arm), _amounts("handeye", self.handeye, "0.1mm,0.02deg")
             square = math.radians(self.backlash_deg) ** 2 / 3 * (model.jacobian(model.home) ** 2).sum(axis=1)
             arm = math.sqrt(square[:3].sum()), math.sqrt(square[3:].sum())
         bent = length_m(self.body_print, "body_print"), length_m(self.body_bent, "body_bent")
         mount, lens = (1e-6 * each * self.warming_k for each in (self.mount_um_per_k, self.lens_ppm_per_k))
         noise, gate, cov = self._noise_px(), Gates(), self.existing.cov if self.existing else np.zeros((0, 0))
+        refocus = 1e-6 * (self.cameras.refocus_ppm if self.refocus_ppm < 0 else self.refocus_ppm)
         if not self.existing:
-            keys = ("camera", "preset", "image", "baseline", "board", "pairs", "board_bent")
+            keys = ("camera", "preset", "image", "baseline", "board", "pairs", "board_bent", "sets")
             kept = {key: getattr(self, key) for key in keys}
             widths, angle = self.focal_px / self.image_size_px[0], self.stereo_rig.convergence_deg
             cov = _calibrated(RigPlan(focal_widths=widths, verging_deg=angle, **kept))
@@ -491,13 +505,13 @@ class RigPlan:
             gate = gates(loose, self.layout, self.views[len(self.views) // 2], math.hypot(*noise.values()), moved_m)
         return Conditions(
             noise, cov, self.board_print, self.marker_of, bent, self.body_size, mount, lens,
-            t["skew"], t["start"], t["readout"], t["stamp"], speed, rotation, gate,
+            refocus, t["skew"], t["start"], t["readout"], t["stamp"], speed, rotation, gate,
             handeye, arm,
         )  # fmt: skip
 
 
 #: Key -> its type: what a plan may say; and types in words.
-KEYS: dict[str, Any] = {each.name: type(each.default) for each in fields(RigPlan) if each.name != "named"}
+KEYS: dict[str, Any] = {each.name: type(each.default) for each in fields(RigPlan) if each.name not in ("named", "sets")}
 _KINDS = {str: "a text", int: "a whole number", float: "a number"}
 
 
@@ -518,7 +532,7 @@ def _calibrated(plan: RigPlan) -> Array:
     kind, size_m = _smallest(board)
     columns, rows = (int(n) for n in np.rint(np.ptp(board.body.points, axis=0)[:2] / size_m) + 1)
     rig, pattern = plan.stereo_rig, chessboard(columns, rows, size_m)
-    sets = [board_poses(np.random.default_rng(seed), rig, pattern, plan.pairs) for seed in range(_SETS)]
+    sets = [board_poses(np.random.default_rng(seed), rig, pattern, plan.pairs) for seed in range(plan.sets)]
     px, least_px = size_m * plan.focal_px / float(np.median(np.concatenate(sets)[:, 2, 3])), _LEAST_PX[kind]
     if px < least_px:
         raise InputError(f"a {kind} of {plan.board} is {px:.1f} px, at least {least_px:g} are needed")

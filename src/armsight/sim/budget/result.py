@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, reduce
 from itertools import combinations, product
@@ -13,7 +13,7 @@ from scipy.optimize import brentq
 
 from armsight.data import Record
 from armsight.errors import InputError
-from armsight.sim.budget.plan import KEYS, RigPlan, catalogue, planned, up
+from armsight.sim.budget.plan import KEYS, CameraClass, RigPlan, catalogue, planned, up
 from armsight.vision.calibrate.budget import CAUSES, LEVEL, Budget
 
 #: A change that gains less than this share is not worth a line; half: lines that nobody buys, double: cheap gains lack.
@@ -33,24 +33,24 @@ CHANGES: dict[str, tuple[int, Callable[[RigPlan], dict[str, object]]]] = {
     "half the exposure, twice the light": (1, lambda plan: {"exposure_ms": 0.5e3 * plan.timing["exposure"]}),
     "a board printed on a stiff plate, its size measured": (1, lambda _: {"board_print": 1e-4, "board_bent": "0.03mm"}),
     "the body's markers measured after printing": (0, lambda _: dict(_MEASURED)),
+    "switch the autofocus off": (0, lambda _: {"refocus_ppm": 0.0}),
     "calibrate again when the room is 1 K warmer": (0, lambda _: {"warming_k": 1.0}),
 }
 #: What another class of cameras brings along.
-OF_CAMERA: Mapping[str, Any] = {"focal_widths": 0.0, "skew_ms": -1.0, "start_ms": -1.0, "exposure_ms": -1.0}
+OF_CAMERA = {"focal_widths": 0.0} | dict.fromkeys(("skew_ms", "start_ms", "exposure_ms", "refocus_ppm"), -1.0)
 #: What ``best`` may choose where the plan does not name it: key -> least and most, m, image widths, and a factor.
 BOUNDS = {"baseline": (0.04, 1.0), "distance": (0.15, 4.0), "focal_widths": (0.6, 4.0), "body_scale": (0.4, 1.6),
           "body_depth": (1.0, 2.0)}  # fmt: skip
 #: Factors by which it is changed, one after the other; a last one nearer to 1: longer, and better by less than predicted.
 _FACTORS = (1.5, 1.15)
 _ENOUGH = 0.01  # a step that gains a smaller share ends the search; half: half as long again, double: 2 % worse
-PAIRS = 40  # of the board; half: its calibration costs 1.4 times as much, double: twice the work at the board
 #: What was measured is within this factor of what was predicted (docs/measured.md): nearer alternatives are one group.
 PREDICTED = 1.25
 #: Causes that have no model, each with its reason.
 NOT_MODELLED = (
     "the detector's failures (glints, hidden markers): the workcell has them, the budget does not",
     "smear by a camera that mixes images of a moving scene",
-    "focus that breathes: an autofocus must be switched off",
+    "an autofocus that searches while it measures",
     "poses of the board other than all over the images",
     "a mount that bends, not only grows, as it warms",
     "a board on the body that is bent: it counts as one rigid marker",
@@ -58,7 +58,7 @@ NOT_MODELLED = (
 
 
 class Accuracy(NamedTuple):
-    """The RMS over the volume, what 95 % of the errors are within at its worst position, the share lost there; m, rad."""
+    """The RMS over the volume, m, rad; what 95 % of the errors are within at its worst or mean position; the share lost."""
 
     rms_m: float
     rms_rad: float
@@ -67,11 +67,11 @@ class Accuracy(NamedTuple):
     lost_share: float = 0.0
 
     @staticmethod
-    def of(found: Budget, *, moving: bool = False, loop: bool = False) -> Accuracy:
+    def of(found: Budget, plan: RigPlan, *, moving: bool = False, loop: bool = False) -> Accuracy:
         """Return that of a budget, by default at rest; in motion of the shots that are not lost."""
-        cov, lost = found.cov(moving=moving, loop=loop), float(found.lost.max()) if moving else 0.0
-        far, rotated = found.at_level(cov)
-        return Accuracy(*found.rms(cov), float(far.max()), float(rotated.max()), lost)
+        cov, lost = found.cov(moving=moving, loop=loop), plan.overall(found.lost) if moving else 0.0
+        far, rotated = map(plan.overall, found.at_level(cov))
+        return Accuracy(*found.rms(cov), far, rotated, lost)
 
     def over(self, m: float = 1.0, rad: float = 0.0) -> float:
         """Return the levels over what is requested; more than 1, and rising, where more shots are lost than may be."""
@@ -125,29 +125,29 @@ class RigBudget(Record):
 
     def __repr__(self) -> str:
         """Return the answer in one line."""
-        return f"RigBudget({self.moving} in motion; {self.at_rest} at rest; 95 % at the worst position)"
+        return f"RigBudget({self.moving} in motion; {self.at_rest} at rest; 95 % at the {self.plan.objective} position)"
 
     @cached_property
     def moving(self) -> Accuracy:
         """In motion."""
-        return Accuracy.of(self.found, moving=True)
+        return Accuracy.of(self.found, self.plan, moving=True)
 
     @cached_property
     def at_rest(self) -> Accuracy:
         """At rest."""
-        return Accuracy.of(self.found)
+        return Accuracy.of(self.found, self.plan)
 
     @cached_property
     def states(self) -> dict[str, Accuracy]:
         """moving, at_rest; closed_loop_at_rest where there is an arm; one_camera and three_cameras, at rest."""
-        loop = {"closed_loop_at_rest": Accuracy.of(self.found, loop=True)} if self.plan.arm else {}
-        others = (("one_camera", 1), ("three_cameras", 3))
-        found = {name: Accuracy.of(planned(self.plan, cameras)) for name, cameras in others}
+        loop = {"closed_loop_at_rest": Accuracy.of(self.found, self.plan, loop=True)} if self.plan.arm else {}
+        others = {"one_camera": planned(self.plan, 1), "three_cameras": planned(self.plan, 3)}
+        found = {name: Accuracy.of(each, self.plan) for name, each in others.items()}
         return {"moving": self.moving, "at_rest": self.at_rest} | loop | found
 
     @property
     def mm(self) -> float:
-        """What 95 % of the errors in motion are within at the worst position."""
+        """What 95 % of the errors in motion are within."""
         return self.moving.mm
 
     @property
@@ -161,8 +161,7 @@ class RigBudget(Record):
         found, total, rows = self.found, self.moving.rms_m**2, []
         for name in found.factors:
             (m, rad), kind = found.rms(found.cov(of=name, loop=True)), CAUSES[name]
-            halved = float(found.at_level(found.cov(scaled=name, by=0.5))[0].max())
-            share = 0.0 if kind.loop else m**2 / total
+            share, halved = 0.0 if kind.loop else m**2 / total, self.level_m(scaled=name, by=0.5)
             rows.append(Cause(name, m, rad, share, halved, kind.moving, kind.common, kind.loop))
         return tuple(sorted(rows, key=lambda row: (-row.share, -row.rms_m)))
 
@@ -172,14 +171,14 @@ class RigBudget(Record):
 
     def check(self) -> None:
         """Raise an InputError where the print of the body alone costs more than what was requested: no camera helps."""
-        floor = self.found.at_level(self.found.cov(of="print of the body"))
+        floor = [*map(self.plan.overall, self.found.at_level(self.found.cov(of="print of the body")))]
         states = (self.moving, f"at {self.plan.speed}"), (self.at_rest, "at rest")
         had = ", ".join(f"{up(s.mm)}mm,{up(s.deg)}deg {when}" for s, when in states if s.lost_share <= MOST_LOST)
         units = ("mm", 1e3), ("deg", 180 / math.pi)
         for least, most, (unit, scale) in zip(floor, self.plan.requested or (0.0, 0.0), units, strict=True):
-            if 0 < most < least.max():
+            if 0 < most < least:
                 raise InputError(
-                    f"want {self.plan.want}: the print of the body alone costs {scale * least.max():.2g} {unit}, no "
+                    f"want {self.plan.want}: the print of the body alone costs {scale * least:.2g} {unit}, no "
                     f"camera reaches {scale * most:g}: {had} can be had with this plan, less with the body's markers "
                     "measured after printing: body_print, body_bent, body_size"
                 )
@@ -191,14 +190,14 @@ class RigBudget(Record):
         more = found.cov() - rest
 
         def over(share: float) -> float:  # what motion costs is proportional to its speed
-            m, rad = (float(each.max()) for each in found.at_level(rest + share**2 * more))
+            m, rad = (self.plan.overall(each) for each in found.at_level(rest + share**2 * more))
             return Accuracy(0.0, 0.0, m, rad).over(*self.plan.requested or ()) - 1
 
         return self.plan.speeds[0] * float(brentq(over, 0.0, 1.0)) if over(0.0) < 0 < over(1.0) else 0.0
 
-    def worst_m(self, cause: str) -> float:
-        """Return what 95 % would be within at the worst position if a cause were alone."""
-        return float(self.found.at_level(self.found.cov(of=cause))[0].max())
+    def level_m(self, **which: Any) -> float:  # noqa: ANN401
+        """Return what 95 % are within for a covariance of the budget, by what :meth:`Budget.cov` takes."""
+        return self.plan.overall(self.found.at_level(self.found.cov(**which))[0])
 
     @cached_property
     def changes(self) -> tuple[Improvement, ...]:
@@ -214,7 +213,7 @@ class RigBudget(Record):
                 after = planned(replace(plan, **change))  # type: ignore[arg-type]
             except InputError:  # such a rig cannot be built
                 continue
-            state = Accuracy.of(after, moving=True)
+            state = Accuracy.of(after, plan, moving=True)
             if state.over() < (1 - WORTH) * self.moving.over():
                 found.append((price, state.over(), Improvement(text, price, state.level_m, state.lost_share)))
         return tuple(one for *_, one in sorted(found))
@@ -261,12 +260,15 @@ def best(plan: RigPlan, progress: Callable[[str], None] = lambda _: None) -> tup
     ``plan``: what is wished; ``progress``: called with each class of cameras as text. Raises InputError: none can be built;
     the message is that of the plan itself.
     """
-    found = []
+    found, ends = list[RigBudget](), dict[CameraClass, RigPlan]()
     classes = [name for name, each in catalogue().items() if each.price]
     for name in [plan.camera] if "camera" in plan.named else classes:
         progress(name)
-        pairs = plan.pairs if "pairs" in plan.named else PAIRS
-        searched = replace(_searched(replace(plan, **_of_camera(plan, name))), pairs=pairs)
+        alike = replace(catalogue()[name], name="", text="", price=0, bytes_px=0.0, usb=0.0)
+        if alike not in ends:
+            every = with_pairs(_searched(replace(plan, sets=1, **_of_camera(plan, name))))
+            ends[alike] = next(one for one in every if loss(one) <= PREDICTED * loss(every[-1]))
+        searched = replace(ends[alike], sets=plan.sets, camera=name)
         if math.isfinite(loss(searched)):
             found.append(RigBudget(searched, planned(searched)))
     if not found:
@@ -281,6 +283,11 @@ def best(plan: RigPlan, progress: Callable[[str], None] = lambda _: None) -> tup
     return tuple(sorted(groups, key=lambda one: (one.plan.cameras.price, one.moving.over())))
 
 
+def with_pairs(plan: RigPlan) -> list[RigPlan]:
+    """Return a plan with each number of pairs of the board that may be chosen: the named, or up to four times as many."""
+    return [replace(plan, pairs=plan.pairs * by) for by in ((1,) if "pairs" in plan.named else (1, 2, 4))]
+
+
 def _of_camera(plan: RigPlan, name: str) -> dict[str, Any]:
     """Return what another class of cameras changes; what the plan names stays."""
     return {key: value for key, value in OF_CAMERA.items() if key not in plan.named} | {"camera": name}
@@ -290,7 +297,9 @@ def _of_camera(plan: RigPlan, name: str) -> dict[str, Any]:
 def loss(plan: RigPlan) -> float:
     """Return what 95 % are within in motion over what was requested, or m; infinity for what cannot be built."""
     try:
-        return Accuracy.of(planned(replace(plan)), moving=True).over(*plan.requested or ())  # a key that holds no views
+        return Accuracy.of(planned(replace(plan)), plan, moving=True).over(
+            *plan.requested or ()
+        )  # a key that holds no views
     except InputError:
         return math.inf
 
@@ -304,11 +313,8 @@ def chosen(found: Sequence[RigBudget]) -> RigBudget:
 def kept(plan: RigPlan) -> set[str]:
     """Return what the search leaves: what is named, a body of its own or its depth where mm are asked, a webcam's lens."""
     own = {"body_scale": plan.body, "body_depth": plan.body or not (plan.requested or (0, 0))[1]}
-    return {
-        *plan.named,
-        *(key for key, is_own in own.items() if is_own),
-        *["focal_widths"] * (plan.cameras.focus_m > 0),
-    }
+    own["focal_widths"] = plan.cameras.focus_m > 0 or plan.cameras.refocus_ppm > 0
+    return {*plan.named, *(key for key, is_own in own.items() if is_own)}
 
 
 def _searched(plan: RigPlan) -> RigPlan:
@@ -317,7 +323,8 @@ def _searched(plan: RigPlan) -> RigPlan:
     free = [key for key in BOUNDS if key not in fixed]
 
     def changed(now: RigPlan, key: str, by: float) -> RigPlan:
-        lens, (least, most) = now.focal_px / now.image_size_px[0], BOUNDS[key]
+        lens = now.focal_px / now.image_size_px[0]
+        least, most = now.between_m if key == "distance" else BOUNDS[key]
         values = dict(zip(BOUNDS, (now.baseline_m, now.distance_m, lens, now.body_scale, now.body_depth), strict=True))
         value = float(f"{min(max(by * values[key], least), most):.3g}")
         new: dict[str, Any] = {key: f"{value:g}m" if key in ("baseline", "distance") else value}
@@ -340,8 +347,7 @@ def _searched(plan: RigPlan) -> RigPlan:
                     now = other
     ends: list[dict[str, Any]] = [{"verging_deg": 0.0}]
     if math.isfinite(loss(now)):
-        found = planned(now)
-        sharp, blurred = (float(found.at_level(found.cov(scaled="exposure blur", by=by))[0].max()) for by in (0.0, 1.0))
-        shorter = (2, 4) if sharp < (1 - _ENOUGH) * blurred else ()
+        found = RigBudget(now, planned(now))
+        shorter = (2, 4) if found.level_m(scaled="exposure blur", by=0.0) < (1 - _ENOUGH) * found.level_m() else ()
         ends += [{"exposure_ms": 1e3 * now.timing["exposure"] / n} for n in shorter]
     return better(now, (replace(now, **end) for end in ends if not fixed & end.keys()))

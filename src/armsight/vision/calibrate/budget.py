@@ -64,6 +64,7 @@ CAUSES: dict[str, CauseKind] = {
     "print of the body": CauseKind(common=True),
     "warming of the mount": CauseKind(common=True, camera=True),
     "warming of the lenses": CauseKind(common=True, camera=True),
+    "autofocus": CauseKind(common=True, camera=True),
     "hand-eye": CauseKind(common=True, loop=True),
     "steps and backlash of the arm": CauseKind(loop=True),
 }
@@ -93,6 +94,7 @@ class Conditions(Record):
     body_scale: float = 0.0  #: of the body's size, as a share.
     mount_m: float = 0.0  #: of the right camera's position along each axis since the calibration, m.
     lens_share: float = 0.0  #: of each focal length since the calibration, as a share.
+    refocus_share: float = 0.0  #: the same, by an autofocus.
     skew_s: float = 0.0  #: by how much the right exposures are later, uncorrected, s.
     start_s: float = 0.0  #: standard deviation of what differs from shot to shot, s.
     readout_s: float = 0.0  #: from the first row to the last, uncorrected, s.
@@ -117,10 +119,9 @@ class Budget(Record):
     shared: tuple[str, ...] = ("skew", "readout")
 
     def cov(self, *, moving: bool = True, loop: bool = False, of: str = "", scaled: str = "", by: float = 1.0) -> Array:
-        """Return covariances (G, 6, 6).
+        """Return covariances (G, 6, 6): ``moving``, with what motion costs; ``loop``, with hand-eye and arm.
 
-        ``moving``: with what motion costs. ``loop``: with hand-eye and arm. ``of``: one cause alone; or "precision" or
-        "trueness". ``scaled``: a cause whose standard deviation is multiplied ``by`` so much.
+        ``of``: one cause alone, or "precision" or "trueness"; ``scaled``: a cause whose sigma is multiplied ``by`` so much.
         """
         total, together = np.zeros((len(self.p_left), 6, 6)), np.zeros((len(self.p_left), 6, 6))
         for name, F in self.factors.items():
@@ -158,9 +159,8 @@ def radius(cov: Array) -> Array:
     mean, square = np.trace(cov, axis1=1, axis2=2), np.einsum("gij,gji->g", cov, cov)
     safe = np.maximum(mean, 1e-300)
     scale = np.maximum(square, 1e-300) / safe
-    return np.asarray(
-        np.where(mean > 0, np.sqrt(scale * 2 * gammaincinv(np.clip(safe / scale, 1.0, 3.0) / 2, LEVEL)), 0.0)
-    )
+    level = np.sqrt(scale * 2 * gammaincinv(np.clip(safe / scale, 1.0, 3.0) / 2, LEVEL))
+    return np.asarray(np.where(mean > 0, level, 0.0))
 
 
 def volume_views(
@@ -199,6 +199,7 @@ def pose_budget(rig: StereoRig, points: Array, normals: Array, views: list[Predi
         "print of the board": given.board_scale * scaled_rig(rig),
         "warming of the mount": given.mount_m * np.eye(rig.parameter_count)[:, -6:-3],
         "warming of the lenses": _lenses(rig, given.lens_share),
+        "autofocus": _lenses(rig, given.refocus_share),
     }
     velocity = np.repeat(np.array([given.speed_m_s, given.rotation_rad_s]) / np.sqrt(3.0), 3)
     out = np.where(np.isfinite(normals).all(axis=1, keepdims=True), normals, 0.0)
