@@ -62,7 +62,7 @@ def budget_report(found: RigBudget, alternatives: Sequence[RigBudget] = (), run:
     sections: dict[str, Section] = {
         "result": ("Result", [Fact(shares), Fact(others), table, more, *_compared(found, alternatives), *beside]),
         "map": ("Over the volume", [Plot("volume", partial(_map, found.found), caption, title)]),
-        "missing": ("Not in the budget", [Lines(NOT_MODELLED, "not in the budget:")]),
+        "missing": ("Limits", [Lines(NOT_MODELLED, "not in the budget:")]),
     }
     notes, cameras = [f"chosen: {_chosen(plan)}"], f"{plan.cameras.text}; {plan.baseline} apart"
     if plan.rig:
