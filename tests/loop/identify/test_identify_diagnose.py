@@ -10,10 +10,14 @@ from worn_arm import poses, worn
 
 from armsight.errors import InputError
 from armsight.geometry.pose import exp_se3, inverse
+from armsight.loop.identify.fit import prior_sigma
 from armsight.loop.identify.identify import identify
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.misread import check_plausible, placed_change, points_off, without_tool
+from armsight.loop.identify.model import Model
+from armsight.loop.identify.placement import with_placement
 from armsight.loop.identify.read import read_poses
+from armsight.loop.identify.selection import PLACEMENT, lacking
 from armsight.loop.identify.validate import with_change_allowed
 from armsight.robot.arm_file import open_arm
 from armsight.tables.rotations import ROTATIONS
@@ -256,6 +260,26 @@ def test_a_coupled_joint_and_an_instrument_of_another_scale_are_named():
     assert "joint 5 seems to move by -0.0" in lacks[1]
     assert "of the reading of joint 4" in lacks[1]
     assert with_change_allowed(identify(w.nominal, seen), seen).lacks == ()
+
+
+def test_exact_data_lack_nothing():
+    arm, q = open_arm("six_r"), np.random.default_rng(30).uniform(-1.0, 1.0, (30, 6))
+    T = replace(arm, offset=arm.offset + 0.01).forward(q)
+    measured = Measured(q, T[:, None, :3, 3], T[:, :3, :3])
+    assert with_change_allowed(identify(arm, measured), measured).lacks == ()
+
+
+@pytest.mark.parametrize("direction", [1.0, -1.0])
+def test_a_coupling_has_the_sign_that_it_has_in_an_arm_file(direction):
+    arm, q = open_arm("six_r"), np.random.default_rng(31).uniform(-1.0, 1.0, (30, 6))
+    arm, coupling = replace(arm, direction=np.array([1.0, 1.0, 1.0, 1.0, direction, 1.0])), np.eye(6)
+    coupling[4, 3] = 0.03
+    T = replace(arm, coupling=coupling).forward(q)
+    measured = Measured(q, T[:, None, :3, 3], T[:, :3, :3])
+    model, x = with_placement(Model.of(arm, measured, backlash=False), measured)
+    free = np.array([p.kind in PLACEMENT for p in model.parameters])
+    (said,) = lacking(model, x, measured, free, prior_sigma(model, {}), (1e-3, 1e-3))
+    assert re.match("joint 5 seems to move by [+]0[.]0[23].* of the reading of joint 4", said)
 
 
 @pytest.mark.parametrize("seed", [72, 73, 74])

@@ -10,7 +10,7 @@ import pytest
 from armsight.data import Array
 from armsight.errors import InputError
 from armsight.loop.identify.identify import identify
-from armsight.loop.identify.lengths import unrounded, without_blunders
+from armsight.loop.identify.lengths import steps_of, unrounded, without_blunders
 from armsight.robot.arm_file import open_arm
 
 ROWS, NOISE_M, STEP_RAD, STEP_M = 90, 2e-4, np.deg2rad(0.1), 1e-4
@@ -56,6 +56,19 @@ def test_a_position_says_what_rounding_took_away() -> None:
     apart = np.linalg.norm(T[:, :3, 3] - T_true[:, :3, 3], axis=1)
     assert apart.max() < STEP_M  # rounding alone moves it by 0.3 mm
     assert np.abs(better - printed).max() < 3 * sigma
+
+
+@pytest.mark.parametrize("rows", [40, 300])
+@pytest.mark.parametrize(("step_deg", "printed_deg"), [(0.1, 1e-6), (360 / 4096, 1e-2), (np.degrees(1e-3), 1e-6)])
+def test_the_step_of_each_joint_is_found_in_any_unit(rows: int, step_deg: float, printed_deg: float) -> None:
+    q_deg = np.random.default_rng(rows).uniform(-60.0, 60.0, (rows, 4))
+    read = np.column_stack(
+        [np.round(np.round(q_deg[:, :2] / step_deg) * step_deg / printed_deg) * printed_deg, q_deg[:, 2]]
+    )
+    chosen = 15.0 * np.round(q_deg[:, 3] / 15.0)
+    steps = np.degrees(steps_of(np.radians(np.column_stack([read, chosen]))))
+    np.testing.assert_allclose(steps[:2], step_deg, rtol=2e-3)
+    assert (steps[2:] < 1e-3).all()  # not rounded, and somebody's poses
 
 
 @pytest.mark.parametrize("step_rad", [1e-4, 1e-5, np.deg2rad(360 / 4096), np.deg2rad(1e-3), np.deg2rad(1.0)])

@@ -26,7 +26,7 @@ from armsight.data import Array
 from armsight.errors import InputError
 from armsight.estimate.chance import chi_square_limit
 from armsight.files import columns_unused
-from armsight.loop.identify.fit import Mask, fit, prior_sigma
+from armsight.loop.identify.fit import Mask, by_joints, fit, prior_sigma
 from armsight.loop.identify.identify import Identified
 from armsight.loop.identify.measured import Measured
 from armsight.loop.identify.misread import TRIMS, without_tool
@@ -52,6 +52,9 @@ REST_S = 0.25  # s; so long about a row's time the arm rests; half: noise, doubl
 MOVES = 3.0
 #: What rounding hides at least, rad and m, as positions are computed in single precision; half, double: nothing.
 LEAST_ROUNDED = 1e-7
+#: Of a step: most parts of the smallest gap between readings, fewest gaps, and how far from its multiples these may be;
+#: half and double: fewer coarse encoders are found, or chance finds a step in few readings.
+PARTS, GAPS, OFF_STEP = 32, 12, 0.15
 MOST_ROUNDED = 5.1e-3  # rad; sigma of whole degrees; half: these are taken for another arm's, double: nothing
 #: Positions may be off by so much, m, in a way that a table of the arm explains, and by this share of the variance beside;
 #: half, double: another table or a controller's tool is found where it hardly matters, or passes where it does.
@@ -78,7 +81,7 @@ def unrounded(arm: Arm, q: Array, p_base: Array, sigma_m: float) -> tuple[Array,
     model = Model(without_tool(arm), 1, False, ())
     measured = Measured(q, p_base[:, None])
     e, J = model.linearised(model.nominal(), measured)
-    B = J[:, :, model.table_at : model.sources_at : 5] * model.arm.direction
+    B = _by_readings(model, J)
 
     def weighed(sigma_rad: float) -> tuple[Array, Array]:
         C = np.linalg.inv(sigma_rad**2 * B @ B.swapaxes(1, 2) + sigma_m**2 * np.eye(3))
@@ -188,18 +191,38 @@ def _possible(read: WireRead, arm: Arm) -> WireRead:
     return read
 
 
+def steps_of(readings: Array) -> Array:
+    """Return the step (n,) that each column of readings (N, n) is rounded to; 0 where none is found.
+
+    It is the greatest common difference of the sorted readings, fitted anew with each gap from the smallest on, as printing
+    rounds an encoder's steps again. Steps beyond ``MOST_ROUNDED`` are poses that somebody chose.
+    """
+    return np.array([_step(each) for each in readings.T])
+
+
 def _step(values: Array) -> float:
-    """Return the largest of 1, 0.1, 0.01 .. 1e-6 that all values are multiples of; 0: none."""
-    steps = 10.0 ** -np.arange(7)
-    return float(next((s for s in steps if np.abs(values / s - np.round(values / s)).max() < 1e-3), 0.0))
+    gaps = np.sort(np.diff(np.sort(values)))
+    gaps = gaps[gaps > LEAST_ROUNDED]
+    for part in range(1, PARTS + 1) if len(gaps) >= GAPS else ():
+        step, total, count = gaps[0] / part, 0.0, 0.0
+        for gap in gaps:
+            total, count = total + gap, count + np.round(gap / step)
+            step = total / count
+        if np.abs(gaps / step - np.round(gaps / step)).max() < OFF_STEP:
+            return float(step) if step < np.sqrt(12) * MOST_ROUNDED else 0.0
+    return 0.0
 
 
 def explained_m(found: Identified, measured: Measured, noise_m: float) -> float:
-    """Return the residual, m, RMS, that a range's noise and the step explain that joints are rounded to."""
-    rows = slice(found.model.table_at, found.model.sources_at, 5)
-    by_joints = found.model.linearised(found.solution.x, measured)[1][:, 0, rows]
-    sigma_rad = np.deg2rad(_step(np.rad2deg(measured.q))) / np.sqrt(12)
-    return float(np.sqrt(noise_m**2 + sigma_rad**2 * np.mean(np.sum(by_joints**2, axis=1))))
+    """Return the residual, m, RMS, that a range's noise and the steps explain that joints are rounded to."""
+    by_readings = _by_readings(found.model, found.model.linearised(found.solution.x, measured)[1])
+    squares = np.sum((by_readings[:, 0] * steps_of(measured.q)) ** 2, axis=1) / 12
+    return float(np.sqrt(noise_m**2 + np.mean(squares)))
+
+
+def _by_readings(model: Model, J: Array) -> Array:
+    """Return the derivative (N, M, n) by the joints' readings, from that by all parameters (N, M, P)."""
+    return np.asarray((by_joints(model, J) * model.arm.direction) @ model.arm.coupling)
 
 
 def without_blunders(
@@ -213,7 +236,7 @@ def without_blunders(
     """
     good, blunders = np.ones(len(q), np.bool_), []
     if p_base is not None:
-        q, good = unrounded(arm, q, p_base, max(1e-3 * _step(1e3 * p_base) / np.sqrt(12), LEAST_ROUNDED))
+        q, good = unrounded(arm, q, p_base, max(steps_of(p_base).max() / np.sqrt(12), LEAST_ROUNDED))
         if good.sum() < SHARE * len(q):
             raise InputError(
                 f"{arm.name}: positions contradict the joints in {(~good).sum()} of {len(q)} rows: other arm?"

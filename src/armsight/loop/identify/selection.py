@@ -84,6 +84,7 @@ PRICE = 1.0
 #: Chance of lengths that are off in proportion, the share of residuals that a coupling explains, and how large it may be,
 #: rad/rad. Half: large scales, or small couplings, are not named; double: ordinary arms are.
 PROPORTIONAL, EXPLAINS, LINEAR = 5e-3, 0.3, 0.25
+MATTERS = 1e-6  # m, rad; least sigma to assess a coupling by; half, double: it counts for exact data only
 PLACEMENT = ("base", "tool")  # the kinds that say where the arm is: base in the rig, tool on the flange
 #: A sensor's harmonics make one curve, the links' loads one compliance: they may be added together.
 CURVE = ("wave", "ripple")
@@ -308,7 +309,7 @@ def lacking(
                 "square size of its calibration?"
             )
     linear = linear_of(model, x, measured, np.ones(len(x), bool), prior)
-    e, J = robust(*whitened(linear, variances_of(linear, noise)))
+    e, J = robust(*whitened(linear, variances_of(linear, (max(noise[0], MATTERS), max(noise[1], MATTERS)))))
     by = (by_joints(model, J)[..., None] * (measured.q - measured.q.mean(axis=0))[:, None, None]).reshape(e.size, -1)
     rows, known = J[:, :, free].reshape(e.size, -1), linear.known[free]
     beside = np.column_stack([rows.T @ by, rows.T @ e.ravel() + known * linear.at[free]])
@@ -317,11 +318,11 @@ def lacking(
     pull = (slope[:, -1] @ slope[:, :-1] - e.ravel() @ by) / squares
     k = int(np.argmax(pull**2 * squares * (abs(pull) < LINEAR)))
     i, j = divmod(k, model.arm.joints)
-    if pull[k] ** 2 * squares[k] > max(EXPLAINS, 30 / e.size) * (e**2).sum():  # of few numbers chance explains much
+    # of few numbers chance explains much, and of residuals far below the sigmas all is chance
+    if pull[k] ** 2 * squares[k] > max(max(EXPLAINS, 30 / e.size) * (e**2).sum(), 30.0):
         of = "its own reading" if i == j else f"the reading of joint {j + 1}"
-        found.append(
-            f"joint {i + 1} seems to move by {pull[k]:+.3g} of {of} beside the model: is it coupled, or geared?"
-        )
+        part = pull[k] * model.arm.direction[i]  # as of the arm's coupling
+        found.append(f"joint {i + 1} seems to move by {part:+.3g} of {of} beside the model: is it coupled, or geared?")
     return tuple(found)
 
 
