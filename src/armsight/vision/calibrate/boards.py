@@ -327,8 +327,8 @@ def calibrate_boards(
         row, factor = other
         raise CalibrationError(
             f"from {usable[row].name} on the board is {factor:.3g} times as large as in the pairs before: another board or "
-            f"print, or cameras that were moved? Images do not show which one is {board.body.name}: calibrate from the "
-            "pairs of that one alone"
+            f"print, or cameras that were moved? Images do not show which: calibrate from the pairs before it, or "
+            "from those from there on, alone"
         )
     progress("looking for gross errors")
     model = rigid_board(points) if flat else printed_board(points)

@@ -30,7 +30,7 @@ from armsight.vision.triangulate import optimal_points
 TAIL = 4.0
 #: What changes if a board of another size is shown, and the share of a cost that is left if that explains it. Half: an
 #: error of twice the corners' noise is not named; double: other changes may be.
-SIZE, _OTHER_COST = "the size of the board", 0.25
+SIZE, _OTHER_COST = "the board's size over the cameras' distance", 0.25
 #: A motion of one standard deviation at first, as a share of the board's diagonal, and the least it may be.
 START_SHARE, _LEAST = 1e-3, 1e-8
 
@@ -205,7 +205,7 @@ def change_of(
 def _amount(rig: StereoRig, p: NDArray[np.intp], step: Array) -> str:
     """Write a step of the rig's parameters ``p``: focal lengths, principal points, the relative pose, or a share."""
     if len(p) == 1:
-        return f"{100 * step[0]:+.2g} %"
+        return f"{100 * step[0]:+.2g} % ({1e3 * abs(step[0]) * rig.baseline_m:.2g} mm of the baseline)"
     if len(p) == 6:
         return f"{1e3 * np.linalg.norm(step[:3]):.2g} mm and {np.degrees(np.linalg.norm(step[3:])):.2g} degrees"
     if p[0] in (0, rig.left.parameters.size):

@@ -92,9 +92,9 @@ def _changed(calibration: Calibration) -> str | None:
         )
     if change.what.startswith(SIZE):
         return (
-            f"{change.what} changed about between {before} and {after}, which displaces points by "
+            f"{change.what.replace(' by ', ' changed by ')} about between {before} and {after}, which displaces points by "
             f"{1e3 * change.shift_m:.2g} mm: another board or print, or cameras that were moved; the rig is of neither "
-            "state, and its sigmas allow for that. Calibrate from the pairs of the board that --target describes"
+            "state, and its sigmas allow for that. Calibrate from the pairs of one state"
         )
     return (
         f"the cameras changed about between {before} and {after}: {change.what}, which displaces points by "
@@ -185,6 +185,8 @@ def _focus(calibration: Calibration) -> str | None:
 
 def _synchrony(calibration: Calibration) -> str | None:
     """Boards that moved between the exposures of a pair, or pairs whose epipolar error stands out."""
+    if calibration.change is not None and calibration.change.what.startswith(SIZE):
+        return None  # that looks like a motion of each board
     if calibration.motion is not None:
         return _moved(calibration, calibration.motion)
     errors = calibration.errors
