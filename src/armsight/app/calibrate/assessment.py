@@ -15,6 +15,7 @@ from armsight.app.show.report import Grade
 from armsight.data import Array, Record
 from armsight.geometry.pose import transform
 from armsight.vision.calibrate.result import Calibration, corner_variance_px2
+from armsight.vision.calibrate.weak import printed_longer
 from armsight.vision.rig import StereoRig
 from armsight.vision.triangulate import optimal_points
 
@@ -206,6 +207,7 @@ def assess(calibration: Calibration) -> tuple[tuple[Grade, str], str]:
     h, rig, points = calibration.held_out, calibration.rig, len(advice(calibration))
     along = rig.T_left_right[:3, :3].T @ rig.T_left_right[:3, 3] / rig.baseline_m
     baseline_share = float(np.sqrt(along @ rig.cov[-6:-3, -6:-3] @ along)) / rig.baseline_m
+    share = max(abs(h.scale_error), baseline_share, (printed_longer(calibration) or (0.0,))[0])
     grade: Grade = "fair" if points else "good"
     if any(row.grade == "poor" for row in graded_metrics(calibration)):
         grade = "poor"
@@ -224,5 +226,5 @@ def assess(calibration: Calibration) -> tuple[tuple[Grade, str], str]:
         (grade, headline),
         f"On held-out pairs, measured points deviate by {1e3 * h.rigid_rms_m:.2g} mm (RMS) from their true shape, at a "
         f"distance of about {1e3 * distance_m(calibration):.0f} mm; lengths, compared with those of the "
-        f"{target(calibration)}, are right to {100 * max(abs(h.scale_error), baseline_share):.2g}%. {then}",
+        f"{target(calibration)}, are right to {100 * share:.2g}%. {then}",
     )

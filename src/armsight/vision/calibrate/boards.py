@@ -30,7 +30,7 @@ from armsight.errors import CalibrationError
 from armsight.geometry.pose import inverse
 from armsight.vision.calibrate import FOLDS, MODELS, heldout
 from armsight.vision.calibrate.motion import ExposureMotion, other_size
-from armsight.vision.calibrate.result import Calibration, HeldOutErrors, RejectedPair
+from armsight.vision.calibrate.result import BOARD_DEGREE, Calibration, HeldOutErrors, RejectedPair
 from armsight.vision.calibrate.screen import LEAST_CORNERS, MOTION_EASE, Screened, noise_px, robust_sigma, screen
 from armsight.vision.calibrate.start import agreed_symmetries, fits, imitated, residual_rms_px, start_board
 from armsight.vision.camera import DISTORTION_MODELS, Camera
@@ -51,8 +51,6 @@ WORTH = {"brown4": 0.0, "brown5": 0.01, "brown8": 0.03, "fisheye": 0.05}
 #: was 1.25 times too large. Synchronised cameras lower it by a hundredth, by chance; what a lens model lacks, by a
 #: tenth.
 MOTION_WORTH = 0.2
-#: Degree of the polynomials in which a printed board may differ from its drawing.
-BOARD_DEGREE = 4
 #: Prior standard deviation of a board from its drawing at first, RMS of one mode, as a share of its diagonal.
 BOARD_SIGMA_SHARE = 1e-3
 _START_PX = 0.1  # sigma of a detection before its residuals show it; half, double: a round more

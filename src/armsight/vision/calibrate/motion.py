@@ -111,7 +111,7 @@ def _condensed(
     """Return P + 1 residuals of each shot, (S, P + 1), that say all it says of the rig, and their derivative.
 
     They are whitened, and by the P free parameters of the rig; the shot's own are eliminated. The axes of the relative
-    position are :func:`_baseline_axes`.
+    position are :func:`baseline_axes`.
     """
     uv, by_shared, by_own = predict(model, solution.state, seen)
     W, count = whiteners(seen, solution.sigma_px), by_shared.shape[2] - len(model.modes)
@@ -136,11 +136,11 @@ def _condensed(
     unit = 1 / np.sqrt(np.maximum(np.einsum("sii->i", left), 1e-300))
     values, axes = np.linalg.eigh(unit[:, None] * left * unit)
     rows = np.sqrt(np.maximum(values, 0.0))[..., None] * axes.swapaxes(1, 2) / unit
-    rows[:, :, -7:-4] = rows[:, :, -7:-4] @ _baseline_axes(solution.state.T_left_right)
+    rows[:, :, -7:-4] = rows[:, :, -7:-4] @ baseline_axes(solution.state.T_left_right)
     return rows[:, :, -1], rows[:, :, :-1]
 
 
-def _baseline_axes(T_left_right: Array) -> Array:
+def baseline_axes(T_left_right: Array) -> Array:
     """Return orthonormal columns (3, 3), the first along the baseline, in the axes of the relative pose's tangent."""
     along = (T_left_right[:3, :3].T @ T_left_right[:3, 3])[:, None]
     axes = np.linalg.qr(np.column_stack([along, np.eye(3)]))[0]
@@ -187,7 +187,7 @@ def change_of(
     poses = np.column_stack([sight, np.log(middle[:, 2]), solution.state.Ts_left_body[:, :2, 2], off_axis])
     if (found := changed(*_condensed(model, solution, seen, free), ways, poses, count=pairs)) is None:
         return None
-    off, axes = found.off.copy(), _baseline_axes(rig.T_left_right)
+    off, axes = found.off.copy(), baseline_axes(rig.T_left_right)
     off[:, -6:-3] = off[:, -6:-3] @ axes.T
     if not matters(found := replace(found, off=off).over_all(free), rig.cov):
         return None

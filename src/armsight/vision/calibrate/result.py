@@ -18,6 +18,9 @@ from armsight.vision.rig import StereoRig
 
 LEAST_SIGMA_PX = 1e-6
 
+#: Degree of the polynomials in which a printed board may differ from its drawing.
+BOARD_DEGREE = 4
+
 
 @dataclass(frozen=True)
 class RejectedPair:

@@ -174,8 +174,8 @@ def _bad_pairs(
         )
         if level[j] > PAIR_RATIO * usual:
             bad[int(j)] = (
-                f"its corners are {level[j] / usual:.1f} times as far off as the other pairs': wrong corners, a board "
-                "that moved between the two images, or motion blur"
+                f"its corners are {level[j] / usual:.1f} times as far off as the other pairs': wrong corners, another "
+                "board, one that moved between the two images, or motion blur"
             )
         elif lost > LOST_SHARE:
             bad[int(j)] = f"{100 * lost:.0f}% of its corners are gross errors"

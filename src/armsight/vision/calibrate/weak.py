@@ -9,8 +9,9 @@ from armsight.data import Array
 from armsight.errors import CalibrationError
 from armsight.estimate.chance import chi_square_limit
 from armsight.files import natural_key
-from armsight.vision.calibrate.motion import SIZE, ExposureMotion
-from armsight.vision.calibrate.result import Calibration, corner_variance_px2
+from armsight.vision.calibrate.motion import SIZE, ExposureMotion, baseline_axes
+from armsight.vision.calibrate.result import BOARD_DEGREE, Calibration, corner_variance_px2
+from armsight.vision.pose.projection import smooth
 
 _LEAST_TILT_DEG = 15.0
 _GOOD_PAIRS = 12
@@ -32,6 +33,9 @@ _OF_MOTION = 3.0
 #: camera that rotated by half a degree contradicts; double: images that are mirrored from a pair on may not.
 _FAR_CHANGE = 0.1
 _FAR_MOTION, _FARTHEST = 2.0, 4
+#: Square of motions over variance across the line of the cameras, as a share of that along it, below which they are those
+#: of boards of other sizes. Half: 1 % at noise of 0.1 px is not named; double: a board that slid by hand may be.
+_ALONG = 0.05
 _ROLLED_DEG = 60.0
 _RECORD = (
     " By what time they differ is not found here, for images have none: give a recording, `armsight calibrate --source "
@@ -104,16 +108,33 @@ def _changed(calibration: Calibration) -> str | None:
     )
 
 
+def printed_longer(calibration: Calibration) -> tuple[float, float, float] | None:
+    """Return by which share a print is longer one way than across it, its sigma, and the angle to the rows, degrees.
+
+    None where that is not surely more than an ordinary print's. It is the strain of the plane by the board's shape.
+    """
+    drawing, shape = calibration.drawing, calibration.solution.state.shape
+    if drawing is None or not len(shape):
+        return None
+    modes = smooth(drawing, BOARD_DEGREE)
+    p = (drawing - drawing.mean(axis=0))[:, :2]
+    D = np.linalg.lstsq(p, np.concatenate([mode[:, :2] for mode in modes], axis=1))[0].reshape(2, -1, 2)
+    J = np.stack([D[0, :, 0] - D[1, :, 1], D[0, :, 1] + D[1, :, 0]])
+    strain, of = J @ shape[: len(modes)], slice(-len(shape), len(modes) - len(shape) or None)
+    share = float(np.linalg.norm(strain))
+    g = strain @ J / max(share, 1e-300) * max(calibration.held_out.normalised_rms, 1.0)
+    sigma = float(np.sqrt(g @ calibration.solution.cov_shared[of, of] @ g))
+    return (share, sigma, float(np.degrees(np.arctan2(*strain[::-1])) / 2)) if share > _LONGER + 4 * sigma else None
+
+
 def _print(calibration: Calibration) -> str | None:
-    if (drawing := calibration.drawing) is None:
+    if (found := printed_longer(calibration)) is None:
         return None
-    p, found = (each[:, :2] - each[:, :2].mean(axis=0) for each in (drawing, calibration.body.points))
-    longest, shortest = np.linalg.svd(np.linalg.lstsq(p, found)[0])[1]
-    if longest < (1 + _LONGER) * shortest:
-        return None
+    share, sigma, angle = found
     return (
-        f"the board is printed {100 * (longest / shortest - 1):.2g} % longer one way than the other: the scale of the rig "
-        "is known no better, which its sigmas do not hold; measure many squares both ways with a caliper"
+        f"the board is printed {100 * share:.2g} ± {100 * sigma:.1g} % longer one way, at {abs(angle):.0f} degrees to its "
+        "rows, than across: lengths are right to no more than that, whatever the rig's sigmas. Print it again, or measure "
+        "many squares both ways with a caliper and give its points in a body file"
     )
 
 
@@ -223,6 +244,20 @@ def _by_position(calibration: Calibration) -> float | None:
 def _moved(calibration: Calibration, motion: ExposureMotion) -> str | None:
     ways = np.linalg.norm(calibration.solution.state.motions[:, :3], axis=1)
     far = [int(j) for j in np.argsort(-ways) if ways[j] > _FAR_MOTION * np.sqrt(3) * motion.rms_m][:_FARTHEST]
+    rig, solution, n = calibration.rig, calibration.solution, len(ways)
+    axes = rig.T_left_right[:3, :3] @ baseline_axes(rig.T_left_right)
+    R = axes.T @ solution.state.Ts_left_body[:n, :3, :3]
+    v = (R @ solution.state.motions[:, :3, None])[..., 0]
+    squares = (v**2 / np.diagonal(R @ solution.cov_motions[:, :3, :3] @ R.swapaxes(1, 2), axis1=1, axis2=2)).mean(
+        axis=0
+    )
+    if squares[1:].mean() < _ALONG * squares[0]:
+        return (
+            "between the two images boards are displaced along the line of the cameras alone, as boards of different sizes "
+            f"are, by {100 * np.std(v[:, 0]) / rig.baseline_m:.2g} % RMS: do the pairs show two boards or prints? The rig is "
+            "of neither: calibrate from the pairs of one alone. If the board slid along that line, trigger both cameras "
+            "together"
+        )
     most = "".join(f", {calibration.pairs[j]} by {1e3 * ways[j]:.1f} mm" for j in far)
     if (field_px := _by_position(calibration)) is not None:
         return (
