@@ -14,6 +14,9 @@ from armsight.sim.budget.plan import RigPlan, catalogue, planned
 from armsight.sim.camera.stages import CameraPipeline
 from armsight.vision.rig import Shutters, StereoRig
 
+#: Of two cameras that lose shots in motion.
+_LATE = {"skew_ms": 10.0, "start_ms": 5.0, "exposure_ms": 1.0}
+
 
 def test_a_file_says_the_same_as_options(tmp_path):
     path = tmp_path / "plan.toml"
@@ -26,6 +29,21 @@ def test_a_file_says_the_same_as_options(tmp_path):
     path.write_text("pair = 12\n")
     with pytest.raises(InputError, match="did you mean pairs"):
         RigPlan.read(str(path))
+
+
+@pytest.mark.parametrize("key", ["rig", "body", "preset"])
+def test_a_file_whose_paths_are_no_texts(tmp_path, key):
+    (path := tmp_path / "plan.toml").write_text(f"{key} = 0.5\n")
+    with pytest.raises(InputError, match=rf"plan.toml: {key} must be a text, got 0\.5"):
+        RigPlan.read(str(path))
+
+
+def test_any_path_is_a_text():
+    class Own:
+        def __fspath__(self):
+            return "rig.json"
+
+    assert RigPlan.read("", rig=Own()).rig == RigPlan.read("", rig=Path("rig.json")).rig == "rig.json"
 
 
 @pytest.mark.parametrize("want", ["600 \u00b5m, 0.2\N{DEGREE SIGN}", "600\u03bcm,12 arcmin", "0.6mm,0.003490658504rad"])
@@ -262,13 +280,14 @@ def test_a_distance_that_is_left_out_is_one_that_may_be():
     ]
 
 
-def test_what_is_not_reached_in_motion_is_reached_when_slower():
-    given = {"volume": "0.1x0.1x0.1m", "distance": "0.7m", "want": "0.6mm"}
-    found = armsight.budget(**given, speed="0.3m/s")
+@pytest.mark.parametrize(("most_mm", "speed", "late"), [(0.6, "0.3m/s", {}), (2.0, "0.4m/s,9deg/s", _LATE)])
+def test_what_is_not_reached_in_motion_is_reached_when_slower(most_mm, speed, late):
+    given = {"volume": "0.1x0.1x0.1m", "distance": "0.7m", "want": f"{most_mm}mm"} | late
+    found = armsight.budget(**given, speed=speed)
+    assert (found.moving.lost_share > 0.2) == bool(late)  # those that are lost move most
     slower = armsight.budget(**given, speed=f"{found.slower_m_s}m/s")
-    assert 0 < found.slower_m_s < 0.3
-    assert slower.mm == pytest.approx(0.6, rel=0.02)
-    assert armsight.budget(**given, speed="0m/s").slower_m_s == 0.0
+    assert 0.9 * most_mm < slower.mm <= most_mm
+    assert slower.slower_m_s == armsight.budget(**given, speed="0m/s").slower_m_s == 0.0
 
 
 def test_the_image_has_the_size_that_is_given():

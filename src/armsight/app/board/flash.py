@@ -78,8 +78,8 @@ def _dfu_util(built: Built) -> list[list[str]]:
     ]
 
 
-#: Programmer -> what to call; the first one installed is taken.
 _Calls = Callable[[Built], list[list[str]]]
+#: Programmer -> what to call; the first one installed is taken.
 PROGRAMMERS: Mapping[str, _Calls] = {"st-flash": _st_flash, "openocd": _openocd, "dfu-util": _dfu_util}
 
 

@@ -12,6 +12,7 @@ import re
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, fields, replace
 from functools import cache, cached_property, lru_cache
+from os import PathLike, fspath
 from pathlib import Path
 from typing import Any
 
@@ -200,16 +201,18 @@ class RigPlan:
         """
         values = read_toml(path) if path else {}
         for key in {"rig", "body", "preset"} & values.keys():
-            if str(values[key]).endswith(".toml" if key == "preset" else "") and not is_board(str(values[key])):
-                values[key] = str(Path(path).parent / values[key])
+            value, end = values[key], ".toml" if key == "preset" else ""
+            if isinstance(value, str) and value.endswith(end) and not is_board(value):
+                values[key] = str(Path(path).parent / value)
         given = values | {key: value for key, value in given.items() if value is not None}
         for key, value in given.items():
             of, kind = f"{path}: " if key in values else "", KEYS.get(key)
             if kind is None:
                 raise InputError(f"{of}unknown key {key!r}{meant(key, KEYS)}")
-            value = str(value) if isinstance(value, Path) else value.item() if isinstance(value, np.generic) else value
-            value = int(value) if kind is int and isinstance(value, float) and value.is_integer() else value
-            given[key] = value
+            value = fspath(value) if isinstance(value, PathLike) else value
+            value = value.item() if isinstance(value, np.generic) else value
+            whole = kind is int and isinstance(value, float) and value.is_integer()
+            given[key] = value = int(value) if whole else value
             if not isinstance(value, (int, float) if kind is float else kind) or isinstance(value, bool):
                 raise InputError(f"{of}{key} must be {_KINDS[kind]}, got {value!r}")
         plan = RigPlan(**given, named=tuple(given))

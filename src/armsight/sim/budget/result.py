@@ -9,8 +9,6 @@ from functools import cached_property, lru_cache, reduce
 from itertools import combinations, product
 from typing import Any, NamedTuple
 
-from scipy.optimize import brentq
-
 from armsight.data import Record
 from armsight.errors import InputError
 from armsight.sim.budget.plan import KEYS, CameraClass, RigPlan, catalogue, planned, up
@@ -22,6 +20,8 @@ WORTH = 0.1
 #: longer exposures and skews count as not reached, double: an answer holds for fewer shots than it says.
 MOST_LOST = 1 - LEVEL
 AT_REST = "measure at rest"
+#: Share of a plan's speed below which a slower one is not searched; half: one search longer, double: slow ones lack.
+_LEAST_OF = 1e-3
 _MEASURED = {"body_print": "0.01mm", "body_bent": "0.02mm", "body_size": 1e-4}
 #: What would make it better -> class of its price, 0 for nothing, and what of a plan it changes.
 CHANGES: dict[str, tuple[int, Callable[[RigPlan], dict[str, object]]]] = {
@@ -183,17 +183,18 @@ class RigBudget(Record):
                     "measured after printing: body_print, body_bent, body_size"
                 )
 
-    @property
+    @cached_property
     def slower_m_s(self) -> float:
-        """Speed below which what was requested is reached, m/s; 0 where that is never, or at the plan's own speed."""
-        rest, found = self.found.cov(moving=False), self.found
-        more = found.cov() - rest
-
-        def over(share: float) -> float:  # what motion costs is proportional to its speed
-            m, rad = (self.plan.overall(each) for each in found.at_level(rest + share**2 * more))
-            return Accuracy(0.0, 0.0, m, rad).over(*self.plan.requested or ()) - 1
-
-        return self.plan.speeds[0] * float(brentq(over, 0.0, 1.0)) if over(0.0) < 0 < over(1.0) else 0.0
+        """Speed, two digits, at which what was requested is reached, m/s; 0 where that is never, or at the plan's own."""
+        plan, (speed, rotation), low = self.plan, self.plan.speeds, 0.0
+        if self.reached(self.moving) or not self.reached(self.at_rest):
+            return low
+        high = speed  # planned again at each: faster, more shots are lost, and the errors are of the others
+        while high > _LEAST_OF * speed and (now := float(f"{(low + high) / 2:.2g}")) not in (low, high):
+            at = f"{now:f}m/s,{math.degrees(rotation * now / speed):f}deg/s"
+            reached = self.reached(Accuracy.of(planned(other := replace(plan, speed=at)), other, moving=True))
+            low, high = (now, high) if reached else (low, now)
+        return low
 
     def level_m(self, **which: Any) -> float:  # noqa: ANN401
         """Return what 95 % are within for a covariance of the budget, by what :meth:`Budget.cov` takes."""
