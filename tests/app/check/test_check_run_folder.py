@@ -436,5 +436,5 @@ def test_a_visit_through_a_waypoint_without_rest_is_of_its_own_approach(joints, 
         np.savetxt(tmp_path / "joints.csv", q, "%.6f", ",", header="t_s,q1_ref_rad,q2_ref_rad", comments="")
     (found,) = said(capsys, tmp_path, "--json").lines
     assert found["poses"]["P1"]["RP_m"]["raw"] < 1e-4  # three times the noise; 2 mm with both sides
-    came = "sides +0" if joints else "aside"
+    came = "smaller angles of joint 1" if joints else "aside"
     assert f"left out: P1 approached from {came}, too seldom (1)" in found["notes"]

@@ -254,6 +254,7 @@ def test_the_commands_mistakes_are_one_line_and_code_2(monkeypatch, capsys, stor
             "film:x: not a source: known are folder:..., pairs:..., video:..., url:..., usb:...",
         ),
         (("0,1", "-o", tmp_path / "a"), "0,1: not a source (usb:0,1?): known are folder:"),
+        (("nope:", "-o", tmp_path / "a"), "nope: not a source: known are folder:"),
         (("0", "-o", tmp_path / "a"), "0: not a source (usb:0,1?): known are folder:"),
         ((stored, "-o", stored), f"{stored}: already holds a recording; record into a new folder"),
         (("usb:97,98", "-o", tmp_path / "a"), "/dev/video97: no such camera; `armsight cameras` lists those attached"),

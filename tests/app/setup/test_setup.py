@@ -105,7 +105,7 @@ def test_a_file_that_is_not_there_is_left_out_of_all_commands(armsight, typed, p
     came.clear()
     person["your file"] = ""
     said = armsight("setup", "ur5e", "--source", "usb:3,1")
-    assert "left out: there is no such file" in said.err
+    assert "left out: there is no my_ur5e_calibration.yaml" in said.err
     assert "--arm ur5e " in came[4]
 
 

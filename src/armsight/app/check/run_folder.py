@@ -109,11 +109,10 @@ class JointTrack(Record):
         here = self.q_ref[end - 1]
         sides = np.zeros(len(here))
         for stop in range(end, 0, -_LOOK_ROWS):  # backwards: what the joints did before their last motion is of no use
-            away = self.q_ref[max(stop - _LOOK_ROWS, 0) : stop] - here
-            far = np.abs(away) > _AWAY_RAD
-            last = len(far) - 1 - np.argmax(far[::-1], axis=0)
-            found = far.any(axis=0) & (sides == 0)
-            sides = np.where(found, -np.sign(away[last, np.arange(len(here))]), sides)
+            gone = here - self.q_ref[max(stop - _LOOK_ROWS, 0) : stop][::-1]
+            far = np.abs(gone) > _AWAY_RAD
+            came = np.take_along_axis(np.where(far, np.sign(gone), 0.0), far.argmax(axis=0)[None], axis=0)[0]
+            sides = np.where(sides == 0, came, sides)
             if sides.all():
                 break
         return sides
@@ -225,10 +224,18 @@ def _rests(
             visits.setdefault((name, came), []).append(seen)
     rare = _rare(visits)
     rows = [row for at, group in visits.items() if at not in rare for row in group]
-    said = [f"left out: {name} approached from {came}, too seldom ({n})" for (name, came), n in rare.items()]
+    said = [f"left out: {name} approached from {_in_words(came)}, too seldom ({n})" for (name, came), n in rare.items()]
     notes = [f"{unseen} rests were not seen, and are left out"] if unseen else []
     notes += first_few(said, "approaches, too seldom")
     return sorted(rows, key=lambda row: (natural_key(row.pose), row.t_s)), notes
+
+
+def _in_words(came: str) -> str:
+    """Say which joints came from which side; any other approach is returned as it is."""
+    ways = (("+", "smaller"), ("-", "larger"))
+    each = ((angles, [str(n) for n, s in enumerate(came[6:], 1) if s == sign]) for sign, angles in ways)
+    said = " and ".join(f"{angles} angles of joint {', '.join(joints)}" for angles, joints in each if joints)
+    return (said or "the start") if came.startswith("sides ") else came
 
 
 def _rare(visits: dict[tuple[str, str], list[Row]]) -> dict[tuple[str, str], int]:

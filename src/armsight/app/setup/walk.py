@@ -87,10 +87,8 @@ class SetupWalk:
         """Do what is left; return the exit code of the step that did not go well, or 0."""
         steps = ARMS[self.arm]
         for number, step in enumerate(steps, start=1):
-            row: dict[str, Any] = {
-                "command": f"armsight {self.typed(step)}",
-                "state": self.done.get(step.command, "open"),
-            }
+            state = self.done.get(step.command, "open")
+            row: dict[str, Any] = {"command": f"armsight {self.typed(step)}", "state": state}
             result["steps"].append(row)
             if step.command in self.done:
                 say(f"{number} of {len(steps)} {row['state']}: {row['command']}")
@@ -101,7 +99,7 @@ class SetupWalk:
                 _write_plate(say)
             row["command"] = f"armsight {self.typed(step)}"
             self.keep()
-            say(f"$ {row['command']}" if possible else "left out: there is no such file")
+            say(f"$ {row['command']}" if possible else f"left out: there is no {step.given}")
             nobody = self.simulated and not sys.stdin.isatty()
             answer = "" if nobody or not possible else _asked("Enter runs it, s leaves it out, q ends here")
             if answer.lower().startswith("q"):

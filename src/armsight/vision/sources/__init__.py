@@ -79,7 +79,7 @@ def check_source(spec: str) -> None:
 
             hint = f" ({'bag' if spec.endswith(SUFFIXES) else 'video'}:{spec}?)"
         gone = ", and there is no such folder" if os.sep in spec and not hint else ""
-        raise InputError(f"{spec}: not a source{hint}: known are {known}, or the path of a folder{gone}")
+        raise InputError(f"{spec.rstrip(':')}: not a source{hint}: known are {known}, or the path of a folder{gone}")
 
 
 def open_source(spec: str | Path) -> Source:
