@@ -254,7 +254,7 @@ def _moved(calibration: Calibration, motion: ExposureMotion) -> str | None:
     if squares[1:].mean() < _ALONG * squares[0]:
         return (
             "between the two images boards are displaced along the line of the cameras alone, as boards of different sizes "
-            f"are, by {100 * np.std(v[:, 0]) / rig.baseline_m:.2g} % RMS: do the pairs show two boards or prints? The rig is "
+            f"are, by {100 * np.std(v[:, 0]) / rig.baseline_m:.2g} % RMS: do the pairs show two boards? The rig is "
             "of neither: calibrate from the pairs of one alone. If the board slid along that line, trigger both cameras "
             "together"
         )
