@@ -12,6 +12,9 @@ def main() -> None:
     except KeyboardInterrupt:
         print("armsight: interrupted", file=sys.stderr)
         sys.exit(130)
+    finally:
+        # CPython ends `python -m` by the signal after an interrupt within an exec (of dataclasses), though it is caught
+        exec("")
 
 
 if __name__ == "__main__":

@@ -208,17 +208,21 @@ def test_a_question_to_a_closed_standard_input_is_one_line(tmp_path, armsight, m
     assert (tmp_path / "arm.urdf").read_text() == "kept"
 
 
-def test_an_interrupt_while_it_is_imported_is_said_in_one_line():
+@pytest.mark.parametrize("raising", ["raise KeyboardInterrupt", "exec('raise KeyboardInterrupt')"])
+def test_an_interrupt_while_it_is_imported_is_said_in_one_line(tmp_path, raising):
+    """Also one within exec: CPython 3.11 ends by the signal then, though it is caught."""
     code = (
         "import runpy, sys\n"
         "class Interrupts:\n"
         "    def find_spec(self, name, path=None, target=None):\n"
         "        if name == 'armsight.app.main':\n"
-        "            raise KeyboardInterrupt\n"
+        f"            {raising}\n"
         "sys.meta_path.insert(0, Interrupts())\n"
         "runpy.run_module('armsight', run_name='__main__')\n"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    (tmp_path / "interrupted.py").write_text(code)
+    given = [sys.executable, "-m", "interrupted"]
+    done = subprocess.run(given, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (130, "armsight: interrupted\n")
 
 

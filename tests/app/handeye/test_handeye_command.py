@@ -339,6 +339,9 @@ def test_exchanged_tables_that_put_the_cameras_far_from_the_flange_are_named(arm
     right, exchanged = (found(armsight, *tables)[0] for tables in ((robot, seen), (seen, robot)))
     np.testing.assert_allclose(log_se3(np.array(exchanged["T_flange_rig"]) @ Z), 0.0, atol=2e-3)  # as good a fit
     assert said in str(exchanged["weak"])
+    _, A, B = motion(16)  # as many as are advised
+    more = matrices(tmp_path / "more.txt", B), matrices(tmp_path / "moved.txt", A)
+    assert asked(armsight, *more).done().out.startswith("Usable only where what is named as weak below is not so")
     assert said not in str(right["weak"])
 
 
@@ -422,7 +425,7 @@ def test_readings_of_rotations_axes_and_units(armsight, tmp_path, seen):
     x = Rotation.from_matrix(B[:, :3, :3]).as_quat()
     bare = tmp_path / "bare.csv"
     np.savetxt(bare, np.hstack([B[:, :3, 3], x]), delimiter=",")
-    by = ("--columns", "seen:rotation=wxyz")
+    by = ("--columns", "units=m,seen:rotation=wxyz")
     rejected(
         matrices(path, A), bare, "the rotations are xyzw, not wxyz: --columns seen:rotation=xyzw", more=by, by=bare
     )

@@ -16,4 +16,5 @@ def test_millimetres_on_poses_left_out_are_not_called_good(monkeypatch, off_m, u
     run = SimpleNamespace(found=SimpleNamespace(used=np.ones(used, bool), cov=None, held_out=held_out))
     found, sentence = report.assess(run, [])
     assert found == grade
+    assert report.assess(run, [], weak=True)[0] == "fair"
     assert f"{1e3 * off_m:.2f} mm" in sentence

@@ -70,13 +70,17 @@ def test_one_wire_finds_a_longer_link_and_its_hooks(tmp_path, capsys):
     assert not (tmp_path / "out" / "zeros.toml").exists()  # one wire shows no zero alone
 
 
-def test_a_residual_far_above_the_ranges_noise_is_not_usable(tmp_path, capsys):
+def test_a_residual_far_above_the_ranges_noise_is_not_usable_and_no_change_is_asserted(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(
+        "armsight.app.identify.run._notes", lambda *_: ["from line 9 on the poses are of another state"]
+    )
     given = files(tmp_path, timed=False, off_m=1.5e-3, noise_m=2e-4)
     said = said_of(capsys, "identify", *given)
     assert said.out.startswith(
         "Do not use this identification: its residual is 0.64 mm where noise_m and rounded joints"
     )
     assert "Is four the maker's nominal arm" in said.out
+    assert "if the model is right, from line 9" in said.err + said.out
 
 
 def test_what_does_not_fit_is_one_line(tmp_path, capsys):
@@ -101,7 +105,7 @@ def test_lost_ranges_are_left_out_and_a_wrong_unit_is_named(tmp_path, capsys):
     assert found["poses"] == ROWS - len(HOOKED) - 2
     assert "line 2, 12: 2 rows without a range at rest within 0.25 s: left out" in json.dumps(found)
     (tmp_path / "wire.csv").write_text("\n".join([head, *rows[:100]]) + "\n")
-    assert_rejected(said_of(capsys, "identify", *given), "within 0.25 s of 20 of 80 rows", "one clock")
+    assert_rejected(said_of(capsys, "identify", *given), "20 of 80 rows", "did the arm rest there?", "one clock")
     between = [
         f"{float(row.split(',')[0]) + 1.1},{row.split(',')[1]}" for row in rows
     ]  # half a pose late: of both beside

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -95,11 +96,12 @@ def _said(options: Options, side: str) -> Said:
     """Return what --columns says of one table, "robot" or "seen"; units=detect holds for both."""
     from armsight.tables.cells import said_columns
 
-    parts = [text if text.startswith("seen:") else f"robot:{text.removeprefix('robot:')}" for text in options.columns]
-    said = {
-        each: said_columns(",".join(text.partition(":")[2] for text in parts if text.startswith(f"{each}:")) or None)
-        for each in ("robot", "seen")
-    }
+    parts: dict[str, list[str]] = {"robot": [], "seen": []}
+    for text in options.columns:  # what follows "seen:" is of that table
+        _, *pairs = re.split(r"(?:^|,)\s*(robot|seen):", f"robot:,{text}")
+        for table, part in zip(pairs[::2], pairs[1::2], strict=True):
+            parts[table] += filter(None, [part.strip(",")])
+    said = {table: said_columns(",".join(each) or None) for table, each in parts.items()}
     return said[side]._replace(detect_units=any(each.detect_units for each in said.values()))
 
 

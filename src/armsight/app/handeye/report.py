@@ -102,7 +102,7 @@ def handeye_report(run: HandEyeAnswer) -> Report:
         sections,
         [*(Note("untrusted", each) for each in why), *(Note("note", each) for each in run.recording.notes), *decided],
         values,
-        assessed=assess(run, why),
+        assessed=assess(run, why, weak=bool(decided)),
     )
 
 
@@ -115,8 +115,11 @@ def _exchanged(run: HandEyeAnswer) -> str:
     return f"{far}: if that is not so, --robot and --seen are exchanged"
 
 
-def assess(run: HandEyeAnswer, why: list[str]) -> tuple[Grade, str]:
-    """Return the grade of a calibration, and in one sentence what to do with it; ``why`` it must not be trusted."""
+def assess(run: HandEyeAnswer, why: list[str], *, weak: bool = False) -> tuple[Grade, str]:
+    """Return the grade of a calibration, and in one sentence what to do with it; ``why`` it must not be trusted.
+
+    ``weak``: a weakness is named, which is to be looked at first.
+    """
     found, position_m = run.found, run.found.held_out.rms()[0]
     used, (worst_m, _) = int(found.used.sum()), worst_sigmas(found.cov)
     if why:
@@ -127,6 +130,8 @@ def assess(run: HandEyeAnswer, why: list[str]) -> tuple[Grade, str]:
         return "fair", f"Usable: {said} along its worst axis; more poses lower that: --plan {MORE} chooses them."
     if position_m > GOOD_M:
         return "fair", f"Usable: {said}; the arm's own error is the likeliest reason: armsight identify finds it."
+    if weak:
+        return "fair", f"Usable only where what is named as weak below is not so: {said}."
     return "good", f"Good: {said}; leave camera and tool as they are mounted."
 
 

@@ -215,6 +215,8 @@ def identify_report(run: Identification, *, everything: bool = False) -> Report:
         Lines(pairs, "correlations over 0.9 (more varied poses distinguish them):", all_or),
         *([] if everything else [Text(_in_short(backlashes, len(pairs)))]),
     ]
+    graded = assess(run)
+    doubt = "if the model is right, " * (graded[0] == "poor")  # a wrong model looks like a change, too
     return Report(
         "identify",
         "Kinematic identification",
@@ -228,8 +230,8 @@ def identify_report(run: Identification, *, everything: bool = False) -> Report:
                 [*_ranges(run, everything=everything), *_printed(run, everything=everything), _parameters(run)],
             ),
         },
-        [Note("note", each) for each in run.notes],
-        assessed=assess(run),
+        [Note("note", doubt * ("another state" in each) + each) for each in run.notes],
+        assessed=graded,
     )
 
 

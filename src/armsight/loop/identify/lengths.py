@@ -157,8 +157,8 @@ def read_wire(data: Path, arm: Arm, references: Path, columns: Renames | None = 
     there = np.isfinite(found_m)
     if there.sum() < SHARE * len(rows):
         raise InputError(
-            f"{source}: a range at rest within {REST_S:g} s of {there.sum()} of {len(rows)} rows of {data}: have both one "
-            "clock?"
+            f"{source}: a range at rest within {REST_S:g} s of {there.sum()} of {len(rows)} rows of {data}: "
+            "did the arm rest there? If it did: have both one clock, and is noise_m right?"
         )
     if not there.all():
         alone = ", ".join(f"{line:.0f}" for line in lines[~there][:8])
