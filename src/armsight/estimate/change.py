@@ -30,6 +30,7 @@ _AT_ONCE = 40  # parts that orders are tested in; half: twice the memory, double
 _TOGETHER = 1 / 16
 #: Least square of a change in sigmas, per number; half: changes that sigmas hold are named, double: fewer.
 _MATTERS = 4.0
+_SAME = 1e-9  # share of a gain that is rounding, as poses may split as the time does; half and double: nothing
 _RIDGE = 1e-13  # of a scaled system whose measurements leave a direction open; half and double: nothing
 _CAUCHY = 3.0  # sigmas from where a residual counts less; half: noise does, double: outliers pull
 
@@ -131,7 +132,7 @@ def changed(
     way, k = np.unravel_index(int(np.argmax(found - usual)), found.shape)
     split, p, gain = int(inner[k]), own[way], found[way, k]
     middle = np.add.reduceat(poses[:n], starts, axis=0) / np.diff(np.append(starts, n))[:, None]
-    sure = gain > most(_orders_by(middle, np.random.default_rng(1)), p).max()
+    sure = gain > (1 + _SAME) * most(_orders_by(middle, np.random.default_rng(1)), p).max()
     step = np.zeros(len(unit))
     step[columns[p]] = in_time[way][1][0, k]
     by_fit = -A[split + 1 :].sum(axis=0)[:, p] @ step[columns[p]]

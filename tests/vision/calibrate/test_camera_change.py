@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from armsight.errors import CalibrationError
 from armsight.geometry.pose import exp_se3
@@ -152,3 +153,21 @@ def test_a_print_that_is_longer_one_way_is_named(longer, named):
     pairs = board_pairs(true, board.body.points * [longer, 1, 1], Ts, seed=1)
     found = calibrate_boards(board, pairs, SIZES, models=("brown4",), folds=2)
     assert any("% longer one way, at" in weak for weak in found.weaknesses) == named
+
+
+@pytest.mark.parametrize(("moved_m", "off"), [(0.0, False), (3e-4, True)])
+def test_corners_of_a_pair_that_are_off_together_widen_the_sigmas_and_white_noise_does_not(moved_m, off):
+    # 0.3 mm between the exposures lowers no noise by a fifth, and makes the rig's errors five times its sigmas without.
+    true, board, Ts = rig_and_board("brown4", count=COUNT, seed=823)
+    way, later = moved_m * np.random.default_rng(823).normal(size=(COUNT, 3)), Ts.copy()
+    later[:, :3, 3] += way
+    first, then = (board_pairs(true, board.body.points, each, seed=823) for each in (Ts, later))
+    pairs = [Pair(a.name, a.left, b.right) for a, b in zip(first, then, strict=True)]
+    found = calibrate_boards(board, pairs, SIZES, models=("brown4",), folds=2)
+    assert found.motion is None
+    assert (found.spread > 2) == off
+    assert any("off together" in weak for weak in found.weaknesses) == off
+    error = rig_error(found.rig, true)
+    nees = error @ np.linalg.solve(found.rig.cov, error)
+    assert chi2.ppf(1e-4, len(error)) < nees < chi2.ppf(1 - 1e-4, len(error))
+    assert not off or nees * found.spread**2 > 3 * chi2.ppf(1 - 1e-4, len(error))

@@ -20,7 +20,7 @@ from armsight.geometry.pose import inverse, transform
 from armsight.geometry.rigid import fit_rigid, fit_scale
 from armsight.geometry.rotation import skew
 from armsight.vision.calibrate import MODELS
-from armsight.vision.calibrate.motion import ExposureMotion, change_of
+from armsight.vision.calibrate.motion import ExposureMotion, change_of, spread_of
 from armsight.vision.calibrate.result import LEAST_SIGMA_PX, Calibration, HeldOutErrors, PairErrors, RejectedPair
 from armsight.vision.calibrate.screen import noise_px
 from armsight.vision.calibrate.weak import weaknesses
@@ -342,6 +342,11 @@ def concluded(
     change = None if moving else change_of(model, solution, observations, rig, len(pairs))
     if change is not None:  # the rig holds for a state between the two
         rig = replace(rig, cov=rig.cov + change.off.T @ change.off)
+    larger = 1.0
+    if change is None and not moving and (added := spread_of(model, solution, observations, len(rig.cov))) is not None:
+        free = np.diag(rig.cov) > 0
+        larger = float(np.sqrt(1 + np.mean(np.diag(added)[free] / np.diag(rig.cov)[free])))
+        rig = replace(rig, cov=rig.cov + added)
     found = model.body(state.shape)[: len(body.points)]
     found = transform(fit_rigid(found, body.points), found)
     deviation_m = float(np.sqrt(((found - body.points) ** 2).sum(axis=1).mean()))
@@ -350,7 +355,7 @@ def concluded(
     motion = None if trial.motion is None else trial.motion.scaled(heldout.normalised_rms)
     drawn, by_pair = replace(body, points=found), (trial.errors, models, rejected, notes, (), motion, disc_radius_m)
     seen = (deviation_m, pairs, pairs_found, observations, solution, epipolar_px, heldout)
-    return assessed(Calibration(rig, drawn, *seen, *by_pair, change=change))
+    return assessed(Calibration(rig, drawn, *seen, *by_pair, change=change, spread=larger))
 
 
 def assessed(calibration: Calibration) -> Calibration:

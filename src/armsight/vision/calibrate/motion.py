@@ -17,10 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array, Record
+from armsight.estimate.chance import chi_square_limit
 from armsight.estimate.change import changed, matters
 from armsight.geometry.pose import inverse, transform
 from armsight.geometry.rotation import skew
-from armsight.vision.pose.bundle import CAUCHY_SCALE, BundleSolution, minimise, whiteners
+from armsight.vision.pose.bundle import CAUCHY_SCALE, BundleSolution, free_parameters, minimise, whiteners
 from armsight.vision.pose.projection import BundleModel, Observations, predict
 from armsight.vision.rig import StereoRig
 from armsight.vision.triangulate import optimal_points
@@ -33,6 +34,9 @@ TAIL = 4.0
 SIZE, _OTHER_COST = "the board's size over the cameras' distance", 0.25
 #: A motion of one standard deviation at first, as a share of the board's diagonal, and the least it may be.
 START_SHARE, _LEAST = 1e-3, 1e-8
+#: Chance that white noise shows corners that are off together; half and double: another rate of false alarms.
+_BY_CHANCE = 1e-4
+_SINGULAR = 1e-14  # eigenvalue of a scaled information that is rounding; half and double: nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,19 +109,13 @@ class CameraChange(Record):
     shift_m: float  #: by how much it displaces the points that the pairs measured, median, m
 
 
-def _condensed(
-    model: BundleModel, solution: BundleSolution, seen: Observations, free: NDArray[np.bool_] | None = None
-) -> tuple[Array, Array]:
-    """Return P + 1 residuals of each shot, (S, P + 1), that say all it says of the rig, and their derivative.
-
-    They are whitened, and by the P free parameters of the rig; the shot's own are eliminated. The axes of the relative
-    position are :func:`baseline_axes`.
-    """
+def _of_shots(model: BundleModel, solution: BundleSolution, seen: Observations) -> Array:
+    """Return (S, Q + 1, Q + 1) what each shot says of the Q shared parameters and, last, their residual, whitened."""
     uv, by_shared, by_own = predict(model, solution.state, seen)
-    W, count = whiteners(seen, solution.sigma_px), by_shared.shape[2] - len(model.modes)
+    W = whiteners(seen, solution.sigma_px)
     white = (W @ (seen.uv - uv)[..., None])[..., 0]
     weigh = 1.0 / np.sqrt(1.0 + np.einsum("ni,ni->n", white, white) / CAUCHY_SCALE**2)[:, None]
-    J = np.concatenate([W @ by_own, W @ by_shared[:, :, :count], white[..., None]], axis=2) * weigh[..., None]
+    J = np.concatenate([W @ by_own, W @ by_shared, white[..., None]], axis=2) * weigh[..., None]
     own, total = by_own.shape[2], np.empty((seen.shot_count, J.shape[2], J.shape[2]))
     for shot in range(seen.shot_count):
         rows = J[seen.shot == shot].reshape(-1, J.shape[2])
@@ -129,10 +127,20 @@ def _condensed(
         total[:, ours, -1] -= pull
         total[:, -1, ours] -= pull
         total[:, -1, -1] += (pull * solution.state.motions).sum(axis=1)
-    left = total[:, own:, own:] - total[:, own:, :own] @ np.linalg.solve(total[:, :own, :own], total[:, :own, own:])
-    if free is not None:
-        kept = np.append(free, True)
-        left = left[:, kept][:, :, kept]
+    by_own = np.linalg.solve(total[:, :own, :own], total[:, :own, own:])
+    return np.asarray(total[:, own:, own:] - total[:, own:, :own] @ by_own)
+
+
+def _condensed(
+    model: BundleModel, solution: BundleSolution, seen: Observations, free: NDArray[np.bool_] | None = None
+) -> tuple[Array, Array]:
+    """Return P + 1 whitened residuals of each shot, (S, P + 1), that say all it says of the rig, and their derivative.
+
+    By the P free parameters of the rig, the shape held. The axes of the relative position are :func:`baseline_axes`.
+    """
+    left = _of_shots(model, solution, seen)
+    free = np.ones(left.shape[2] - 1 - len(model.modes), bool) if free is None else free
+    left = left[:, (kept := np.append(np.flatnonzero(free), -1))][:, :, kept]
     unit = 1 / np.sqrt(np.maximum(np.einsum("sii->i", left), 1e-300))
     values, axes = np.linalg.eigh(unit[:, None] * left * unit)
     rows = np.sqrt(np.maximum(values, 0.0))[..., None] * axes.swapaxes(1, 2) / unit
@@ -200,6 +208,29 @@ def change_of(
     step = (off[1] - off[0])[p] if found.way != SIZE else -axes.T[:1] @ (off[1] - off[0])[-6:-3] / rig.baseline_m
     what = f"{found.way} by {_amount(rig, p, step)}" if found.sure else ""
     return CameraChange(found.row, what, off, shift_m)
+
+
+def spread_of(model: BundleModel, solution: BundleSolution, seen: Observations, count: int) -> Array | None:
+    """Return what is added to the covariance of the rig's ``count`` parameters as corners of a shot are off together.
+
+    Each shot may be of a rig of its own, spread as the covariance is, by the variance that makes the squares of the shots'
+    gradients as expected (MINQUE; Rao, "Estimation of variance components", 1972). None where noise may have larger ones.
+    """
+    each, free = _of_shots(model, solution, seen), free_parameters(model, solution.state)
+    A = each[:, :-1, :-1] * free * free[:, None]
+    H = A.sum(axis=0) + np.diag(np.append(np.zeros(count), np.full(len(model.modes), model.shape_sigma_m**-2.0)))
+    unit = 1 / np.sqrt(np.where(free, np.diag(H), 1.0))
+    values, axes = np.linalg.eigh(unit[:, None] * H * unit)
+    root = unit[:, None] * axes[:, values > _SINGULAR] / np.sqrt(values[values > _SINGULAR])
+    rig, (half_d2, density) = root[:count], np.polynomial.laguerre.laggauss(40)
+    own, gain = rig.T @ A[:, :count, :count] @ rig, rig.T @ A[:, :count] @ root
+    less, whole = gain @ gain.swapaxes(1, 2), (gain.swapaxes(1, 2) @ gain).sum(axis=0)
+    w = 1.0 / (1.0 + 2 * half_d2 / CAUCHY_SCALE**2)  # of white noise: the variance of a gradient is less than A
+    squares = ((each[:, :count, -1] @ rig) ** 2).sum() * (density @ w) / (density @ (half_d2 * w**2))
+    usual, spread = np.einsum("sii->", own - less), (own * (own - 2 * less)).sum() + (whole**2).sum()
+    if squares * usual <= chi_square_limit(usual**2 / spread, _BY_CHANCE) * spread:
+        return None
+    return np.asarray((squares - usual) / spread * rig @ whole @ rig.T)
 
 
 def _amount(rig: StereoRig, p: NDArray[np.intp], step: Array) -> str:

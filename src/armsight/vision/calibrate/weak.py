@@ -48,7 +48,7 @@ _FIELD_DEGREE, _FIELD_SHARE, _FIELD_CHANCE = 4, 0.04, 1e-4
 
 def weaknesses(calibration: Calibration) -> tuple[str, ...]:
     """Assess a calibration: one sentence per weakness, what it is and what to do; empty where nothing stands out."""
-    checks = [_agreement, _changed, _print, _pairs, _focus, _synchrony, _sides]
+    checks = [_agreement, _changed, _spread, _print, _pairs, _focus, _synchrony, _sides]
     if calibration.rig.cov[0, 0] > 0:  # intrinsics were estimated, not given
         checks += [_tilts, _coverage, _focal, _scale]
     return tuple(message for check in checks if (message := check(calibration)) is not None)
@@ -125,6 +125,14 @@ def printed_longer(calibration: Calibration) -> tuple[float, float, float] | Non
     g = strain @ J / max(share, 1e-300) * max(calibration.held_out.normalised_rms, 1.0)
     sigma = float(np.sqrt(g @ calibration.solution.cov_shared[of, of] @ g))
     return (share, sigma, float(np.degrees(np.arctan2(*strain[::-1])) / 2)) if share > _LONGER + 4 * sigma else None
+
+
+def _spread(calibration: Calibration) -> str | None:
+    said = (
+        f"the corners of a pair are off together, not by noise; the sigmas are {calibration.spread:.2g} times as large "
+        "for it. Did the board move or bend, did a lens refocus, or does its model not fit? Hold still, lock the focus"
+    )
+    return said if calibration.spread > 1 else None
 
 
 def _print(calibration: Calibration) -> str | None:
