@@ -1,11 +1,10 @@
 """Pairs of board images in, a calibrated rig and its held-out errors out.
 
-1. Correct boards named in another order, start from nothing (``start.py``), reject gross errors (``screen.py``). 2.
-Adjust cameras, relative pose, poses of the board and the board itself jointly. A print is distorted and bowed by a
-tenth
-   of a millimetre, several times the error of a good corner; if it is not estimated, it biases the cameras (Strobl and
-   Hirzinger, ICCV workshops 2011). A board in the hand before cameras that are not synchronised moves between the
-   exposures of a pair; where that is significant, every pair has a motion of its own (``motion.py``).
+1. Correct boards named in another order, start from nothing (``start.py``), reject gross errors (``screen.py``).
+2. Adjust cameras, relative pose, poses of the board and the board itself jointly. A print is distorted and bowed by a
+   tenth of a millimetre; if it is not estimated, it biases the cameras (Strobl and Hirzinger, ICCV workshops 2011). A
+   board in the hand before cameras that are not synchronised moves between the exposures of a pair; where that is
+   significant, every pair has a motion of its own (``motion.py``).
 3. Choose the distortion model by held-out error, never by the fit (:class:`LensModelSearch`).
 
 The noise of the corners, the tolerance of the print and the motion between the exposures are estimated together with

@@ -90,8 +90,7 @@ def pair_errors(
             float(shot),
             float(np.sqrt((epipolar**2).mean())),
             float(np.sqrt((gap**2).sum(axis=1).mean())),
-            fit_scale(board, p),
-            float(len(good)),
+            *(fit_scale(board, p), float(len(good))),
             *_normalised(transform(T_found, body), p, cov_p, by_rig, cov_rig),
         )
         rows.append(row)
@@ -161,11 +160,6 @@ def require_choice(folds: int, models: tuple[str, ...] = MODELS) -> None:
         raise InputError(f"models is {models!r}: expected some of {MODELS}")
 
 
-def folds_of(count: int, folds: int) -> list[NDArray[np.intp]]:
-    """Split ``count`` shots into folds of neighbours apart: shot j goes to fold j mod folds."""
-    return [np.flatnonzero(np.arange(count) % folds == k) for k in range(folds)]
-
-
 def cross_validate(
     fit: Callable[[NDArray[np.intp]], tuple[StereoRig, Array, ExposureMotion | None]],
     drawing: Array,
@@ -181,7 +175,8 @@ def cross_validate(
     :func:`pair_errors`. Returns the held-out errors of every shot.
     """
     parts = []
-    for held in folds_of(observations.shot_count, folds):
+    for first in range(folds):
+        held = np.arange(first, observations.shot_count, folds)
         rig, estimated, motion = fit(np.setdiff1d(np.arange(observations.shot_count), held))
         errors = pair_errors(
             rig, drawing, observations.shots(held), estimated=estimated, motion=motion, disc_radius_m=disc_radius_m
@@ -344,8 +339,7 @@ def concluded(
         rig = replace(rig, cov=rig.cov + change.off.T @ change.off)
     larger = 1.0
     if change is None and not moving and (added := spread_of(model, solution, observations, len(rig.cov))) is not None:
-        free = np.diag(rig.cov) > 0
-        larger = float(np.sqrt(1 + np.mean(np.diag(added)[free] / np.diag(rig.cov)[free])))
+        larger = float(np.sqrt(1 + (np.diag(added) / np.maximum(np.diag(rig.cov), 1e-300)).max()))
         rig = replace(rig, cov=rig.cov + added)
     found = model.body(state.shape)[: len(body.points)]
     found = transform(fit_rigid(found, body.points), found)

@@ -86,7 +86,7 @@ class Calibration(Record):
     disc_radius_m: float | None = None
     recorded: bool = False  #: whether the pairs had times, so that the skew of the cameras was looked for
     change: CameraChange | None = None  #: how the cameras changed while the pairs were taken; None where they did not
-    spread: float = 1.0  #: how many times as large its sigmas are as corners of a pair are off together, RMS
+    spread: float = 1.0  #: how many times as large sigmas are at most as corners of a pair are off together
 
     def __repr__(self) -> str:
         """Return the errors on pairs left out of the fit, px and mm."""

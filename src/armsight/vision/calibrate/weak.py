@@ -129,7 +129,7 @@ def printed_longer(calibration: Calibration) -> tuple[float, float, float] | Non
 
 def _spread(calibration: Calibration) -> str | None:
     said = (
-        f"the corners of a pair are off together, not by noise; the sigmas are {calibration.spread:.2g} times as large "
+        f"the corners of a pair are off together, not by noise; sigmas are up to {calibration.spread:.2g} times as large "
         "for it. Did the board move or bend, did a lens refocus, or does its model not fit? Hold still, lock the focus"
     )
     return said if calibration.spread > 1 else None
