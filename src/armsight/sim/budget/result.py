@@ -189,11 +189,13 @@ class RigBudget(Record):
         plan, (speed, rotation), low = self.plan, self.plan.speeds, 0.0
         if self.reached(self.moving) or not self.reached(self.at_rest):
             return low
-        high = speed  # planned again at each: faster, more shots are lost, and the errors are of the others
-        while high > _LEAST_OF * speed and (now := float(f"{(low + high) / 2:.2g}")) not in (low, high):
+        high, now = speed, speed / max(self.moving.over(*plan.requested or ()), 1.0)
+        # Planned again at each: faster, more shots are lost, the errors are of the others, and planning takes longer.
+        while high > _LEAST_OF * speed and (now := float(f"{now:.2g}")) not in (low, high):
             at = f"{now:f}m/s,{math.degrees(rotation * now / speed):f}deg/s"
             reached = self.reached(Accuracy.of(planned(other := replace(plan, speed=at)), other, moving=True))
             low, high = (now, high) if reached else (low, now)
+            now = min((low + high) / 2, 1.2 * low) if low else high / 1.5
         return low
 
     def level_m(self, **which: Any) -> float:  # noqa: ANN401
