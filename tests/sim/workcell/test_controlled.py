@@ -5,13 +5,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from armsight.app.demo.demo import motion_text
-from armsight.app.run.motion_file import read_motions
+from armsight.app.demo.demo import motions_of
 from armsight.data import JointCommand
 from armsight.errors import InputError
 from armsight.loop.servo import JointLoops, LoopTiming, PoseServo
 from armsight.robot.arm_file import open_arm
 from armsight.robot.board_registry import slowed
+from armsight.robot.models import MODELS
 from armsight.robot.trajectories import point_to_point
 from armsight.sim.workcell.arm import PRESETS
 from armsight.sim.workcell.controlled import CONTROLLED, ZERO_DEG, standing
@@ -48,15 +48,14 @@ def test_the_same_seed_is_the_same_arm_and_a_nominal_one_has_true_zeros():
     np.testing.assert_array_equal(true.path[:, :5], true.path[:, 5:])
 
 
-@pytest.mark.parametrize("name", [*CONTROLLED, "ur5e"])
+@pytest.mark.parametrize("name", [name for name in MODELS if open_arm(name).joints == 6 or name in CONTROLLED])
 def test_poses_and_motions_of_the_demo_are_within_reach(name, tmp_path):
     own = CONTROLLED.get(name)
     model = standing(open_arm(name))
     model = model if own is None else slowed(model, own.board)
-    text = motion_text(model, workcell_poses(model, default=False), quick=True, slow=True)
-    (tmp_path / "motion.toml").write_text(text.replace('"circle"', '"home"').split("center_mm")[0])
-    plan = read_motions(model, tmp_path / "motion.toml")
-    assert [motion.kind for motion in plan.motions][:2] == ["joints", "line"]
+    poses = workcell_poses(model, default=False)
+    _, plan = motions_of(model, poses, tmp_path / "motion.toml", quick=True, slow=True)
+    assert [motion.kind for motion in plan.motions] == ["joints", "line", "circle"]
 
 
 def test_an_arm_that_the_workcell_does_not_take_is_one_line():

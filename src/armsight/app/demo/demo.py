@@ -25,12 +25,12 @@ from armsight.app.run.devices import setup_of, simulated_unit
 from armsight.app.run.experiment import RunResult, closed_on, drive, prior_of, timing
 from armsight.app.run.folder import finish, make_room, open_folder, run_in
 from armsight.app.run.metrics import Study, track_metrics
-from armsight.app.run.motion_file import DEFAULT_MOTION, QUICK, read_motions
+from armsight.app.run.motion_file import DEFAULT_MOTION, QUICK, MotionPlan, read_motions
 from armsight.app.run.tracks import Tracks
 from armsight.app.show.report import Report
 from armsight.app.stream.mcap_file import REFERENCES
 from armsight.data import Array, PoseEstimate, Record, Shot
-from armsight.errors import ArmsightError
+from armsight.errors import ArmsightError, InputError
 from armsight.files import read_text, write_text
 from armsight.geometry.pose import inverse, log_se3, pose
 from armsight.geometry.rotation import exp_so3
@@ -290,6 +290,7 @@ _CAMERAS, _SLOW_CAMERAS = "1280x720@60", "1280x720@30"
 _REST_S = 5.0
 #: How far the line of another arm goes, of the way between its outermost poses, and its circle's radius, of its size.
 _LINE, _RADIUS = 0.7, 0.1
+_SIZES = (1.0, 0.6, 0.35, 0.2)  # shares of both that are tried; half: less of the arm moves, double: limits
 
 
 @dataclass(frozen=True)
@@ -322,12 +323,14 @@ def run_demo(demo: Demo, *, progress: Progress = lambda line: None) -> Report:
     cameras = demo.cameras or (_SLOW_CAMERAS if demo.model in CONTROLLED else _CAMERAS)
     with open_folder(folder, simulated=True), _workcell(demo, cameras) as workcell:
         own = demo.model != DEFAULT_ARM
-        motion = _MOTIONS[demo.quick].read_text(encoding="utf-8")
-        if own:
-            motion = motion_text(workcell.model, workcell.poses, quick=demo.quick, slow=workcell.link is None)
         make_room(folder)
-        write_text(folder / "motion.toml", motion)
-        plan = read_motions(workcell.model, folder / "motion.toml")
+        if own:
+            model, slow = workcell.model, workcell.link is None
+            motion, plan = motions_of(model, workcell.poses, folder / "motion.toml", quick=demo.quick, slow=slow)
+        else:
+            motion = _MOTIONS[demo.quick].read_text(encoding="utf-8")
+            write_text(folder / "motion.toml", motion)
+            plan = read_motions(workcell.model, folder / "motion.toml")
         progress("rendering the calibration target")
         shots = _ahead(workcell.board_shots(pairs))
         first = next(shots)  # begun before, the second process would take a core from those that render it
@@ -390,15 +393,26 @@ def _calibrated(
     return calibrate_boards(board, pairs, sizes, progress=progress, second=second)
 
 
-def motion_text(model: Arm, poses: Array, *, quick: bool, slow: bool) -> str:
+def motions_of(model: Arm, poses: Array, path: Path, *, quick: bool, slow: bool) -> tuple[str, MotionPlan]:
+    """Write and plan :func:`motion_text`, line and circle as large as the arm's limits allow; else InputError."""
+    for size in _SIZES:
+        write_text(path, text := motion_text(model, poses, quick=quick, slow=slow, size=size))
+        try:
+            return text, read_motions(model, path)
+        except InputError as error:
+            reason = error
+    raise reason
+
+
+def motion_text(model: Arm, poses: Array, *, quick: bool, slow: bool, size: float = 1.0) -> str:
     """Return motions of an arm before the workcell's cameras as a motion file: poses (5, n), rad, a line, a circle.
 
-    ``quick``: one pose alone; ``slow``: its controller takes long to come to rest.
+    ``quick``: one pose alone; ``slow``: its controller takes long to come to rest; ``size``: of line and circle.
     """
     rest = f"rest_s = {_REST_S}\n" if slow else ""
     first, second = (model.forward(q)[:3, 3] for q in poses[:2])
-    step = 1e3 * _LINE * (second - first)
-    center = 1e3 * (first + np.array([0.0, 0.0, -_RADIUS * model.size_m])) + step
+    step = 1e3 * size * _LINE * (second - first)
+    center = 1e3 * (first + np.array([0.0, 0.0, -size * _RADIUS * model.size_m])) + step
     axis = np.round(np.cross(second - first, [0.0, 0.0, 1.0]) / np.linalg.norm(second - first), 3)
     motions = [
         f'kind = "joints"\nname = "pose {n}"\nq_deg = {np.degrees(q).round(2).tolist()}\n{rest}'

@@ -149,6 +149,13 @@ def up(value: float) -> str:
     return f"{math.ceil(value / unit - 1e-9) * unit:.2g}"
 
 
+def _plain(value: Any, kind: type) -> Any:  # noqa: ANN401
+    """Return a path as text, a number of NumPy as Python's, and a whole one as int where that is the kind."""
+    value = fspath(value) if isinstance(value, PathLike) else value
+    value = value.item() if isinstance(value, np.generic) else value
+    return int(value) if kind is int and isinstance(value, float) and value.is_integer() else value
+
+
 @dataclass(frozen=True)
 class RigPlan:
     """A rig that is not built yet, and what it is to measure. Lengths m, angles and shares as the names say."""
@@ -209,10 +216,7 @@ class RigPlan:
             of, kind = f"{path}: " if key in values else "", KEYS.get(key)
             if kind is None:
                 raise InputError(f"{of}unknown key {key!r}{meant(key, KEYS)}")
-            value = fspath(value) if isinstance(value, PathLike) else value
-            value = value.item() if isinstance(value, np.generic) else value
-            whole = kind is int and isinstance(value, float) and value.is_integer()
-            given[key] = value = int(value) if whole else value
+            given[key] = value = _plain(value, kind)
             if not isinstance(value, (int, float) if kind is float else kind) or isinstance(value, bool):
                 raise InputError(f"{of}{key} must be {_KINDS[kind]}, got {value!r}")
         plan = RigPlan(**given, named=tuple(given))
