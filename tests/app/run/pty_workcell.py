@@ -2,8 +2,8 @@
 
 The board's clock goes on by itself, a millisecond at a time and not faster than real time; where the computer is loaded
 it goes slower, and the host's waits with it. It does not wait for what the host computes: what the host does not read in
-time is lost, and a host that is silent for SILENT_TICKS stops the arm. That is four times what boards usually allow; the
-calibrations take longer still. The host's clock is tied to the board's.
+time is lost, and a host that is silent for SILENT_TICKS stops the arm. That is 15 times what boards usually allow, as the
+simulation and other tests take time from the host; the calibrations take longer. The host's clock is tied to the board's.
 """
 
 import time
@@ -17,7 +17,7 @@ from armsight.sim.workcell.workcell import Workcell
 
 #: The host's clock when the board's is 0, s; by how much it is faster; how far stamps are off, s.
 OFFSET_S, DRIFT, JITTER_S = 12345.678, 50e-6, 2e-4
-SILENT_TICKS = 400
+SILENT_TICKS = 1500
 
 
 class PtyWorkcell(PtyCable):

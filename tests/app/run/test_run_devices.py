@@ -101,7 +101,7 @@ def silent(far):
     """Wait until the board has noticed that nobody is there any more."""
     begin_s = far.workcell.t_s
     while state(far)[0] is not BoardState.HOLDING:
-        assert far.workcell.t_s < begin_s + 2.0, state(far)
+        assert far.workcell.t_s < begin_s + 4.0, state(far)
         threading.Event().wait(0.01)
 
 
