@@ -301,3 +301,11 @@ def test_the_image_has_the_size_that_is_given():
 def test_squares_of_a_board_that_are_too_small_are_squares(board):
     with pytest.raises(InputError, match=rf"^a square of {board} is \d\.\d px, at least 8 are needed"):
         planned(RigPlan(volume="0.1x0.1x0.1m", distance="0.7m", camera="webcam-720p", board=board))
+
+
+def test_a_smaller_aperture_costs_light():
+    def noise_px(**plan):
+        return RigPlan.read("", volume="0.2x0.2x0.1m", distance="0.8m", **plan)._noise_px()["pixel noise"]
+
+    assert noise_px(f_number=2.0) == noise_px()  # the class's
+    assert noise_px(f_number=8.0) > 1.5 * noise_px()

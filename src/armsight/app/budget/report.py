@@ -135,7 +135,7 @@ def _answer(found: RigBudget) -> tuple[Grade, str]:
     ways = [one for one in found.changes if one.change != AT_REST and one.change.split(":")[0] not in catalogue()]
     to_do = [min(ways, key=lambda one: one.level_m).change] if ways else []
     to_do += [f"measure slower than {found.slower_m_s:.2g} m/s"] if found.slower_m_s else []
-    costs += f": {', or '.join(to_do)}" if to_do else ""
+    costs += f"; what helps most: {', or '.join(to_do)}" if to_do else ""
     if requested is None:
         return "fair", f"{said}.{costs}."
     asked = f"{1e3 * requested[0]:g} mm" + (f", {math.degrees(requested[1]):g} deg" if requested[1] else "")

@@ -296,10 +296,8 @@ def lacking(
 
     Arguments as of :func:`change_at`. The residuals' score says by how much any reading, times a number, moves a joint.
     """
-    found, lengths = (
-        [],
-        np.array([p.kind in ("a", "d") for p in model.parameters]) & free & (abs(model.nominal()) > 1e-3),
-    )
+    found = list[str]()
+    lengths = np.array([p.kind in ("a", "d") for p in model.parameters]) & free & (abs(model.nominal()) > 1e-3)
     nominal = model.nominal()[lengths]
     if len(nominal) > 2:
         (scale,), (sigma,) = regression(nominal[:, None], x[lengths] - nominal, None)

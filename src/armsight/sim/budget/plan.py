@@ -338,9 +338,11 @@ class RigPlan:
 
     @cached_property
     def pipeline(self) -> CameraPipeline:
-        """The camera's stages, its exposure as planned."""
+        """The camera's stages, its exposure as planned, and its light by the aperture where that is not the class's."""
         found = CameraPipeline.load(self.preset or self.cameras.preset)
-        return found if self.exposure_ms < 0 else found.exposed_for(1e-3 * self.exposure_ms)
+        found = found if self.exposure_ms < 0 else found.exposed_for(1e-3 * self.exposure_ms)
+        share = (self.cameras.f_number / (self.f_number or self.cameras.f_number)) ** 2
+        return replace(found, sensor=found.sensor and replace(found.sensor, white_e=share * found.sensor.white_e))
 
     @cached_property
     def timing(self) -> dict[str, float]:

@@ -300,9 +300,8 @@ def _of_camera(plan: RigPlan, name: str) -> dict[str, Any]:
 def loss(plan: RigPlan) -> float:
     """Return what 95 % are within in motion over what was requested, or m; infinity for what cannot be built."""
     try:
-        return Accuracy.of(planned(replace(plan)), plan, moving=True).over(
-            *plan.requested or ()
-        )  # a key that holds no views
+        found = planned(replace(plan))  # the key, kept, holds no views
+        return Accuracy.of(found, plan, moving=True).over(*plan.requested or ())
     except InputError:
         return math.inf
 
