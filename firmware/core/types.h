@@ -448,7 +448,7 @@ typedef struct motor_state {
     float known_kk[MOTOR_KNOWN]; /* and its variance */
     uint32_t known;              /* how many of them there were */
     uint32_t weakened;           /* the faults of a constant that by these is less than it was; 0: none */
-    int32_t window_side;     /* which way the last one went, 1 or -1; 0: not known where in its backlash it ended */
+    int32_t window_side;     /* which way the last one went, 1 or -1, by a negative torque 2 or -2; 0: not known where in its backlash it ended */
     uint32_t sampled;        /* samples taken */
     float trust;             /* of the speed limit: what the joint may use; 1 once motor and reading went the same way */
     float way_read_rad;      /* the way since the joint last rested, by the reading */

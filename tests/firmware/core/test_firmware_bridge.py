@@ -105,6 +105,19 @@ def test_a_moving_joint_whose_bridge_is_stuck_at_an_emergency_stop_is_braked(mot
         assert abs(arm.plant.link[3] - at) < 0.1
 
 
+def test_a_bridge_that_is_stuck_as_the_stop_comes_is_called_nothing_else(motors, library):
+    for seed in SEEDS:
+        arm = motors.drawn_arm(library, seed)
+        arm.enable()
+        arm.rest(400)
+        motors.until_moving(arm, 3)
+        arm.plant.stuck[3] = 0.7
+        arm.tick(4)
+        arm.inputs.stop_pressed = 1
+        arm.tick(12)
+        assert arm.first in ((None, None), (Fault.BRIDGE, 3)), seed
+
+
 @pytest.mark.parametrize(("kind", "named"), [(PotFault.DRIFT, Fault.POT_DRIFT), (None, Fault.CURRENT_SENSOR)])
 def test_a_step_before_a_stop_names_no_fault_once_the_drives_are_on_again(motors, library, kind, named):
     """50 ms after: with a step of late a reading that drifts would be a current sensor."""
@@ -116,7 +129,7 @@ def test_a_step_before_a_stop_names_no_fault_once_the_drives_are_on_again(motors
         arm.plant.stuck[3] = 0.7
         arm.tick(4)
         arm.inputs.stop_pressed = 1
-        arm.tick(3)  # after a fourth one some are named
+        arm.tick(3)  # after a fourth one some bridges are named
         arm.plant.stuck[3], arm.plant.blocked[:] = 0.0, True
         assert arm.tick(90)["windings_shorted"]
         assert arm.core.joint[3].motor.stepped_off
