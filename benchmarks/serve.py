@@ -170,7 +170,7 @@ class Serving:
         return None
 
     def child(self) -> int | None:
-        """Return the process that measures."""
+        """Return the process that measures: the older one, the other waits."""
         children = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children").read_text().split()
         return int(children[0]) if children else None
 

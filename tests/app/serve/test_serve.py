@@ -3,6 +3,7 @@
 import configparser
 import json
 import signal
+import subprocess
 import sys
 import threading
 import time
@@ -24,10 +25,11 @@ SHOT = {"kind": "shot", "status": "ok", "age_s": 0.02, "covariance": [[9e-10, 0,
 #: Sends shots, then fails as its next line of the plan says: `N REASON` (exit 2 after N shots), `N silent`, `N ends`.
 STUB = """
 import json, pathlib, socket, sys, time
+arguments = json.loads(sys.stdin.readline() or sys.exit())
 plan = pathlib.Path("plan"); lines = plan.read_text().splitlines()
 plan.write_text("\\n".join(lines[1:]))
 count, reason = (lines or ["0 ends"])[0].split(" ", 1)
-port = int(sys.argv[-1].rpartition(":")[2])
+port = int(arguments[-1].rpartition(":")[2])
 out = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 for k in range(int(count)):
     shot = json.loads(sys.argv[1]) | ({"status": "missed"} if k == 1 else {})
@@ -67,6 +69,7 @@ def test_each_loss_is_said_once_and_the_return_with_its_tries(serving):
     assert [each["event"] for each in events] == ["measuring", "lost", "lost", "back", "lost", "back", "ended"]
     assert [each.get("why") for each in events[1:3]] == ["camera gone", "board gone"]
     assert (events[3]["tries"], events[5]["tries"]) == (4, 1)
+    assert served._next is None or served._next.poll() is not None  # none waits on
     assert log.count("lost: camera gone; trying again") == 2
     assert log.count("measure: armsight: error: camera gone") <= 2  # at most one for each loss, not for each try
     values = served.values()
@@ -101,6 +104,11 @@ def test_an_interrupt_ends_the_child(serving):
     with pytest.raises(KeyboardInterrupt):
         serving("2 silent")
     assert time.monotonic() - before < service._END_S  # the child was not waited for in vain
+
+
+def test_a_child_that_waits_ends_with_its_service():
+    done = subprocess.run(service._ARMSIGHT, stdin=subprocess.DEVNULL, capture_output=True, check=True)
+    assert (done.stdout, done.stderr) == (b"", b"")
 
 
 def test_a_board_that_is_lost_and_back_is_said_once(tmp_path):

@@ -1,4 +1,4 @@
-"""The child process of a service: started, watched by what it publishes, started again when it was lost; and its pages."""
+"""The child process of a service: started, watched by what it publishes, replaced when it was lost; and its pages."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ _PAUSE_S = 0.5
 
 #: Lines of the child that are remembered; half, double: so much memory.
 _LINES = 1000
-#: What is started; the command and its options follow.
-_ARMSIGHT = (sys.executable, "-P", "-m", "armsight")
+#: What is started, before it is needed; a line of its input has the command and its options.
+_ARMSIGHT = (sys.executable, "-P", "-m", "armsight.app.serve.child")
 #: Lines of the child that only say that it goes on, and those that it also publishes.
 _PROGRESS = re.compile(rf"[a-z ]+: \d+( of \d+)?$|{BOARD}")
 #: Metric -> its kind and what it is, as Prometheus shows it.
@@ -66,6 +66,7 @@ class Service:
         self._config, self._report = config, report
         self._log = _logger(config)
         self._child: subprocess.Popen[bytes] | None = None
+        self._next: subprocess.Popen[bytes] | None = None  # imports, and waits
         self._lines, self._said = set[str](), set[str]()  # of this child, and of all during one loss
         self._last_line = ""
         self._began = self._newest = time.monotonic()
@@ -101,11 +102,15 @@ class Service:
                         raise InputError(self._last_line or "armsight measure ended without a shot")
                     pause = _PAUSE_S if self._lost_since is None else min(2 * pause, self._config.retry_s)
                     self._lost(self._last_line or f"armsight measure ended with {code}")
+                    self._prepare()
                     time.sleep(pause)
             except KeyboardInterrupt:
                 self._event("stopped", "stopped")
                 raise
             finally:
+                if self._next is not None:
+                    self._next.kill()
+                    self._next.communicate()
                 if page is not None:
                     page.close()
                 _close(self._log)
@@ -139,18 +144,19 @@ class Service:
 
     def _one(self, heard: socket.socket) -> int | None:
         """Start the child and listen to it until it ends or falls silent; return its exit code, None where it was ended."""
-        arguments = [*self._config.started(), f"--stream=json+udp:127.0.0.1:{heard.getsockname()[1]}"]
+        arguments = ["measure", *self._config.started(), f"--stream=json+udp:127.0.0.1:{heard.getsockname()[1]}"]
         self._tries, self._last_line, self._lines = self._tries + 1, "", set()
         listener: threading.Thread | None = None
         try:
-            self._child = subprocess.Popen(
-                [*_ARMSIGHT, "measure", *arguments],
-                cwd=self._config.folder,
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.PIPE,
-                start_new_session=True,  # a terminal's Ctrl-C reaches it once, from here
-            )
+            self._prepare()
+            self._child, self._next = self._next, None
+            assert self._child is not None
+            assert self._child.stdin is not None
+            with (
+                suppress(BrokenPipeError),
+                self._child.stdin as line,
+            ):  # one that was killed meanwhile: its code says so
+                line.write(json.dumps(arguments).encode() + b"\n")
             listener = threading.Thread(target=self._listen, args=(self._child,), daemon=True)
             listener.start()
             code = self._heard(heard, self._child)
@@ -173,8 +179,21 @@ class Service:
             limit_s, since = (self._config.stale_s, self._newest) if began else (_BEGIN_S, started)
             if time.monotonic() - since > limit_s:
                 return None
+            if began:
+                self._prepare()
         self._take_all(heard)
         return code
+
+    def _prepare(self) -> None:
+        """Start the next child: it imports, and waits."""
+        self._next = self._next or subprocess.Popen(
+            _ARMSIGHT,
+            cwd=self._config.folder,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            start_new_session=True,  # a terminal's Ctrl-C reaches it once, from here
+        )
 
     def _take_all(self, heard: socket.socket) -> None:
         with suppress(BlockingIOError):

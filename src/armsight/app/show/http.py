@@ -22,6 +22,8 @@ HERE = ("127.0.0.1", "localhost", "::1")
 Answer = tuple[int, str, bytes]
 #: Path -> what answers it; it is given the first value of each key of the query.
 Routes = Mapping[str, Callable[[dict[str, str]], Answer]]
+#: s, between two looks whether to stop; half: more wake-ups, double: the end of a service takes longer.
+_LOOK_S = 0.1
 _HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",
@@ -110,7 +112,7 @@ class Pages:
             ) from None
         self._host = f"[{host}]" if ":" in host else host
         self._server.daemon_threads = True
-        threading.Thread(target=self._server.serve_forever, daemon=True).start()
+        threading.Thread(target=self._server.serve_forever, args=(_LOOK_S,), daemon=True).start()
 
     @property
     def port(self) -> int:
