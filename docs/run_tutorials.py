@@ -37,6 +37,8 @@ PAGES = (
     "tutorials/iso9283_test",
     "arms/so101",
     "arms/ur",
+    "arms/xarm",
+    "arms/franka",
     "arms/another_arm",
 )
 _BLOCK = re.compile(r"(?:<!-- run: (?P<how>\w+) -->\n)?^```console\n(?P<text>.*?)^```$", re.DOTALL | re.MULTILINE)

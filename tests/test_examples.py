@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from armsight import StereoRig
+from armsight import StereoRig, open_arm
 from armsight.sim.recording import Truth
 
 FOLDER = Path(__file__).resolve().parent.parent / "examples"
@@ -105,6 +105,20 @@ def plate_to_print(main, folder, capsys):
     assert (folder / "plate.stl").stat().st_size == 84 + 50 * len(triangles)
 
 
+def poses_without_an_arm(main, folder, capsys):
+    main("xarm7", folder)
+    assert capsys.readouterr().out == "40 poses of a simulated xarm7: joints.csv, poses.csv\n"
+    joints, poses = (np.genfromtxt(folder / f"{name}.csv", delimiter=",", names=True) for name in ("joints", "poses"))
+    assert joints.dtype.names == ("t_s", *(f"q{k}_rad" for k in range(1, 8)))
+    q = np.column_stack([joints[name] for name in joints.dtype.names[1:]])
+    arm = open_arm("xarm7")
+    assert (arm.q_min <= q).all()
+    assert (q <= arm.q_max).all()
+    p_mm = np.column_stack([poses[name] for name in ("x_mm", "y_mm", "z_mm")])
+    moved_mm, nominal_mm = np.ptp(p_mm, axis=0), np.ptp(1e3 * arm.forward(q)[:, :3, 3], axis=0)
+    assert np.linalg.norm(moved_mm) == pytest.approx(np.linalg.norm(nominal_mm), rel=0.2)  # the same motion, rotated
+
+
 #: Number of an example -> what runs it and holds what it prints.
 CHECKS = {
     "01": measure_a_board,
@@ -115,6 +129,7 @@ CHECKS = {
     "06": handeye_for_a_paper,
     "07": recording_into_pandas,
     "08": plate_to_print,
+    "09": poses_without_an_arm,
 }
 
 
