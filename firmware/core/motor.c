@@ -944,18 +944,26 @@ bool motor_disobeys(const motor_state *motor, const motor_config *config, float 
     const float terminal_v = ir_v + emf_v;
     /* The resistance or constant of a motor whose bridge follows may be half of the learnt. */
     const float unsure_v = !off && follows(motor, config) ? 0.5f * (number_size(ir_v) + number_size(emf_v)) : 0.0f;
-    /* Through shorted windings a current of the wrong sign takes as much as the back-EMF. */
-    const bool as_much = !off || number_size(ir_v - emf_v) < INVERTED * number_size(terminal_v);
-    if (number_size(terminal_v - applied_v * per_tick) < STUCK_SUPPLY * supply_v + unsure_v ||
-        (as_much && motor->damping_share == 0.0f &&
+    /* By a current of the wrong sign all of that goes with the duty. */
+    const float otherwise_v = terminal_v - applied_v * per_tick;
+    const bool inverted = number_size(otherwise_v - 2.0f * ir_v) < INVERTED * number_size(otherwise_v);
+    if (number_size(otherwise_v) < STUCK_SUPPLY * supply_v + unsure_v ||
+        (inverted && motor->damping_share == 0.0f &&
          config->resistance_ohm * motor->dither_va < -ANSWER_NONE * (motor->dither_vv + ANSWER_VV))) {
         return false;
     }
     if (off) { /* the current drives it on, or would if nothing held it: shorted windings brake */
-        return terminal_v * ir_v > 0.0f && terminal_v * way_rad > -number_size(terminal_v) * WINDOW_NOISE_RAD;
+        return terminal_v * ir_v > DEAD_SHARE * terminal_v * terminal_v &&
+               terminal_v * way_rad > -number_size(terminal_v) * WINDOW_NOISE_RAD;
     }
     return applied_v * error_rad > 0.0f && way_rad * error_rad < 0.0f && number_size(way_rad) > DISOBEY_RAD &&
            number_size(error_rad) > DISOBEY_OFF_RAD;
+}
+
+bool motor_is_dead(const motor_state *motor, const motor_config *config)
+{
+    const uint32_t at = (motor->sampled - 1u) % MOTOR_SAMPLES;
+    return config->resistance_ohm * number_size(motor->sample_a[at]) < DEAD_SHARE * number_size(motor->sample_v[at]);
 }
 
 #define SWING_TICKS 60u /* in which a swing of 8 Hz and faster changes its side; half: only from 16 Hz on, double:
@@ -1001,7 +1009,10 @@ bool motor_swings_far(motor_state *motor, float off_rad_s, bool known)
 bool motor_stays_fast(motor_state *motor, const motor_config *config, float reading_rad_s)
 {
     const bool alone = motor->doubted != 0u || config->resistance_ohm <= 0.0f || !motor_is_known(motor);
-    const bool fast = number_size(alone ? reading_rad_s : motor->speed_rad_s) > FAST * motor->fastest_rad_s;
+    /* What is before the spring: a load that sinks into it makes no motor faster. */
+    const float before_rad_s = reading_rad_s + motor_twists(motor, motor->last_a) * (float)TICKS_PER_S;
+    const bool fast = number_size(alone ? reading_rad_s : motor->speed_rad_s) > FAST * motor->fastest_rad_s &&
+                      (alone || number_size(before_rad_s) > motor->fastest_rad_s);
     motor->fast_ticks = fast ? number_add(motor->fast_ticks, WATCH_TICKS) : 0u;
     return motor->fast_ticks >= FAST_TICKS + motor->swing_ticks;
 }

@@ -30,6 +30,12 @@ static inline void motor_through(motor_state *motor, const transmission_config *
     }
 }
 
+/* Return by how much more the current twists the transmission in a tick. */
+static inline float motor_twists(const motor_state *motor, float current_a)
+{
+    return motor->twist_share * (motor->twist_rad_per_a * current_a - motor->twist_rad);
+}
+
 /* Say that in the tick that is measured next a driver that limits the current may not put the whole duty out. */
 void motor_limit(motor_state *motor);
 
@@ -133,6 +139,9 @@ bool motor_may_have_stepped(const motor_state *motor);
 /* Return whether for 16 ms a motor has not done what was put out to it, and by reading and current another voltage drives
  * it: against the way error_rad that it is driven, or at all where nothing was put out and shorted windings brake. */
 bool motor_disobeys(const motor_state *motor, const motor_config *config, float supply_v, float error_rad);
+
+/* Return whether no current flows that the voltage must drive: a broken lead, and its load drives the joint. */
+bool motor_is_dead(const motor_state *motor, const motor_config *config);
 
 #define MOTOR_SWING 0.2f /* of the speed limit: so far from the reference's speed a swing goes at least; half: elastic joints alarm, double: slow swings are not seen */
 

@@ -27,8 +27,7 @@ float pid_measure_by_motor(joint_state *joint, const joint_gains *gains)
         joint->held_rad = pid->measured_rad;
         joint->held_rad_s = pid->speed_rad_s;
     }
-    const float twist_rad = joint->motor.twist_rad_per_a * joint->current_a;
-    joint->motor.twist_rad += joint->motor.twist_share * (twist_rad - joint->motor.twist_rad);
+    joint->motor.twist_rad += motor_twists(&joint->motor, joint->current_a);
     return joint->pot.angle_rad + joint->motor.twist_rad;
 }
 

@@ -400,8 +400,9 @@ static void name_suspect(core_state *core, joint_state *joint, const joint_confi
     motor_state *motor = &joint->motor;
     const bool stepped = motor_stepped(motor);
     if (motor_is_stuck(motor, &config->motor, core->supply_v, &core->sums) ||
-        (stepped && motor->trust == 1.0f && motor_disobeys(motor, &config->motor, core->supply_v, joint->pid.error_rad))) {
-        blame(core, joint, FAULT_BRIDGE, i);
+        ((stepped || motor->doubted != 0u) && motor->trust == 1.0f && motor_disobeys(motor, &config->motor, core->supply_v, joint->pid.error_rad))) {
+        blame(core, joint, motor_is_dead(motor, &config->motor) ? FAULT_CURRENT_SENSOR : FAULT_BRIDGE, i);
+        core->state = STATE_FAULTED; /* nothing holds it but a brake */
         return;
     }
     if (joint->suspect == FAULT_NONE) {
