@@ -16,7 +16,7 @@ from collections import Counter, defaultdict
 
 import numpy as np
 
-from board_arms import COUNTS_PER_RAD, NAMED_TICKS, PERIOD_TICKS, Fault, c, opened
+from board_arms import NAMED_TICKS, PERIOD_TICKS, Fault, c, opened
 from board_motors import ASLEEP_MS, SPEED, drawn_arm, until_moving
 
 POTS = {fault for fault in Fault if fault.name.startswith("POT_")}
@@ -66,7 +66,7 @@ class Broken:
 class HalfBridgeReversed(Broken):
     """The PWM of one half-bridge has the wrong sign: one direction of duty drives the other way."""
 
-    accepted = {Fault.BRIDGE}  # or silence: a direction that is not used shows nothing
+    accepted = frozenset({Fault.BRIDGE})  # or silence: a direction that is not used shows nothing
 
     def draw(self):
         self.sign = self.rng.choice([-1, 1])
@@ -79,7 +79,7 @@ class HalfBridgeReversed(Broken):
 class HalfBridgeDead(HalfBridgeReversed):
     """One half-bridge never switches: one direction of duty drives nothing."""
 
-    accepted = {Fault.BRIDGE, Fault.CURRENT_SENSOR}
+    accepted = frozenset({Fault.BRIDGE, Fault.CURRENT_SENSOR})
 
     def drives(self, outputs):
         if outputs.duty[self.joint] * self.sign > 0:
@@ -87,9 +87,9 @@ class HalfBridgeDead(HalfBridgeReversed):
 
 
 class BridgeLate(Broken):
-    """A driver that puts out what it was told 4 to 10 ms ago."""
+    """A driver that puts out the duty of 4 to 10 ms ago."""
 
-    accepted = {Fault.BRIDGE, Fault.OSCILLATION, Fault.CURRENT_SENSOR}
+    accepted = frozenset({Fault.BRIDGE, Fault.OSCILLATION, Fault.CURRENT_SENSOR})
 
     def draw(self):
         self.queue = [0.0] * int(self.rng.integers(4, 11))
@@ -102,7 +102,7 @@ class BridgeLate(Broken):
 class WiperLifts(Broken):
     """The wiper loses its track over 0.01 to 0.1 rad: a pull-up lifts the reading."""
 
-    accepted = {Fault.POT_OPEN, Fault.POT_JUMP}
+    accepted = frozenset({Fault.POT_OPEN, Fault.POT_JUMP})
 
     def draw(self):
         self.at, self.half = self.rad + self.rng.uniform(-0.3, 0.3), self.rng.uniform(0.005, 0.05)
@@ -159,7 +159,7 @@ class BitStuck(Broken):
 class NoiseOfCurrent(Broken):
     """The reading's noise grows with the motor's current: 30 to 150 counts an ampere."""
 
-    accepted = {*POTS, Fault.OSCILLATION}
+    accepted = frozenset({*POTS, Fault.OSCILLATION})
 
     def draw(self):
         self.per_a = self.rng.uniform(30, 150)
@@ -172,7 +172,7 @@ class NoiseOfCurrent(Broken):
 class GroundShifts(Broken):
     """The reading moves with the motor's current: 100 to 400 counts an ampere, a ground lead shared."""
 
-    accepted = {*POTS, Fault.OSCILLATION, Fault.FOLLOWING}
+    accepted = frozenset({*POTS, Fault.OSCILLATION, Fault.FOLLOWING})
 
     def draw(self):
         self.per_a = self.rng.choice([-1, 1]) * self.rng.uniform(100, 400)
@@ -181,10 +181,10 @@ class GroundShifts(Broken):
         self.put(inputs, inputs.counts[self.joint] + self.per_a * float(self.plant._current_a[self.joint]))
 
 
-class SupplySags(Broken):
+class SupplyWeak(Broken):
     """A supply of 0.2 to 1 ohm behind its sensor, under the load of all joints."""
 
-    accepted = {Fault.SUPPLY_LOW, Fault.OVERLOAD}
+    accepted = frozenset({Fault.SUPPLY_LOW, Fault.OVERLOAD})
 
     def draw(self):
         self.ohm, self.volts = self.rng.uniform(0.2, 1.0), self.plant.supply_mv * 1e-3
@@ -198,7 +198,7 @@ class SupplySags(Broken):
 class SupplySensorOff(Broken):
     """The supply's sensor is off by 10 to 25 %."""
 
-    accepted = {Fault.SUPPLY_LOW, Fault.SUPPLY_HIGH, Fault.CURRENT_SENSOR, Fault.MOTOR, Fault.POT_SCALE}
+    accepted = frozenset({Fault.SUPPLY_LOW, Fault.SUPPLY_HIGH, Fault.CURRENT_SENSOR, Fault.MOTOR, Fault.POT_SCALE})
 
     def draw(self):
         self.gain = 1 + self.rng.choice([-1, 1]) * self.rng.uniform(0.1, 0.25)
@@ -210,7 +210,7 @@ class SupplySensorOff(Broken):
 class ToothMissing(Broken):
     """Over 0.03 to 0.08 rad of the motor nothing drives the joint: its gear has a tooth less."""
 
-    accepted = {*POTS, *LOADS}  # what the motor does alone cannot be told from a reading that slips
+    accepted = frozenset({*POTS, *LOADS})  # what the motor does alone cannot be distinguished from a reading that slips
 
     def draw(self):
         self.wide, self.at = self.rng.uniform(0.03, 0.08), self.rad + self.rng.uniform(-0.3, 0.3)
@@ -237,7 +237,7 @@ class BrakeDrags(Broken):
 class Cogs(Broken):
     """A bad bearing: 0.3 to 0.8 N m that change their sign each 0.02 to 0.1 rad."""
 
-    accepted = {*LOADS, Fault.OSCILLATION}
+    accepted = frozenset({*LOADS, Fault.OSCILLATION})
 
     def draw(self):
         self.n_m, self.wide = self.rng.uniform(0.3, 0.8), self.rng.uniform(0.02, 0.1)
@@ -249,7 +249,7 @@ class Cogs(Broken):
 class CurrentSaturates(Broken):
     """The current's sensor shows at most 0.2 to 1 A."""
 
-    accepted = {Fault.CURRENT_SENSOR}
+    accepted = frozenset({Fault.CURRENT_SENSOR})
 
     def draw(self):
         self.most_ma = round(self.rng.uniform(200, 1000))
@@ -261,7 +261,7 @@ class CurrentSaturates(Broken):
 class CurrentLags(Broken):
     """The current's sensor is filtered by 5 to 20 ms."""
 
-    accepted = {Fault.CURRENT_SENSOR}
+    accepted = frozenset({Fault.CURRENT_SENSOR})
 
     def draw(self):
         self.ticks, self.seen = self.rng.uniform(5, 20), 0.0
@@ -274,7 +274,7 @@ class CurrentLags(Broken):
 class CurrentOneWay(Broken):
     """The current's sensor shows one direction only."""
 
-    accepted = {Fault.CURRENT_SENSOR}
+    accepted = frozenset({Fault.CURRENT_SENSOR})
 
     def draw(self):
         self.sign = int(self.rng.choice([-1, 1]))
@@ -286,7 +286,7 @@ class CurrentOneWay(Broken):
 class CurrentFrozen(Broken):
     """The current's sensor stays at what it showed."""
 
-    accepted, must = {Fault.CURRENT_SENSOR}, True
+    accepted, must = frozenset({Fault.CURRENT_SENSOR}), True
 
     def draw(self):
         self.seen = None
@@ -299,7 +299,7 @@ class CurrentFrozen(Broken):
 class BrushLifts(Broken):
     """A brush that loses its contact for 1 to 4 ms every 10 to 40 ms."""
 
-    accepted = {Fault.MOTOR, Fault.CURRENT_SENSOR}
+    accepted = frozenset({Fault.MOTOR, Fault.CURRENT_SENSOR})
 
     def draw(self):
         self.ohm, self.left, self.lifted = float(self.model[0, self.joint]), 0, False
@@ -315,7 +315,7 @@ class BrushLifts(Broken):
 class LeadBroken(Broken):
     """A lead of the motor breaks."""
 
-    accepted, must = {Fault.CURRENT_SENSOR, Fault.MOTOR}, True
+    accepted, must = frozenset({Fault.CURRENT_SENSOR, Fault.MOTOR}), True
 
     def drives(self, outputs):
         self.model[0, self.joint] = 1e6
@@ -324,7 +324,7 @@ class LeadBroken(Broken):
 class MagnetsFade(Broken):
     """The motor's constant fades to 0.6 within 4 s."""
 
-    accepted = {Fault.MOTOR, *LOADS}
+    accepted = frozenset({Fault.MOTOR, *LOADS})
 
     def draw(self):
         self.constant, self.left = float(self.model[1, self.joint]), 1.0
@@ -337,7 +337,7 @@ class MagnetsFade(Broken):
 class StreamStops(Broken):
     """The host falls silent at full speed."""
 
-    accepted, must = {Fault.HOST_SILENT}, True
+    accepted, must = frozenset({Fault.HOST_SILENT}), True
 
     def reads(self, inputs):
         inputs.command.kind = c.COMMAND_NONE
@@ -346,7 +346,7 @@ class StreamStops(Broken):
 class StreamFreezes(Broken):
     """The host sends its last motion command again and again."""
 
-    accepted = {Fault.HOST_SILENT}
+    accepted = frozenset({Fault.HOST_SILENT})
 
     def draw(self):
         self.last = None
@@ -437,8 +437,13 @@ def main():
                 if result not in ("named", "beside") or on:
                     wrong[shown].append(seed)
             total += results
-            line = f"{kind + (' moving' if moving else ''):28}" + ", ".join(f"{k} {n}" for k, n in results.most_common())
-            print(f"{line}; fast {max(fasts):.2f}, ran {ran}, ms {np.median(lates) if lates else float('nan'):.0f}; ", end="")
+            line = f"{kind + (' moving' if moving else ''):28}" + ", ".join(
+                f"{k} {n}" for k, n in results.most_common()
+            )
+            print(
+                f"{line}; fast {max(fasts):.2f}, ran {ran}, ms {np.median(lates) if lates else float('nan'):.0f}; ",
+                end="",
+            )
             print(", ".join(f"{k} {n}" for k, n in codes.most_common()), end="")
             print("".join(f"; {k}: {s[:3]}" for k, s in wrong.items()), flush=True)
     print(dict(total))

@@ -15,16 +15,25 @@ FOLDER = Path(__file__).resolve().parents[3] / "benchmarks"
 SEEDS = range(800, 803)
 
 
-@pytest.fixture(scope="module")
-def motors():
-    """The benchmark's module."""
+def benchmark(name):
+    """Return a benchmark's module."""
     sys.path.insert(0, str(FOLDER))
-    spec = importlib.util.spec_from_file_location("board_motors", FOLDER / "board_motors.py")
+    spec = importlib.util.spec_from_file_location(name, FOLDER / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
     spec.loader.exec_module(module)
     sys.path.remove(str(FOLDER))
     return module
+
+
+@pytest.fixture(scope="module")
+def motors():
+    return benchmark("board_motors")
+
+
+@pytest.fixture(scope="module")
+def unforeseen():
+    return benchmark("board_unforeseen")
 
 
 def at_rest(motors, library, seed, *, brake=0.0):
@@ -49,6 +58,15 @@ def test_a_bridge_that_drives_by_itself_puts_all_drives_to_sleep(motors, library
         assert arm.first == (Fault.BRIDGE, 3)
         assert asleep(arm)
         assert arm.out[0]["state"] == BoardState.FAULTED
+
+
+@pytest.mark.parametrize(("kind", "code"), [("HalfBridgeReversed", "BRIDGE"), ("LeadBroken", "CURRENT_SENSOR")])
+def test_what_moves_against_its_duty_is_named_and_driven_no_more(unforeseen, library, kind, code):
+    """That needs no step of late, and without a current it is no bridge."""
+    for seed in (5100015300, 5100015591, 5100015882):
+        result, shown, _, late, ran = unforeseen.case(library, seed, kind, False)
+        assert (result, shown.split("+")[0], ran) == ("named", code, False)
+        assert late < 300
 
 
 @pytest.mark.parametrize("share", [-1.0, 0.4])
