@@ -18,8 +18,8 @@ typedef struct board_description {
     void (*sense)(core_inputs *inputs);
 
     /* Tick. Put the duties to the motors. With drives_on 0 and windings_shorted not 0 keep the bridges awake at duty 0:
-     * both ends of a winding low, the motor brakes itself. With both 0 switch the drivers off. Release the brakes, where
-     * there are any, while brakes_open is not 0. */
+     * both ends of a winding low, the motor brakes itself. With both 0 switch the drivers off. Release the brakes,
+     * where there are any, while brakes_open is not 0. */
     void (*drive)(const core_outputs *outputs);
 
     /* Tick, once each time it ran to its end. */

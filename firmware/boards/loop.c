@@ -40,7 +40,8 @@ void loop_start(board_loop *loop, const board_description *board)
     memset(loop, 0, sizeof *loop); /* a compound literal may take its size of stack */
     loop->board = board;
     uint32_t source = load(loop, &config);
-    if (!suits(&board->abilities, &config)) { /* written by the firmware of another board, or the factory's six joints */
+    if (!suits(&board->abilities, &config)) { /* written by the firmware of another board, or the factory's six
+                                                 joints */
         config_factory(&config);
         config.joint_count = board->abilities.joints;
         source = CONFIG_FACTORY;

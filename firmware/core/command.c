@@ -62,7 +62,8 @@ static uint32_t enable(core_state *core, bool inward)
     for (uint32_t i = 0u; i < core->config.joint_count; i++) {
         const transmission_config *between = &core->config.joint[i].transmission;
         core->by_motor |= between->twist_rad_per_a + between->damping_share > 0.0f ? 1u : 0u;
-        if (!held || (core->joint[i].released | core->joint[i].motor.alone) != 0u) { /* what is held stays where it is held */
+        if (!held || (core->joint[i].released | core->joint[i].motor.alone) != 0u) {
+            /* what is held stays where it is held */
             start_joint(&core->joint[i], &core->config.joint[i], core->config.supply_nominal_mv, i);
             motor_through(&core->joint[i].motor, between);
         }

@@ -7,7 +7,8 @@
 
 _Static_assert(sizeof(pot_config) == 2u * (POT_NODES + 3u) + 4u * (POT_NODES + 4u), "pot_config has a hole");
 _Static_assert(sizeof(encoder_config) == 24u, "encoder_config has a hole");
-_Static_assert(offsetof(joint_config, transmission) + 12u == sizeof(joint_config), "a new joint only has more at its end");
+_Static_assert(offsetof(joint_config, transmission) + 12u == sizeof(joint_config),
+               "a new joint only has more at its end");
 _Static_assert(offsetof(config_copy, crc) == sizeof(config_copy) - sizeof(uint32_t), "config_copy has a hole");
 
 uint32_t config_crc_on(uint32_t crc, const void *bytes, uint32_t length)
@@ -102,7 +103,8 @@ static bool table_is_valid(const pot_config *pot)
 static bool encoder_is_valid(const encoder_config *encoder)
 {
     const bool quadrature = encoder->sensor == SENSOR_QUADRATURE;
-    const bool placed = quadrature ? encoder->input >= 1u && encoder->input <= JOINTS : encoder->zero_counts < ENCODER_REV;
+    const bool placed =
+        quadrature ? encoder->input >= 1u && encoder->input <= JOINTS : encoder->zero_counts < ENCODER_REV;
     return encoder->sensor <= SENSOR_ABSOLUTE && placed && number_within(encoder->counts_per_rev, 16.0f, 1e7f) &&
            (encoder->direction == 1 || encoder->direction == -1) && number_within(encoder->home_rad, -13.0f, 13.0f);
 }
@@ -110,7 +112,8 @@ static bool encoder_is_valid(const encoder_config *encoder)
 static bool sensor_is_valid(const joint_config *joint)
 {
     const pot_config *pot = &joint->pot;
-    const bool own = joint->encoder.sensor == SENSOR_POTENTIOMETER ? table_is_valid(pot) : encoder_is_valid(&joint->encoder);
+    const bool own =
+        joint->encoder.sensor == SENSOR_POTENTIOMETER ? table_is_valid(pot) : encoder_is_valid(&joint->encoder);
     return own && number_within(pot->jump_rad, 1e-4f, 1.0f) && number_within(pot->frozen_rad, 1e-3f, 1.0f) &&
            number_within(pot->inverted_rad, 1e-3f, 1.0f);
 }
@@ -150,12 +153,14 @@ static bool encoder_is_consistent(const joint_config *joint)
     return within && step_rad <= 0.5f * joint->pot.jump_rad && step_rad <= 0.5f * joint->pot.frozen_rad;
 }
 
-/* Return whether the numbers fit each other: a stall shows below the duty's limit, the sensor reaches the soft limits, a
- * healthy gear's backlash leaves motor and sensor together. */
+/* Return whether the numbers fit each other: a stall shows below the duty's limit, the sensor reaches the soft limits,
+ * a healthy gear's backlash leaves motor and sensor together. */
 static bool joint_is_consistent(const joint_config *joint)
 {
-    const bool own = joint->encoder.sensor == SENSOR_POTENTIOMETER ? table_is_consistent(joint) : encoder_is_consistent(joint);
-    return own && joint->motor.backlash_rad < joint->motor.apart_rad && joint->stall_duty <= joint->duty_limit && joint->speed_limit_rad_s * TICK_S < joint->pot.jump_rad;
+    const bool own =
+        joint->encoder.sensor == SENSOR_POTENTIOMETER ? table_is_consistent(joint) : encoder_is_consistent(joint);
+    return own && joint->motor.backlash_rad < joint->motor.apart_rad && joint->stall_duty <= joint->duty_limit &&
+           joint->speed_limit_rad_s * TICK_S < joint->pot.jump_rad;
 }
 
 /* Return whether no two quadrature encoders are on one timer. */
@@ -203,7 +208,8 @@ bool config_is_valid(const core_config *config)
         }
     }
     return inputs_differ(config) && config->supply_min_mv < config->supply_max_mv &&
-           config->supply_min_mv >= config->supply_nominal_mv / 2u && word_within(config->supply_nominal_mv, 1000u, 100000u) &&
+           config->supply_min_mv >= config->supply_nominal_mv / 2u &&
+           word_within(config->supply_nominal_mv, 1000u, 100000u) &&
            word_within(config->overload_ticks, 1u, 10000u) && word_within(config->brake_release_ticks, 0u, 1000u) &&
            word_within(config->brake_engage_ticks, 0u, 1000u) && word_within(config->supply_ticks, 1u, 1000u) &&
            word_within(config->pot_ticks, 1u, 100u) && word_within(config->following_ticks, 1u, 10000u) &&

@@ -156,7 +156,8 @@ static void rest(core_state *core)
         governor_hold(&joint->reference, joint->pot.angle_rad);
         joint->released = 0u;
         joint->motor.alone = 0u;
-        if (joint->pid.duty != 0.0f && motor_stepped(&joint->motor)) { /* its current's answer to the end shows its sign */
+        if (joint->pid.duty != 0.0f && motor_stepped(&joint->motor)) {
+            /* its current's answer to the end shows its sign */
             joint->motor.dither_vv = joint->motor.dither_va = joint->motor.dither_aa = joint->motor.dithers = 0.0f;
         }
         joint->pid.integral_duty = joint->pid.duty = joint->pid.error_rad = joint->pid.reference_rad_s = 0.0f;
@@ -179,7 +180,8 @@ static void close_brakes(core_state *core)
     core->state = core->faults != 0u ? STATE_FAULTED : STATE_DISABLED;
 }
 
-/* Write every field of the outputs: the joints' duties for the present supply, as gains are those of the nominal one. */
+/* Write every field of the outputs: the joints' duties for the present supply, as gains are those of the nominal
+ * one. */
 static void report(core_state *core, core_outputs *outputs, uint32_t supply_mv)
 {
     const uint32_t least_mv = core->config.supply_nominal_mv / 2u; /* a sensor of the supply may fail too */
@@ -236,7 +238,8 @@ void core_tick(core_state *core, const core_inputs *inputs, core_outputs *output
             angle_rad = pid_measure_by_motor(joint, &config->gains);
         }
         if (closed) {
-            if ((weak || joint->over_a > 0.0f) && joint->motor.duty != 0.0f) { /* what it does not put out is not known */
+            if ((weak || joint->over_a > 0.0f) && joint->motor.duty != 0.0f) {
+                /* what it does not put out is not known */
                 motor_limit(&joint->motor);
             }
             if (config->motor.resistance_ohm > 0.0f) {

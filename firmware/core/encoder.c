@@ -22,7 +22,8 @@ bool encoder_frames_sound(uint32_t frames)
 
 bool encoder_magnet_wrong(uint32_t frames) { return (frames & MAGNET << 16) != 0u; }
 
-/* Return how many counts from its zero the encoder is. Counts of a timer wrap, those of an angle do half a revolution away. */
+/* Return how many counts from its zero the encoder is. Counts of a timer wrap, those of an angle do half a revolution
+ * away. */
 static int32_t from_zero(const encoder_state *encoder, const encoder_config *config, uint32_t counts)
 {
     if (config->sensor == SENSOR_QUADRATURE) {

@@ -2,18 +2,18 @@
 
 #include "number.h"
 
-#define TRACK_S 0.02f /* s; time constant of the way back to the path, once near it; half: it overshoots, double: it is off
-                         the path for longer */
-#define ANSWER_PER_S 200.0f /* 1/s; of the speed that leads there: four times as fast, so that nothing overshoots; half: it
-                               does, double: the acceleration limit acts instead */
+#define TRACK_S 0.02f /* s; time constant of the way back to the path, once near it; half: it overshoots, double: it is
+                         off the path for longer */
+#define ANSWER_PER_S 200.0f /* 1/s; of the speed that leads there: four times as fast, so that nothing overshoots; half:
+                               it does, double: the acceleration limit acts instead */
 
 void governor_hold(governor_state *reference, float position_rad)
 {
     *reference = (governor_state){.position_rad = position_rad};
 }
 
-/* Return the greatest speed from which a joint stops within distance_rad (0 or more): sqrt(2 a d), less the late_rad_s it
- * loses only after the deceleration has come. */
+/* Return the greatest speed from which a joint stops within distance_rad (0 or more): sqrt(2 a d), less the late_rad_s
+ * it loses only after the deceleration has come. */
 static inline float stopping_speed(float twice_rad_s2, float distance_rad, float late_rad_s)
 {
     return number_root(late_rad_s * late_rad_s + twice_rad_s2 * distance_rad) - late_rad_s;

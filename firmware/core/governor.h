@@ -1,5 +1,5 @@
-/* The reference within its limits: a path that the host's points make, followed within speed, acceleration, jerk and the
- * braking distance before the soft limits. A path within them is followed exactly. All functions: tick context. */
+/* The reference within its limits: a path that the host's points make, followed within speed, acceleration, jerk and
+ * the braking distance before the soft limits. A path within them is followed exactly. All functions: tick context. */
 #ifndef ARMSIGHT_GOVERNOR_H
 #define ARMSIGHT_GOVERNOR_H
 

@@ -1,14 +1,16 @@
 #include "motor.h"
 
 #define SAMPLE_KEEPS (1.0f - (float)SAMPLE_TICKS * TICK_S / FADE_S) /* of what fades, from sample to sample */
-#define FADE_S 0.4f /* s; a gap fades with this time constant; half: slow drifts stay unseen, double: old errors add up */
+#define FADE_S 0.4f /* s; a gap fades with this time constant; half: slow drifts stay unseen, double: old errors add
+                       up */
 #define PRIOR_VARIANCE 0.005625f /* of R and K over the configuration's: 0.075^2, three sigma of both cover 15 %; half:
                                     other motors are doubted, double: faults show later at first */
 #define WANDER_VARIANCE 6e-9f /* per tick, of K: magnets get warm; half: K follows later, double: a reading's scale is
                                  learnt as K */
-#define WARMS 1e-5f           /* sigma of R per tick: three of it are 3 % a second, 40 % within 20 s; half: a winding that warms
-                                 so fast is a fault, double: a reading that stands still is noticed later */
-#define WARM_VARIANCE 0.04f   /* to which that grows where nothing is learnt: 0.2^2, so that three sigma cover -20 to +40 % */
+#define WARMS 1e-5f /* sigma of R per tick: three of it are 3 % a second, 40 % within 20 s; half: a winding that warms
+                       so fast is a fault, double: a reading that stands still is noticed later */
+#define WARM_VARIANCE 0.04f /* to which that grows where nothing is learnt: 0.2^2, so that three sigma cover -20 to +40
+                               % */
 #define SIGMAS 3.0f /* of a number that count as its uncertainty; half: sound joints are doubted, double: faults show
                        late */
 #define SCALE_LOW 0.65f /* of R: a tolerance of 15 %, 3 % of the current's gain, copper from -50 to +100 K; half:
@@ -23,21 +25,22 @@
                                     teaches, double: less is learnt */
 #define RESTING 0.5f /* of the backlash: two positions in it are a sigma of 0.41 apart; half: backlash teaches, double:
                         rest teaches less */
-#define WINDOW_WAY_RAD (4.0f * WINDOW_NOISE_RAD) /* on less the loop's answer to the noise looks like a motor constant */
+#define WINDOW_WAY_RAD (4.0f * WINDOW_NOISE_RAD) /* on less the loop's answer to the noise looks like a motor
+                                                    constant */
 #define SURPRISE 3.0f /* sigmas beyond which a window teaches nothing until motor and reading agreed once, and then;
                          half: other motors are never learnt, double: wrong scales are */
 #define TEACHES 1.5f /* as much as one that is off by so many; half: a winding that warms is followed too late, double:
                         a drift is followed */
-#define KNOWN_TICKS 1000u /* so often what was learnt is kept; half: a weak motor is learnt before it shows, double: a young arm shows
-                            it later */
-#define LATELY_S 1.5f /* what says what the constant is now fades so; half: slow joints show nothing, double: a weak motor shows
-                         later */
-#define LATELY_WARMS 0.02f /* per s, of R: so fast a winding may warm or cool meanwhile; half: warm windings are weak motors, double:
-                              weak motors show later */
-#define LATELY_LEFT 0.8f /* variances of a window's noise that a constant may leave; half: weak motors show later, double: readings
-                            that lag are weak motors */
-#define WEAKENED 0.1f /* of the configured constant, and SIGMAS: so much less is a weak motor; half: other motors are weak, double:
-                         motors that lost a quarter are not seen */
+#define KNOWN_TICKS 1000u /* so often what was learnt is kept; half: a weak motor is learnt before it shows, double: a
+                             young arm shows it later */
+#define LATELY_S 1.5f /* what says what the constant is now fades so; half: slow joints show nothing, double: a weak
+                         motor shows later */
+#define LATELY_WARMS 0.02f /* per s, of R: so fast a winding may warm or cool meanwhile; half: warm windings are weak
+                              motors, double: weak motors show later */
+#define LATELY_LEFT 0.8f /* variances of a window's noise that a constant may leave; half: weak motors show later,
+                            double: readings that lag are weak motors */
+#define WEAKENED 0.1f /* of the configured constant, and SIGMAS: so much less is a weak motor; half: other motors are
+                         weak, double: motors that lost a quarter are not seen */
 #define SAMPLE_TICKS 8u /* between samples; half: ticks cost more, double: faults are named later */
 #define AGREED 4.0f /* of apart_rad: so much way together proves that wiring and scale are right; half: noise proves
                        it, double: joints are careful for longer */
@@ -50,11 +53,12 @@
                         twice as fast */
 #define CONSTANT_OFF 0.15f /* by so much a motor's constant may be off; half: other motors are doubted, double: weak
                               motors are learnt */
-#define SMOOTH 0.333333f      /* of a tick's news in the speed that is damped: 2 ms; half: soft joints swing, twice: noise */
+#define SMOOTH 0.333333f /* of a tick's news in the speed that is damped: 2 ms; half: soft joints swing, twice: noise */
 #define SEEN_RAD_S 0.5f /* rad/s, above a motor's speed in one tick by noise: no slower limit is held by it; half:
                            noise brakes, double: slow joints go beyond theirs */
 #define SIDE_UNKNOWN 0
-#define REVERSAL_TICKS 64u /* in a longer window a joint may have reversed and come back; half: less is learnt, double: backlash teaches */
+#define REVERSAL_TICKS 64u /* in a longer window a joint may have reversed and come back; half: less is learnt, double:
+                              backlash teaches */
 #define DEAD_SHARE 0.05f /* of what the voltage could drive: a smaller current of late is none; half: dead sensors show
                             later, double: unloaded joints look dead */
 #define SETTLE_TICKS 3u /* after the windings were closed, currents are not yet known; half: the first current is
@@ -67,17 +71,20 @@
                               double: a bridge shows later */
 #define DISOBEY_OFF_RAD 0.02f /* and so far it is from where it is to be; half: lagging joints are suspected, double: a
                                  bridge shows later */
-#define FOLLOWS 0.7f            /* of the answer of the configured resistance; half: weak motors look like bridges, double: a bridge shows late */
-#define FOLLOWS_SAMPLES 8u /* after a step the answer is that since; half: what was before hides a bridge, double: weak motors look like one */
-#define INVERTED 0.3f /* of their sum: so little may both differ, by R, K and noise; half: inverted currents are bridges, double:
-                         bridges at half of their speed drive on */
+#define FOLLOWS 0.7f /* of the answer of the configured resistance; half: weak motors look like bridges, double: a
+                        bridge shows late */
+#define FOLLOWS_SAMPLES 8u /* after a step the answer is that since; half: what was before hides a bridge, double: weak
+                              motors look like one */
+#define INVERTED 0.3f /* of their sum: so little may both differ, by R, K and noise; half: inverted currents are
+                         bridges, double: bridges at half of their speed drive on */
 #define STUCK_SUPPLY 0.2f /* of the supply: less a stuck bridge hardly moves; half: uncertain windings look like
                              bridges, double: bridges at 0.3 are not seen */
 #define STEP_RAD_S 0.05f /* a change of the motor's speed in a tick, beyond noise and torque, that is none; half: noise
                             steps, double: small offsets do not */
 #define ROUGH_TIMES 5.0f /* of the mean change from tick to tick: four sigma of its noise; half: noise steps, double:
                             faults do not */
-#define DITHER_SUPPLY 0.04f   /* of the supply: changes that are smaller are taken once a sample; half: more ticks cost more, double: less shows */
+#define DITHER_SUPPLY 0.04f /* of the supply: changes that are smaller are taken once a sample; half: more ticks cost
+                               more, double: less shows */
 #define DITHER_KEPT 0.875f /* per sample, of the sums over changes of voltage and current: 64 ms; half: noise names
                               parts, nearer 1: a fault shows later in them */
 #define ROUGH_SHARE 0.0625f /* of a sample in that mean; half: a noisier load is followed later, double: the mean is
@@ -115,7 +122,8 @@ static void way_begin(motor_state *motor)
     motor->way_ticks = 0u;
 }
 
-/* Take a window's way of both into that since the joint last rested: once it is long and the same, the reading is trusted. */
+/* Take a window's way of both into that since the joint last rested: once it is long and the same, the reading is
+ * trusted. */
 static void earn(motor_state *motor, const motor_config *config, float way_rad)
 {
     const float emf_v = motor->window_v - motor->resistance_scale * motor->window_ir_v;
@@ -138,8 +146,9 @@ static void earn(motor_state *motor, const motor_config *config, float way_rad)
     way_begin(motor);
 }
 
-/* Return how far the motor's way over a window may be from the reading's, and remember which way it went. Only a gear that
- * goes on to the side where its teeth lie already crosses no backlash: a motor that rests may be anywhere between them. */
+/* Return how far the motor's way over a window may be from the reading's, and remember which way it went. Only a gear
+ * that goes on to the side where its teeth lie already crosses no backlash: a motor that rests may be anywhere between
+ * them. */
 static float window_noise(motor_state *motor, const motor_config *config, float way_rad)
 {
     const bool moved = number_size(way_rad) > WINDOW_WAY_RAD;
@@ -170,8 +179,8 @@ static void learn(motor_state *motor, const motor_config *config)
     const float ir_v = motor->mean_ir_v;
     const float kw_v = motor->mean_kw_v;
     const float noise_v = motor->mean_noise_v;
-    /* What a joint that rests hides in its backlash goes with the current: all such windows err alike, and one says what
-     * many do. */
+    /* What a joint that rests hides in its backlash goes with the current: all such windows err alike, and one says
+     * what many do. */
     if (!moved && motor->variance_rr * ir_v * ir_v < noise_v * noise_v) {
         return;
     }
@@ -208,8 +217,8 @@ static void mean(motor_state *motor, const motor_config *config, float way_rad, 
     motor->mean_ticks = motor->window_ticks;
 }
 
-/* Return the faults of a motor whose constant is less than it was. One that was learnt down to its bound is none: motor and reading
- * may never have agreed. */
+/* Return the faults of a motor whose constant is less than it was. One that was learnt down to its bound is none: motor
+ * and reading may never have agreed. */
 static uint32_t weak_parts(const motor_state *motor, bool agreed)
 {
     const bool sure = agreed && motor->constant_scale > CONSTANT_LOW;
@@ -217,9 +226,13 @@ static uint32_t weak_parts(const motor_state *motor, bool agreed)
 }
 
 /* Return where the oldest of what is known of late stands. */
-static uint32_t oldest_of(const motor_state *motor) { return motor->known > MOTOR_KNOWN ? motor->known % MOTOR_KNOWN : 0u; }
+static uint32_t oldest_of(const motor_state *motor)
+{
+    return motor->known > MOTOR_KNOWN ? motor->known % MOTOR_KNOWN : 0u;
+}
 
-/* Look whether the constant is less than it was: not behind a spring, on which a joint swings while dry friction holds its motor. */
+/* Look whether the constant is less than it was: not behind a spring, on which a joint swings while dry friction holds
+ * its motor. */
 static void weakened(motor_state *motor)
 {
     const float rr = motor->lately_rr + 1.0f / WARM_VARIANCE;
@@ -233,8 +246,8 @@ static void weakened(motor_state *motor)
     const uint32_t oldest = oldest_of(motor);
     const float by_rv = (ttr * rv - motor->lately_tr * motor->lately_tv) * per_square;
     const float by_tv = (rr * motor->lately_tv - motor->lately_tr * rv) * per_square;
-    const float left = motor->lately_vv + motor->resistance_scale * motor->resistance_scale / WARM_VARIANCE - by_rv * rv -
-                       by_tv * motor->lately_tv - kv * kv / kk;
+    const float vv = motor->lately_vv + motor->resistance_scale * motor->resistance_scale / WARM_VARIANCE;
+    const float left = vv - by_rv * rv - by_tv * motor->lately_tv - kv * kv / kk;
     if (left > LATELY_LEFT * motor->lately_n) {
         return; /* it is none: a reading that lags looks slower, too, but follows no constant */
     }
@@ -246,9 +259,9 @@ static void weakened(motor_state *motor)
     }
 }
 
-/* Take the last window, if in motion, into what the constant is of late, by least squares beside a resistance that changes
- * steadily: v = (r + s t) R i + k K w. A motion either way shows it, however slow; an offset, a winding that warms and a reading
- * that drifts err one way in one direction, the other in the other. */
+/* Take the last window, if in motion, into what the constant is of late, by least squares beside a resistance that
+ * changes steadily: v = (r + s t) R i + k K w. A motion either way shows it, however slow; an offset, a winding that
+ * warms and a reading that drifts err one way in one direction, the other in the other. */
 static void lately(motor_state *motor)
 {
     const float seconds = (float)motor->mean_ticks * TICK_S;
@@ -342,8 +355,8 @@ void motor_limit(motor_state *motor)
     motor->step_rad_s = UNKNOWN_RAD_S;
 }
 
-/* Take a sample in which a driver may have limited the current: it put out anything between nothing and the duty's voltage.
- * What reading and current ask for within that is taken for it, and nothing is learnt. */
+/* Take a sample in which a driver may have limited the current: it put out anything between nothing and the duty's
+ * voltage. What reading and current ask for within that is taken for it, and nothing is learnt. */
 static void sample_limited(motor_state *motor, const motor_config *config, float angle_rad)
 {
     const float way_rad = angle_rad - motor->part_rad;
@@ -382,8 +395,8 @@ bool motor_flows_asleep(const zero_state *zero, const motor_config *config, floa
                             in motion, double: warm light joints alarm */
 #define ANSWER_HIGH 1.7f /* or more; half: sound joints alarm, double: shorted windings show only under load */
 
-/* Return how the current answers to the voltage from tick to tick, over the answer of the learnt resistance: no load, no
- * speed and no reading is in it. */
+/* Return how the current answers to the voltage from tick to tick, over the answer of the learnt resistance: no load,
+ * no speed and no reading is in it. */
 static float answer_of(const motor_state *motor, const motor_config *config)
 {
     return motor->resistance_scale * config->resistance_ohm * motor->dither_va / motor->dither_vv;
@@ -462,7 +475,8 @@ static void sample(motor_state *motor, const motor_config *config, float ir_v, f
 }
 
 #define LOAD_SAMPLES 8u /* in a mean of the load; half: noisier, double: the joint moves meanwhile */
-#define BEFORE_SAMPLES 23u /* so far back a fault had not begun that shows now; half: it had, double: is not remembered */
+#define BEFORE_SAMPLES 23u /* so far back a fault had not begun that shows now; half: it had, double: is not
+                              remembered */
 #define WORN_CONSTANT 0.83f /* of the learnt constant: what a partly shorted winding has, 0.7 to 0.95; half: sensors
                                are named, double: motors */
 #define WORN_SIGMA 0.04f /* of a constant that is seen; half: a motion says more than it knows, double: more are both
@@ -474,10 +488,11 @@ static void sample(motor_state *motor, const motor_config *config, float ir_v, f
 #define LOAD_SHARE 0.1f /* and of that itself; likewise */
 #define WEIGHS 4.0f /* no witness says more (logarithm of the odds); half: none convicts against the other, double: one
                        outweighs the other */
-#define DECIDES 1.5f        /* with less two parts cannot be distinguished; half: more are named wrongly, double: more are both named */
+#define DECIDES 1.5f /* with less two parts cannot be distinguished; half: more are named wrongly, double: more are both
+                        named */
 
-/* Write the means over some samples, which ended back samples ago: what the load takes of the applied voltage, V (less the back-EMF by the reading),
- * and the current, A. */
+/* Write the means over some samples, which ended back samples ago: what the load takes of the applied voltage, V (less
+ * the back-EMF by the reading), and the current, A. */
 static void load_of(const motor_state *motor, const motor_config *config, uint32_t back, float *volts, float *amperes)
 {
     *volts = *amperes = 0.0f;
@@ -531,10 +546,12 @@ void motor_recall(motor_state *motor)
     motor->variance_kk = motor->known_kk[oldest];
 }
 
-/* Take a change of the motor's speed in a tick that is beyond noise: by its torque, its uncertain numbers, or a step. */
+/* Take a change of the motor's speed in a tick that is beyond noise: by its torque, its uncertain numbers, or a
+ * step. */
 static void changed(motor_state *motor, const motor_config *config, float change_rad_s, float current_a)
 {
-    const float largest_a = number_size(motor->last_a) > motor->current_a ? number_size(motor->last_a) : motor->current_a;
+    const float last_a = number_size(motor->last_a);
+    const float largest_a = last_a > motor->current_a ? last_a : motor->current_a;
     const float torque_rad_s = motor->swift_per_a * largest_a;
     const float unsure_rad_s = motor->unsure_per_a * number_size(current_a - motor->last_a);
     if (change_rad_s <= motor->step_rad_s + torque_rad_s + unsure_rad_s || motor_stepped(motor)) {
@@ -637,20 +654,21 @@ uint32_t motor_disagrees(const motor_state *motor, const motor_config *config, f
     return agreed ? FAULT_POT_SLIP : FAULT_POT_SCALE;
 }
 
-#define NAME_SAMPLES 24u /* of the last 192 ms: most of them after the joint was let go of; half: noise names parts, double:
-                            what was before the fault does */
-#define SLOW_RAD_S 0.1f /* rad/s; a reading that drifts more slowly holds its joint; half: weak motors are drifts, double: slow drifts
-                           are weak motors */
+#define NAME_SAMPLES 24u /* of the last 192 ms: most of them after the joint was let go of; half: noise names parts,
+                            double: what was before the fault does */
+#define SLOW_RAD_S 0.1f /* rad/s; a reading that drifts more slowly holds its joint; half: weak motors are drifts,
+                           double: slow drifts are weak motors */
 #define NAME_NOISE_RAD 0.002f /* of a reading; half: noise names faults, double: small ones keep their first name */
 #define JUMP_SHARE 0.7f /* of the way between both, in one sample; half: slips look like jumps, double: no jump is
                            named */
 #define LAG_SHARE 0.5f /* of what the others leave: a lag has one number more to fit with; half: lags are named
                           otherwise, double: slips are named lags */
 #define SAME_SHARE 0.7f /* of what the other leaves; half: more are both named, double: the smaller is always named */
-#define STUCK_SHARE 0.5f /* of what a sound bridge leaves; half: bridges show later, double: offsets look like bridges */
+#define STUCK_SHARE 0.5f /* of what a sound bridge leaves; half: bridges show later, double: offsets look like
+                            bridges */
 
-/* What a joint did over some samples, in radians since the first of them: reading, way by the voltage alone, way that the
- * winding's voltage takes of it, the sample's number, and the sum of the way between motor and reading. */
+/* What a joint did over some samples, in radians since the first of them: reading, way by the voltage alone, way that
+ * the winding's voltage takes of it, the sample's number, and the sum of the way between motor and reading. */
 enum { READ, VOLTAGE, CURRENT, TIME, BETWEEN };
 #define COLUMNS MOTOR_COLUMNS
 
@@ -732,7 +750,8 @@ static void take_out(motor_sums *s, uint32_t column)
     }
 }
 
-/* Return what is left of the reading if it follows late: by least squares a k + x T/lag, of which x alone is what lag adds. */
+/* Return what is left of the reading if it follows late: by least squares a k + x T/lag, of which x alone is what lag
+ * adds. */
 static float left_by_lag(const motor_sums *s, float *rate)
 {
     float slope, between_slope;
@@ -750,9 +769,10 @@ static bool jumped(const motor_state *motor, const motor_config *config, uint32_
     float low = 0.0f, high = 0.0f, largest = 0.0f, z = 0.0f;
     for (uint32_t i = count - 1u; i > 0u; i--) {
         const uint32_t at = (motor->sampled - i) % MOTOR_SAMPLES;
-        const float emf_v = motor->sample_v[at] - motor->resistance_scale * config->resistance_ohm * motor->sample_a[at];
-        const float step = motor->sample_read_rad[at] - motor->sample_read_rad[(at + MOTOR_SAMPLES - 1u) % MOTOR_SAMPLES] -
-                           emf_v * motor->per_constant * TICK_S;
+        const float ir_v = motor->resistance_scale * config->resistance_ohm * motor->sample_a[at];
+        const float before_rad = motor->sample_read_rad[(at + MOTOR_SAMPLES - 1u) % MOTOR_SAMPLES];
+        const float way_rad = (motor->sample_v[at] - ir_v) * motor->per_constant * TICK_S;
+        const float step = motor->sample_read_rad[at] - before_rad - way_rad;
         z += step;
         low = z < low ? z : low;
         high = z > high ? z : high;
@@ -761,9 +781,9 @@ static bool jumped(const motor_state *motor, const motor_config *config, uint32_
     return largest > 10.0f * NAME_NOISE_RAD && largest > JUMP_SHARE * (high - low);
 }
 
-/* Return whether a motor is weak whose reading went further, the reading drifts, or both where they cannot be distinguished. A
- * drift, or a wrong resistance under a load, adds a steady speed: what is left without one follows the motor's changes of speed,
- * one to one or further. A motor that rests shows a drift alone. */
+/* Return whether a motor is weak whose reading went further, the reading drifts, or both where they cannot be
+ * distinguished. A drift, or a wrong resistance under a load, adds a steady speed: what is left without one follows the
+ * motor's changes of speed, one to one or further. A motor that rests shows a drift alone. */
 static uint32_t further(const motor_state *motor, motor_sums *s, uint32_t count, float drift, bool rests, float by_lag)
 {
     const float per_sample = (float)SAMPLE_TICKS * TICK_S;
@@ -846,7 +866,8 @@ uint32_t motor_blames(const motor_state *motor, const motor_config *config, floa
     float volts, amperes;
     load_of(motor, config, 0u, &volts, &amperes);
     const float opens_v = 2.0f * config->constant_v_s * config->apart_rad / FADE_S; /* what opens the gap */
-    if (!motor_answers_otherwise(motor, config)) { /* at rest an offset stays, and a weak motor takes what its load does */
+    if (!motor_answers_otherwise(motor, config)) { /* at rest an offset stays, and a weak motor takes what its load
+                                                      does */
         const float unsure_v = SIGMAS * number_root(motor->variance_rr) * number_size(ohm * amperes);
         return number_size(volts - ohm * amperes) > opens_v + unsure_v ? BIT_SENSOR : BIT_MOTOR;
     }
@@ -854,7 +875,8 @@ uint32_t motor_blames(const motor_state *motor, const motor_config *config, floa
         const bool flows = number_size(answer) < ANSWER_NONE && number_size(ohm * amperes) > opens_v;
         return flows ? BIT_SENSOR | BIT_BRIDGE : BIT_SENSOR;
     }
-    float odds = 0.0f; /* their logarithm, for a worn winding: what the load takes, and the constant, if the joint moved */
+    float odds = 0.0f; /* their logarithm, for a worn winding: what the load takes, and the constant, if the joint
+                          moved */
     if (motor->before != 0u) {
         const float load_v = motor->before_v;
         const float worn_v = (1.0f / (WORN_CONSTANT * answer) - 1.0f) * load_v;
@@ -863,7 +885,8 @@ uint32_t motor_blames(const motor_state *motor, const motor_config *config, floa
         odds = number_bound((volts - load_v - 0.5f * worn_v) * worn_v / variance, WEIGHS);
     }
     if (motor->way_seen > WAY_SHOWS) {
-        const float variance = motor->constant_sigma * motor->constant_sigma + motor->variance_kk + WORN_SIGMA * WORN_SIGMA;
+        const float variance =
+            motor->constant_sigma * motor->constant_sigma + motor->variance_kk + WORN_SIGMA * WORN_SIGMA;
         const float less = 1.0f - WORN_CONSTANT;
         odds += number_bound((1.0f - 0.5f * less - motor->constant_seen) * less / variance, WEIGHS);
     }
@@ -970,9 +993,12 @@ bool motor_is_dead(const motor_state *motor, const motor_config *config)
                            motions look like swings */
 #define SWINGS 8u /* so many changes are no answer to anything; half: pushes look like swings, double: a joint swings
                      for longer */
-#define SWING_STAYS 0.6f  /* of the first half of them: a second half that is smaller decays; half: ringing stops joints, double: noise hides a swing */
-#define SWING_RAD_S 0.4f /* rad/s from the reference's speed at least; half: noise swings, double: slow joints swing unseen */
-#define SWING_NOISES 1.75f /* of the noise; looks in a row on a side are beyond that by more in sum: white noise as large alarms once in 5000 h; half: each minute, double: joints swing unseen */
+#define SWING_STAYS 0.6f /* of the first half of them: a second half that is smaller decays; half: ringing stops joints,
+                            double: noise hides a swing */
+#define SWING_RAD_S 0.4f /* rad/s from the reference's speed at least; half: noise swings, double: slow joints swing
+                            unseen */
+#define SWING_NOISES 1.75f /* of the noise; looks in a row on a side are beyond that by more in sum: white noise as
+                              large alarms once in 5000 h; half: each minute, double: joints swing unseen */
 
 bool motor_swings_far(motor_state *motor, float off_rad_s, bool known)
 {
@@ -980,11 +1006,13 @@ bool motor_swings_far(motor_state *motor, float off_rad_s, bool known)
     if (size_rad_s <= SWING_RAD_S) {
         return false;
     }
-    const bool goes_on = motor->driven_ticks - motor->swing_seen <= WATCH_TICKS && motor->swing_shows_rad_s * off_rad_s > 0.0f;
+    const bool goes_on =
+        motor->driven_ticks - motor->swing_seen <= WATCH_TICKS && motor->swing_shows_rad_s * off_rad_s > 0.0f;
     const float beyond_rad_s = off_rad_s > 0.0f ? off_rad_s - SWING_RAD_S : off_rad_s + SWING_RAD_S;
     motor->swing_shows_rad_s = goes_on ? motor->swing_shows_rad_s + beyond_rad_s : beyond_rad_s;
     motor->swing_seen = motor->driven_ticks;
-    if (off_rad_s * motor->swing_rad_s <= 0.0f) { /* the other side, or noise: of a current beside an uncertain resistance or of a reading */
+    if (off_rad_s * motor->swing_rad_s <= 0.0f) { /* the other side, or noise: of a current beside an uncertain
+                                                     resistance or of a reading */
         const float noise_rad_s = known ? motor->unsure_per_a * number_size(motor->last_a) : SWING_RAD_S;
         if (number_size(motor->swing_shows_rad_s) <= SWING_NOISES * noise_rad_s) {
             return false;

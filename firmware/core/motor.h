@@ -8,9 +8,12 @@
 #include "number.h"
 #include "types.h"
 
-#define MOTOR_STEP_TICKS 160u /* for so long a step may be what a gap began with; half: slow gaps have no beginning, double: old steps are blamed */
-#define MOTOR_TWIST 0.5f /* of the largest current's twist of late: half: soft joints are dropped, twice: faults show later */
-#define MOTOR_WITNESS 0.1f /* of the speed it is held to: so much faster than the reading it must be to count; half: noise brakes, double: a wrong reading lets it be faster */
+#define MOTOR_STEP_TICKS 160u /* for so long a step may be what a gap began with; half: slow gaps have no beginning,
+                                 double: old steps are blamed */
+#define MOTOR_TWIST 0.5f /* of the largest current's twist of late: half: soft joints are dropped, twice: faults show
+                            later */
+#define MOTOR_WITNESS 0.1f /* of the speed it is held to: so much faster than the reading it must be to count; half:
+                              noise brakes, double: a wrong reading lets it be faster */
 
 /* Begin to watch a joint that reads angle_rad and has this speed limit; phase differs from joint to joint, so that not
  * all are sampled at once. */
@@ -49,11 +52,13 @@ void motor_sleep(zero_state *zero, float current_a);
 /* Return whether a current is shown that was not, once the bridge has slept for 32 ms: the sensor's error. */
 bool motor_flows_asleep(const zero_state *zero, const motor_config *config, float supply_v);
 
-/* Return how fast the motor surely is: sure_rad_s doubts it as at the last sample, and the current may be larger by now. */
+/* Return how fast the motor surely is: sure_rad_s doubts it as at the last sample, and the current may be larger by
+ * now. */
 float motor_sure(const motor_state *motor);
 
-/* Return the way of a motor in a tick; yielding: by the least its winding may take of the voltage. Held at rest by that it gives
- * way to its load as far as its resistance is uncertain, and is never driven on. Its constant has no part in it. */
+/* Return the way of a motor in a tick; yielding: by the least its winding may take of the voltage. Held at rest by that
+ * it gives way to its load as far as its resistance is uncertain, and is never driven on. Its constant has no part in
+ * it. */
 float motor_way(const motor_state *motor, bool yielding);
 
 /* Return the joint's speed: the reading's, or the motor's where that is faster beyond all its uncertainty. */
@@ -67,8 +72,8 @@ static inline float motor_witness(const motor_state *motor, float reading_rad_s)
  * behind its spring is damped by the motor before it. While the motor's is not known, the reading's is. */
 void motor_damp(motor_state *motor, float reading_rad_s);
 
-/* Return how far motor and reading may be apart by the motor's uncertain numbers, and by the twist that the current does not
- * show: friction, inertia, and a stiffness that is another than the configuration's. */
+/* Return how far motor and reading may be apart by the motor's uncertain numbers, and by the twist that the current
+ * does not show: friction, inertia, and a stiffness that is another than the configuration's. */
 static inline float motor_explains(const motor_state *motor)
 {
     return motor->band_rad + MOTOR_TWIST * motor->twist_rad_per_a * motor->current_a;
@@ -90,11 +95,12 @@ static inline bool motor_is_apart(const motor_state *motor, const motor_config *
 uint32_t motor_disagrees(const motor_state *motor, const motor_config *config, float supply_v);
 
 /* Return the fault (FAULT_BIT) by what motor and reading did in the last 192 ms, or those that cannot be distinguished;
- * suspect where that does not show it. A motor that was let go of changes its speed by itself: only then a reading that drifts can be distinguished from one that slips. */
+ * suspect where that does not show it. A motor that was let go of changes its speed by itself: only then a reading that
+ * drifts can be distinguished from one that slips. */
 uint32_t motor_names(const motor_state *motor, const motor_config *config, uint32_t suspect, motor_sums *sums);
 
-/* Return whether the speed by the back-EMF has changed of late as no torque changes it: then current, winding or bridge are
- * not what they were, and the reading has no part in it. */
+/* Return whether the speed by the back-EMF has changed of late as no torque changes it: then current, winding or bridge
+ * are not what they were, and the reading has no part in it. */
 static inline bool motor_stepped(const motor_state *motor)
 {
     return motor->step_ticks != 0u && motor->driven_ticks - motor->step_ticks < MOTOR_STEP_TICKS;
@@ -103,7 +109,8 @@ static inline bool motor_stepped(const motor_state *motor)
 /* Look for what the motor's constant is since the step, whatever current's offset and gain are. */
 void motor_weakens(motor_state *motor, const motor_config *config, motor_sums *sums);
 
-/* Let the resistance be as uncertain as it may have changed within so many ticks: a temperature that rises is no random walk. */
+/* Let the resistance be as uncertain as it may have changed within so many ticks: a temperature that rises is no random
+ * walk. */
 void motor_warms(motor_state *motor, const motor_config *config, uint32_t ticks);
 
 /* Let a motor be the only witness: with what was known of it before what the reading has spoilt. */
@@ -112,13 +119,14 @@ void motor_recall(motor_state *motor);
 /* Let a motor be no witness any more, until the drives were off. */
 void motor_doubt(motor_state *motor, const motor_config *config);
 
-/* Return whether the current answers to the voltage otherwise than the learnt winding lets it: the reading has no part in it. */
+/* Return whether the current answers to the voltage otherwise than the learnt winding lets it: the reading has no part
+ * in it. */
 bool motor_answers_otherwise(const motor_state *motor, const motor_config *config);
 
 #define MOTOR_NONE_SAMPLES 5u /* 40 ms, half of what its sums remember */
 
-/* Return which part has failed (FAULT_BIT), or which cannot be distinguished. Over what was before, by offset a, gain g,
- * constant k and resistance r:
+/* Return which part has failed (FAULT_BIT), or which cannot be distinguished. Over what was before, by offset a,
+ * gain g, constant k and resistance r:
  *
  *     what shows                        offset   sign, lead   gain   weak   shorted
  *     answer of current to voltage      1        0, -1        g      1      1/r
@@ -132,20 +140,23 @@ uint32_t motor_blames(const motor_state *motor, const motor_config *config, floa
 /* Return whether since such a step reading and current go with a voltage that stays, whatever is put out. */
 bool motor_is_stuck(const motor_state *motor, const motor_config *config, float supply_v, motor_sums *sums);
 
-/* Return whether the back-EMF has stepped of late, or may have while a driver limited the current: a bridge that drives by
- * itself once the drives are off does so, a reading that fails does not. */
+/* Return whether the back-EMF has stepped of late, or may have while a driver limited the current: a bridge that drives
+ * by itself once the drives are off does so, a reading that fails does not. */
 bool motor_may_have_stepped(const motor_state *motor);
 
-/* Return whether for 16 ms a motor has not done what was put out to it, and by reading and current another voltage drives
- * it: against the way error_rad that it is driven, or at all where nothing was put out and shorted windings brake. */
+/* Return whether for 16 ms a motor has not done what was put out to it, and by reading and current another voltage
+ * drives it: against the way error_rad that it is driven, or at all where nothing was put out and shorted windings
+ * brake. */
 bool motor_disobeys(const motor_state *motor, const motor_config *config, float supply_v, float error_rad);
 
 /* Return whether no current flows that the voltage must drive: a broken lead, and its load drives the joint. */
 bool motor_is_dead(const motor_state *motor, const motor_config *config);
 
-#define MOTOR_SWING 0.2f /* of the speed limit: so far from the reference's speed a swing goes at least; half: elastic joints alarm, double: slow swings are not seen */
+#define MOTOR_SWING 0.2f /* of the speed limit: so far from the reference's speed a swing goes at least; half: elastic
+                            joints alarm, double: slow swings are not seen */
 
-/* Return whether the motor swings about its reference, from whose speed it is far off by off_rad_s, by its own speed if known. */
+/* Return whether the motor swings about its reference, from whose speed it is far off by off_rad_s, by its own speed if
+ * known. */
 bool motor_swings_far(motor_state *motor, float off_rad_s, bool known);
 
 #define UNKNOWN_RAD_S 1000.0f /* as uncertain as a motor's speed is whose voltage is not known */
@@ -165,8 +176,8 @@ static inline bool motor_swings(motor_state *motor, float reading_rad_s, float r
 /* Return whether a joint whose reading is faster than its limit has been so long enough to be sure. */
 bool motor_stays_fast(motor_state *motor, const motor_config *config, float reading_rad_s);
 
-/* Return whether the joint has been faster than it may be long enough to be sure; reading_rad_s is what the reading says
- * of it, alone where the motor is no witness. To be asked each WATCH_TICKS. */
+/* Return whether the joint has been faster than it may be long enough to be sure; reading_rad_s is what the reading
+ * says of it, alone where the motor is no witness. To be asked each WATCH_TICKS. */
 static inline bool motor_is_fast(motor_state *motor, const motor_config *config, float reading_rad_s)
 {
     if (number_size(reading_rad_s) <= motor->fastest_rad_s) {

@@ -2,19 +2,28 @@
 
 #include "number.h"
 
-#define SLOWEST_PER_S 80.0f  /* the observer's three poles are at 1 / derivative_filter_s, which the reading's noise allows, but */
+#define SLOWEST_PER_S 80.0f /* the observer's three poles are at 1 / derivative_filter_s, which the reading's noise
+                               allows, but */
 #define FASTEST_PER_S 150.0f /* within these; half: a bridge drives on longer, double: noise is taken for a load */
-#define USUAL_PER_S 10.0f /* so fast the usual load follows; half: a load that gravity changes is none of it, double: a bridge is */
-#define SUDDEN_PER_S 2.0f /* and so fast after a sudden change; half: a payload is long a push, double: a bridge is usual */
+#define USUAL_PER_S 10.0f /* so fast the usual load follows; half: a load that gravity changes is none of it, double: a
+                             bridge is */
+#define SUDDEN_PER_S 2.0f /* and so fast after a sudden change; half: a payload is long a push, double: a bridge is
+                             usual */
 #define SUDDEN 0.25f      /* of the duty; half: usual loads are sudden, double: a bridge becomes usual at once */
-#define PULL 0.15f        /* of the duty accelerates it at least where its inertia is learnt; half: noise teaches, double: less is learnt */
-#define LEARNS_PER_S 20.0f /* so fast, of the squares of that; half: payloads are bridges for longer, double: bridges are learnt */
+#define PULL 0.15f /* of the duty accelerates it at least where its inertia is learnt; half: noise teaches, double: less
+                      is learnt */
+#define LEARNS_PER_S 20.0f /* so fast, of the squares of that; half: payloads are bridges for longer, double: bridges
+                              are learnt */
 #define LIGHTEST 0.6f /* of the configured inertia; half: bridges are learnt, double: nothing is */
 #define HEAVIEST 3.0f /* likewise: payloads; half: those look like bridges, double: bridges are learnt */
-#define AGREED_RAD 0.2f   /* of such a way under usual loads; half: an inverted reading looks like a bridge, double: a bridge shows later */
-#define DRIVEN 0.9f /* of the supply, more than before: no push is so strong; half: pushes are bridges, double: no bridge is */
-#define DRIVEN_FAST 0.4f /* of that at the speed limit: there back-EMF brakes what is pushed; half: pushes are bridges, double: bridges go beyond it */
-#define DRIVEN_OFF 0.3f /* likewise, where nothing is put out; half: a joint whose inertia is another is one, double: slow bridges drive on */
+#define AGREED_RAD 0.2f /* of such a way under usual loads; half: an inverted reading looks like a bridge, double: a
+                           bridge shows later */
+#define DRIVEN 0.9f /* of the supply, more than before: no push is so strong; half: pushes are bridges, double: no
+                       bridge is */
+#define DRIVEN_FAST 0.4f /* of that at the speed limit: there back-EMF brakes what is pushed; half: pushes are bridges,
+                            double: bridges go beyond it */
+#define DRIVEN_OFF 0.3f /* likewise, where nothing is put out; half: a joint whose inertia is another is one, double:
+                           slow bridges drive on */
 #define DRIVEN_RAD 0.008f /* so far; half: noise moves it, double: a bridge drives on longer */
 
 void observer_move(observer_state *observer, float angle_rad)
@@ -45,7 +54,8 @@ void observer_measure(observer_state *observer, const joint_gains *gains, float 
     const bool usual = number_size(sudden) < SUDDEN;
     observer->usual_duty += TICK_S * (usual ? USUAL_PER_S : SUDDEN_PER_S) * sudden;
     observer->agreed_rad += usual ? TICK_S * number_size(observer->speed_rad_s) : 0.0f;
-    if (number_size(sudden) < 2.0f * SUDDEN && number_size(observer->pull_duty) > PULL) { /* a load that goes with the acceleration is inertia */
+    if (number_size(sudden) < 2.0f * SUDDEN && number_size(observer->pull_duty) > PULL) {
+        /* a load that goes with the acceleration is inertia */
         const float more = TICK_S * LEARNS_PER_S * sudden * observer->pull_duty;
         observer->inertia = number_clamp(observer->inertia + more, LIGHTEST, HEAVIEST);
     }

@@ -4,10 +4,14 @@
 #include "number.h"
 
 #define INLINE static inline __attribute__((always_inline))
-#define BEYOND 2.0f /* so many times a speed is damped beyond its limit; half: limits are exceeded by loads, double: it chatters there */
-#define BRAKE_S 0.003f /* s; a few ticks; half: a motor's speed measured a tick late swings, double: limits hold later */
-#define SPARE_SPEED 1.03f /* of the speed limit: a joint that moves at it can still catch up; 1: it cannot, 1.06: it is faster than its limit by that */
-#define LOADED 0.25f /* of the speed limit: a joint far from its reference that is slower is held back by a load; half: loads are lifted later, double: free joints overshoot */
+#define BEYOND 2.0f /* so many times a speed is damped beyond its limit; half: limits are exceeded by loads, double: it
+                       chatters there */
+#define BRAKE_S 0.003f /* s; a few ticks; half: a motor's speed measured a tick late swings, double: limits hold
+                          later */
+#define SPARE_SPEED 1.03f /* of the speed limit: a joint that moves at it can still catch up; 1: it cannot, 1.06: it is
+                             faster than its limit by that */
+#define LOADED 0.25f /* of the speed limit: a joint far from its reference that is slower is held back by a load; half:
+                        loads are lifted later, double: free joints overshoot */
 #define CREEP_RAD_S 0.005f /* from here on dry friction is compensated by half and more */
 
 void pid_reset(pid_state *pid, float measured_rad)
@@ -53,8 +57,8 @@ INLINE float limited_duty(const pid_state *pid, const pid_demand *demand, float 
 static float direction_of(float speed_rad_s) { return speed_rad_s / (number_size(speed_rad_s) + CREEP_RAD_S); }
 
 /* Return the error that the integral gathers while the spring is bounded: what a joint that a load holds back or drives
- * away lacks of a share of its speed limit, or of its reference's speed, by whichever is faster, reading or motor, and never
- * more than its error. A joint that moves on gathers none. */
+ * away lacks of a share of its speed limit, or of its reference's speed, by whichever is faster, reading or motor, and
+ * never more than its error. A joint that moves on gathers none. */
 static float bounded_error(const joint_gains *gains, const pid_demand *demand, float spring, float error_rad)
 {
     if (gains->kp_per_rad <= 0.0f || spring * error_rad <= 0.0f) {
@@ -64,7 +68,8 @@ static float bounded_error(const joint_gains *gains, const pid_demand *demand, f
     const float motor_rad_s = demand->motor_rad_s;
     const float fast_rad_s = number_size(motor_rad_s) > number_size(damped_rad_s) ? motor_rad_s : damped_rad_s;
     const float per_rad_s = gains->kd_s_per_rad + demand->own_s_per_rad;
-    const float along = demand->reference_rad_s * spring > 0.0f ? per_rad_s * number_size(demand->reference_rad_s) : 0.0f;
+    const float along =
+        demand->reference_rad_s * spring > 0.0f ? per_rad_s * number_size(demand->reference_rad_s) : 0.0f;
     const float least = LOADED * number_size(spring);
     const float needed = along > least ? along : least;
     const float lacking = (spring > 0.0f ? needed : -needed) - per_rad_s * fast_rad_s;
@@ -108,8 +113,8 @@ float pid_step(pid_state *pid, const joint_gains *gains, const pid_demand *deman
     return step(pid, gains, demand, limited);
 }
 
-/* Return the duty of kp and kv that moves a free joint at its speed limit and a little more: what back-EMF (own_s_per_rad)
- * and damping take there. Without a known motor nothing bounds it. */
+/* Return the duty of kp and kv that moves a free joint at its speed limit and a little more: what back-EMF
+ * (own_s_per_rad) and damping take there. Without a known motor nothing bounds it. */
 static float spring_limit(const joint_config *config, float own_s_per_rad)
 {
     if (config->motor.resistance_ohm <= 0.0f) {
@@ -134,7 +139,8 @@ void pid_control(joint_state *joint, const joint_config *config, float per_nomin
     const float free_duty = fastest_rad_s * own_s_per_rad;
     const bool fast = joint->motor.sure_rad_s > fastest_rad_s;
     const float faster_rad_s = fast ? motor_sure(&joint->motor) - fastest_rad_s : 0.0f;
-    if (faster_rad_s > 0.0f) { /* it is driven on as a free motor at its limit, less what brings it back there in BRAKE_S */
+    if (faster_rad_s > 0.0f) { /* it is driven on as a free motor at its limit, less what brings it back there in
+                                  BRAKE_S */
         const float left_duty = free_duty - config->gains.ka_s2_per_rad * (1.0f / BRAKE_S) * faster_rad_s;
         if (joint->motor.speed_rad_s > 0.0f) {
             duty_high = number_clamp(left_duty, duty_low, duty_high);

@@ -19,15 +19,15 @@ inline void pid_measure(pid_state *pid, const joint_gains *gains, float measured
     pid->measured_rad = measured_rad;
 }
 
-/* Let the motion of its motor count for the reading of a joint that it holds, after pid_measure. Returns where a motor is, by the
- * reading and what the current twists between them. */
+/* Let the motion of its motor count for the reading of a joint that it holds, after pid_measure. Returns where a motor
+ * is, by the reading and what the current twists between them. */
 float pid_measure_by_motor(joint_state *joint, const joint_gains *gains);
 
 /* Compute this tick's duty (-duty_limit to duty_limit) from the last measurement; sets LIMITED_... bits in *limited. */
 float pid_step(pid_state *pid, const joint_gains *gains, const pid_demand *demand, uint32_t *limited);
 
-/* Compute a joint's duty of this tick within what its limits, a speed beyond its limit and the host's gravity duty leave;
- * per_nominal_v: 1 / nominal supply. */
+/* Compute a joint's duty of this tick within what its limits, a speed beyond its limit and the host's gravity duty
+ * leave; per_nominal_v: 1 / nominal supply. */
 void pid_control(joint_state *joint, const joint_config *config, float per_nominal_v);
 
 /* Move what a change of gains would add to the output into the integral, so that the output does not jump. */

@@ -9,21 +9,25 @@
 #include "pot.h"
 #include "setpoint.h"
 
-#define LOST_TICKS 100u /* so many ticks lost of late are no accident; half: a burst of interrupts stops the arm, double: an
-                           overloaded board moves on for longer */
-#define CRC_BYTES 2u /* of the configuration looked at in a tick: all of it in less than a second; half: a flipped bit shows
-                        after twice the time, double: ticks cost more */
-#define OVERCURRENT_TICKS 20u /* in a row above the limit; half: a reversal trips it, double: windings heat for longer */
-#define STOP_TICKS 300u /* after which an emergency stop ends with sleeping drives, braked by shorted windings until then; half:
-                           a fast joint coasts, double: a bridge that conducts by itself drives on for longer */
-#define NAME_EARLY_TICKS 64u /* after which a weak motor may show: its reading holds it again; half: noise names, double: it
-                                sinks for longer */
-#define NAME_TICKS 160u /* after which a joint has shown which fault it has; half: more are named wrongly, double: the arm hears
-                           of it later */
-#define NAME_LATE_TICKS 480u /* likewise, where only rest shows it; half: it still moves, double: the arm hears of it later */
-#define MAY_REST (FAULT_BIT(FAULT_MOTOR) | FAULT_BIT(FAULT_POT_DRIFT)) /* the reading of a weak motor rests, one that drifts does not */
-#define HELD_RAD 0.2f /* rad that a joint which its motor holds may move; half: a reading that drifts drops the arm before it is
-                         known, double: a joint that cannot be held goes further */
+#define LOST_TICKS 100u /* so many ticks lost of late are no accident; half: a burst of interrupts stops the arm,
+                           double: an overloaded board moves on for longer */
+#define CRC_BYTES 2u /* of the configuration looked at in a tick: all of it in less than a second; half: a flipped bit
+                        shows after twice the time, double: ticks cost more */
+#define OVERCURRENT_TICKS 20u /* in a row above the limit; half: a reversal trips it, double: windings heat for
+                                 longer */
+#define STOP_TICKS 300u /* after which an emergency stop ends with sleeping drives, braked by shorted windings until
+                           then; half: a fast joint coasts, double: a bridge that conducts by itself drives on for
+                           longer */
+#define NAME_EARLY_TICKS 64u /* after which a weak motor may show: its reading holds it again; half: noise names,
+                                double: it sinks for longer */
+#define NAME_TICKS 160u /* after which a joint has shown which fault it has; half: more are named wrongly, double: the
+                           arm hears of it later */
+#define NAME_LATE_TICKS 480u /* likewise, where only rest shows it; half: it still moves, double: the arm hears of it
+                                later */
+#define MAY_REST (FAULT_BIT(FAULT_MOTOR) | FAULT_BIT(FAULT_POT_DRIFT)) /* the reading of a weak motor rests, one that
+                                                                          drifts does not */
+#define HELD_RAD 0.2f /* rad that a joint which its motor holds may move; half: a reading that drifts drops the arm
+                         before it is known, double: a joint that cannot be held goes further */
 
 #define FAULT_NAME(name, code, reaction, text) [code] = #name,
 #define FAULT_TEXT(name, code, reaction, text) [code] = text,
@@ -281,7 +285,8 @@ static void doubt_motor(joint_state *joint, const joint_config *config)
     }
 }
 
-/* Hold a joint by its motor: whichever of both is wrong, a back-EMF of nothing is rest, and the reading shows there what it is. */
+/* Hold a joint by its motor: whichever of both is wrong, a back-EMF of nothing is rest, and the reading shows there
+ * what it is. */
 static void doubt_reading(core_state *core, joint_state *joint)
 {
     joint->released = 0u;
@@ -303,8 +308,8 @@ static void watch_current(core_state *core, joint_state *joint, const joint_conf
     }
 }
 
-/* Watch a joint that its motor holds. Where its current fails, too, or it leaves its position by the motor or by a reading that
- * may be right, nothing holds it: the arm is let go of, which closes the brakes. */
+/* Watch a joint that its motor holds. Where its current fails, too, or it leaves its position by the motor or by a
+ * reading that may be right, nothing holds it: the arm is let go of, which closes the brakes. */
 static void watch_held(core_state *core, joint_state *joint, const joint_config *config, uint32_t i)
 {
     motor_warms(&joint->motor, &config->motor, WATCH_TICKS);
@@ -312,7 +317,8 @@ static void watch_held(core_state *core, joint_state *joint, const joint_config 
     const bool reads = (core->joint_faults[i] & FAULT_BIT(FAULT_MOTOR)) != 0u ||
                        (joint->suspect == FAULT_POT_DRIFT && joint->suspect_ticks < NAME_TICKS);
     const float read_rad = reads ? number_size(joint->pot.angle_rad - joint->reference.position_rad) : 0.0f;
-    const float motor_rad = 2.0f * number_size(joint->pid.error_rad); /* so far a joint goes whose motor has half of its constant */
+    const float motor_rad = 2.0f * number_size(joint->pid.error_rad); /* so far a joint goes whose motor has half of its
+                                                                         constant */
     if (blind || read_rad > HELD_RAD || motor_rad > HELD_RAD) {
         safety_raise(core, blind ? FAULT_CURRENT_SENSOR : FAULT_FOLLOWING, i);
         core->state = STATE_FAULTED;
@@ -334,7 +340,8 @@ static void watch_motor(core_state *core, joint_state *joint, const joint_config
             safety_raise(core, fault, i);
             joint->suspect = fault;
             const bool rests = fault == FAULT_POT_FROZEN && joint->reference.speed_rad_s == 0.0f;
-            if (motor->trust == 1.0f || rests || fault == FAULT_POT_DRIFT) { /* else coasting shows the reading's share, whatever R is */
+            if (motor->trust == 1.0f || rests || fault == FAULT_POT_DRIFT) {
+                /* else coasting shows the reading's share, whatever R is */
                 doubt_reading(core, joint);
             }
         }
@@ -393,14 +400,15 @@ static void name(core_state *core, joint_state *joint, const joint_config *confi
     joint->suspect = FAULT_NONE;
 }
 
-/* Give a fault by which motor and reading disagreed its right name, once the motion since then shows it. Letting go of a
- * joint asks whose fault it is: where the back-EMF goes on without a step, the motor is a good witness. */
+/* Give a fault by which motor and reading disagreed its right name, once the motion since then shows it. Letting go of
+ * a joint asks whose fault it is: where the back-EMF goes on without a step, the motor is a good witness. */
 static void name_suspect(core_state *core, joint_state *joint, const joint_config *config, uint32_t i)
 {
     motor_state *motor = &joint->motor;
     const bool stepped = motor_stepped(motor);
+    const bool asked = (stepped || motor->doubted != 0u) && motor->trust == 1.0f;
     if (motor_is_stuck(motor, &config->motor, core->supply_v, &core->sums) ||
-        ((stepped || motor->doubted != 0u) && motor->trust == 1.0f && motor_disobeys(motor, &config->motor, core->supply_v, joint->pid.error_rad))) {
+        (asked && motor_disobeys(motor, &config->motor, core->supply_v, joint->pid.error_rad))) {
         blame(core, joint, motor_is_dead(motor, &config->motor) ? FAULT_CURRENT_SENSOR : FAULT_BRIDGE, i);
         core->state = STATE_FAULTED; /* nothing holds it but a brake */
         return;
@@ -457,14 +465,16 @@ static void watch_joint(core_state *core, joint_state *joint, const joint_config
     if (joint->motor.doubted == 0u) {
         watch_motor(core, joint, config, i);
     }
-    if (motor_is_fast(&joint->motor, &config->motor, joint->pid.speed_rad_s)) { /* by the reading where the motor is no witness */
+    if (motor_is_fast(&joint->motor, &config->motor, joint->pid.speed_rad_s)) {
+        /* by the reading where the motor is no witness */
         safety_raise(core, FAULT_OVERSPEED, i);
     }
     watch_current(core, joint, config, i);
     if (motor_swings(&joint->motor, joint->pid.speed_rad_s, joint->reference.speed_rad_s, config->speed_limit_rad_s)) {
         safety_raise(core, FAULT_OSCILLATION, i);
         take_back_gains(core, joint, i);
-        if (joint->motor.doubted == 0u && motor_answers_otherwise(&joint->motor, &config->motor)) { /* it swings for that */
+        if (joint->motor.doubted == 0u && motor_answers_otherwise(&joint->motor, &config->motor)) {
+            /* it swings for that */
             doubt_motor(joint, config);
             blame(core, joint, FAULT_CURRENT_SENSOR, i);
         }
@@ -523,8 +533,9 @@ void safety_watch_sleep(core_state *core)
         if (!bridge || !motor_flows_asleep(&joint->zero, motor, core->supply_v)) {
             continue;
         }
-        core->joint_faults[i] |= FAULT_BIT(FAULT_CURRENT_SENSOR); /* or the bridge conducts asleep: only a free joint that */
-        core->faults |= FAULT_BIT(FAULT_CURRENT_SENSOR);         /* rests all the same shows that it does not */
+        /* Or the bridge conducts asleep: only a free joint that rests all the same shows that it does not. */
+        core->joint_faults[i] |= FAULT_BIT(FAULT_CURRENT_SENSOR);
+        core->faults |= FAULT_BIT(FAULT_CURRENT_SENSOR);
         const bool rests = number_size(joint->pot.angle_rad - joint->motor.last_rad) < motor->apart_rad;
         if (rests && core->config.brake_engage_ticks == 0u) {
             rename_fault(core, i, FAULT_BRIDGE, FAULT_CURRENT_SENSOR);

@@ -26,7 +26,8 @@ inline float setpoint_shortest_s(float distance_rad, float from_rad_s, float to_
 
 /* Aim at (to_rad, to_rad_s) in the given ticks (1 or more), or later where speed_limit_rad_s (above 0) asks for it.
  * |to_rad_s| and the present speed must be within the limit. Returns whether it takes longer than asked for. */
-inline bool setpoint_aim(setpoint_state *setpoint, float to_rad, float to_rad_s, uint32_t ticks, float speed_limit_rad_s)
+inline bool setpoint_aim(setpoint_state *setpoint, float to_rad, float to_rad_s, uint32_t ticks,
+                         float speed_limit_rad_s)
 {
     const float distance_rad = to_rad - setpoint->position_rad;
     const float least_ticks =

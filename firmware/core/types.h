@@ -41,14 +41,15 @@
     X(PUSHED, 20, YIELD, "pushed: something moves the joint against its motor")                       \
     X(OVERSPEED, 21, HOLD, "overspeed: the joint is faster than its limit")                           \
     X(OSCILLATION, 22, HOLD, "oscillation: the joint swings about its reference; the stored gains are in use again") \
-    X(CURRENT_SENSOR, 23, HOLD, "current: its sensor shows another one than the voltage must drive, or a lead is broken") \
+    X(CURRENT_SENSOR, 23, HOLD,                                                                                    \
+      "current: its sensor shows another one than the voltage must drive, or a lead is broken")                       \
     X(OVERCURRENT, 24, JOINT, "overcurrent: the motor current stays beyond twice its limit")          \
     X(ARITHMETIC, 25, RELEASE, "arithmetic: a duty was no number")                                    \
     X(MEMORY, 26, RELEASE, "memory: the configuration in use has changed by itself")                  \
     X(TICKS_LOST, 27, RELEASE, "ticks lost: the control loop loses time again and again")             \
     X(TAKEN_OVER, 28, HOLD, "taken over: another host said hello while the arm was driven")           \
     X(CRASH, 29, RELEASE, "restarted after a crash of the firmware")                                      \
-    X(ENCODER, 30, JOINT, "encoder: no sound reading: its wires, or a magnet too weak or too strong")                       \
+    X(ENCODER, 30, JOINT, "encoder: no sound reading: its wires, or a magnet too weak or too strong") \
     X(BRIDGE, 31, SLEEP, "bridge: it drives its motor by itself; all drives sleep")                        \
     X(MOTOR, 32, HOLD, "motor: weak, or a winding shorted: it moves otherwise than its voltage and current say")
 
@@ -89,8 +90,8 @@ enum { REJECTION_NONE = 0, REJECTION_LIST(REJECTION_CODE) REJECTION_COUNT };
 
 /* What a fault does to a moving arm: HOLD stops it along its path and holds it. YIELD does so too, but the joint lets
  * itself be moved to where it is. JOINT shorts the windings of the joint and stops the others along their path. RELEASE
- * shorts the windings of all. SLEEP switches all drivers off, for one that drives by itself. CHOSEN is the configuration's
- * silence_reaction. */
+ * shorts the windings of all. SLEEP switches all drivers off, for one that drives by itself. CHOSEN is the
+ * configuration's silence_reaction. */
 enum {
     REACTION_HOLD = 1,
     REACTION_RELEASE = 2,
@@ -200,7 +201,8 @@ typedef struct transmission_config {
 } transmission_config;
 
 /* The encoder of one joint. The joint is at home_rad where its counts are those of the zero: an absolute one's
- * zero_counts, a quadrature one's when COMMAND_HOME came. Of pot then only jump_rad, frozen_rad and inverted_rad count. */
+ * zero_counts, a quadrature one's when COMMAND_HOME came. Of pot then only jump_rad, frozen_rad and inverted_rad
+ * count. */
 typedef struct encoder_config {
     uint32_t sensor;      /* SENSOR_...; the rest is not looked at for a potentiometer */
     uint32_t input;       /* 1 to JOINTS, no two joints' the same: which timer; quadrature only */
@@ -250,7 +252,7 @@ typedef struct core_config {
     uint32_t brake_engage_ticks;  /* 0 to 1000: how long they take to close; the drives hold meanwhile */
     uint32_t silence_ticks;    /* 2 to 60000: longest time without a motion command */
     uint32_t silence_reaction; /* REACTION_HOLD or REACTION_RELEASE */
-    uint32_t sync_led_pin;     /* 0: no sync LED; else 16 (port + 1) + pin, port 0 (A) to 7 (H): PA0 is 16, PC10 is 58 */
+    uint32_t sync_led_pin;     /* 0: no sync LED; else 16 (port + 1) + pin, port 0 (A) to 7 (H): PC10 is 58 */
     uint32_t sync_led_ticks;   /* 1 to 100: how long each bit of the LED's code lasts */
 } core_config;
 
@@ -341,7 +343,7 @@ typedef struct pid_demand {
     float duty_high;       /* 0 to duty_limit: likewise */
     float duty_slew_per_s;
     float damped_rad_s;    /* the speed that is damped: the measured one, or the motor's where the reading is wrong */
-    float braked_duty;     /* off it where the speed of an elastic joint's motor is beyond its limit: its integral gathers it, too */
+    float braked_duty;     /* off it where an elastic joint's motor is beyond its limit: its integral gathers it */
     float own_s_per_rad;   /* duty that back-EMF takes per rad/s */
     float motor_rad_s;     /* the motor's speed by it, 0 where it is not watched */
 } pid_demand;
@@ -381,7 +383,7 @@ typedef struct motor_state {
     uint32_t before;         /* not 0: it is known what the load took before that, */
     float before_v;          /* of the applied voltage less the back-EMF by the reading, */
     float before_a;          /* and as a current */
-    float heard_rad_s;       /* up to this speed a current is heard of late; 0 while it is doubted, or a step was seen */
+    float heard_rad_s;       /* up to this speed a current is heard of late; 0 while doubted, or a step was seen */
     float ohm;               /* learnt, as of the last sample */
     uint32_t sample_ticks;   /* driven_ticks when the next sample is taken */
     float rough_rad_s;       /* mean change of speed_rad_s from tick to tick */
@@ -448,9 +450,9 @@ typedef struct motor_state {
     float known_kk[MOTOR_KNOWN]; /* and its variance */
     uint32_t known;              /* how many of them there were */
     uint32_t weakened;           /* the faults of a constant that by these is less than it was; 0: none */
-    int32_t window_side;     /* which way the last one went, 1 or -1, by a negative torque 2 or -2; 0: not known where in its backlash it ended */
+    int32_t window_side;     /* which way the last one went, 1 or -1, by a negative torque 2 or -2; 0: not known */
     uint32_t sampled;        /* samples taken */
-    float trust;             /* of the speed limit: what the joint may use; 1 once motor and reading went the same way */
+    float trust;             /* of the speed limit: what it may use; 1 once motor and reading went the same way */
     float way_read_rad;      /* the way since the joint last rested, by the reading */
     float way_motor_rad;     /* and by the motor with the configured constant */
     float way_unsure_rad;    /* how far that may be off by its resistance */
@@ -461,7 +463,7 @@ typedef struct motor_state {
     float swing_shows_rad_s; /* sum of how far beyond the threshold it was in the looks in a row on a side, signed */
     uint32_t swings;         /* changes in quick succession */
     float swing_rad_s;       /* how far off it was at most since the last, signed, */
-    float swing_stays_rad_s; /* sum of that over the second half of the changes that count, less a share of the first half's */
+    float swing_stays_rad_s; /* sum of that over the second half of the changes, less a share of the first half's */
     uint32_t swing_ticks;    /* half a period of the joint on its spring: so long that gives back what it took */
     uint32_t fast_ticks;     /* faster than the limit, in a row */
     uint32_t none_samples;   /* in a row: no winding answers as it does */
@@ -471,7 +473,7 @@ typedef struct motor_state {
     float sample_read_rad[MOTOR_SAMPLES];
     float sample_v[MOTOR_SAMPLES]; /* sums since the sample before: applied voltage, V ticks, */
     float sample_a[MOTOR_SAMPLES]; /* and current, A ticks */
-    uint32_t alone;              /* not 0: the reading is no witness; the motor holds the joint, and nothing is learnt */
+    uint32_t alone;              /* not 0: the reading is no witness; the motor holds the joint, nothing is learnt */
     float known_r[MOTOR_KNOWN];  /* the resistance's scale as known_k, */
     float known_rr[MOTOR_KNOWN]; /* and its variance */
 } motor_state;

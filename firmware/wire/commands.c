@@ -180,7 +180,8 @@ static void take_command(wire_state *wire, const mavlink_message_t *message)
     if (!command_admit(wire, message, command.sequence, command.session)) {
         return;
     }
-    const bool known = (command.kind >= COMMAND_ENABLE && command.kind <= COMMAND_CLEAR_STOP) || command.kind == COMMAND_HOME;
+    const bool known =
+        (command.kind >= COMMAND_ENABLE && command.kind <= COMMAND_CLEAR_STOP) || command.kind == COMMAND_HOME;
     if (!known) {
         command_reject(wire, command.sequence, REJECTION_UNKNOWN_COMMAND);
         return;

@@ -302,13 +302,14 @@ static void write_sys_status(wire_state *wire)
         const int32_t each = wire->report.current_ma[joint];
         current_ma += each < 0 ? -each : each;
     }
+    const bool ready = outputs->faults == 0u && outputs->state != STATE_STOPPED;
     mavlink_sys_status_t status = {
         .onboard_control_sensors_present = SENSOR_MOTOR_OUTPUTS | SENSOR_BATTERY | PREARM_CHECK,
         .onboard_control_sensors_enabled =
             (outputs->drives_on != 0u ? SENSOR_MOTOR_OUTPUTS : 0u) | SENSOR_BATTERY | PREARM_CHECK,
         .onboard_control_sensors_health = ((outputs->faults & ~supply) == 0u ? SENSOR_MOTOR_OUTPUTS : 0u) |
                                           ((outputs->faults & supply) == 0u ? SENSOR_BATTERY : 0u) |
-                                          (outputs->faults == 0u && outputs->state != STATE_STOPPED ? PREARM_CHECK : 0u),
+                                          (ready ? PREARM_CHECK : 0u),
         .voltage_battery = (uint16_t)(wire->report.supply_mv < 65534u ? wire->report.supply_mv : 65534u),
         .current_battery = (int16_t)(current_ma < 327670 ? current_ma / 10 : 32767),
         .battery_remaining = -1,
@@ -363,7 +364,8 @@ void common_write(wire_state *wire)
     if (common->waits == WAITS_TO_CLEAR) {
         (void)ask_core(wire, COMMAND_CLEAR_FAULTS, WAITS_CLEAR);
     }
-    if (common->sensed_period != 0u && tick - common->sensed_tick >= common->sensed_period && telemetry_has_room(wire)) {
+    if (common->sensed_period != 0u && tick - common->sensed_tick >= common->sensed_period &&
+        telemetry_has_room(wire)) {
         common->sensed_tick = tick;
         write_sensed(wire);
     }
@@ -478,7 +480,8 @@ static void store(wire_state *wire)
         settings_copy(wire, 0u, &staged->config, sizeof staged->config);
     }
     for (uint32_t joint = 0u; joint < JOINTS; joint++) {
-        settings_copy(wire, offset_of(joint * PARAMS_OF_JOINT), &staged->config.joint[joint].gains, sizeof(joint_gains));
+        settings_copy(wire, offset_of(joint * PARAMS_OF_JOINT), &staged->config.joint[joint].gains,
+                      sizeof(joint_gains));
     }
     staged->crc = config_crc(&staged->config, sizeof staged->config);
     wire->common.params_staged = 1u;
@@ -487,7 +490,8 @@ static void store(wire_state *wire)
 
 static uint32_t arm(wire_state *wire, float armed)
 {
-    (void)ask_core(wire, armed != 0.0f ? COMMAND_ENABLE : COMMAND_DISABLE, armed != 0.0f ? WAITS_COMMAND : WAITS_DISARM);
+    (void)ask_core(wire, armed != 0.0f ? COMMAND_ENABLE : COMMAND_DISABLE,
+                   armed != 0.0f ? WAITS_COMMAND : WAITS_DISARM);
     return MAV_RESULT_ACCEPTED;
 }
 

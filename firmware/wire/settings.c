@@ -41,7 +41,8 @@ static void take_store(wire_state *wire, const mavlink_message_t *message)
 {
     mavlink_config_store_t store;
     mavlink_msg_config_store_decode(message, &store);
-    if (command_admit(wire, message, store.sequence, store.session) && command_append(wire, COMMAND_STORE, store.sequence) != NULL) {
+    if (command_admit(wire, message, store.sequence, store.session) &&
+        command_append(wire, COMMAND_STORE, store.sequence) != NULL) {
         wire->staged.crc = store.crc;
     }
 }

@@ -5,7 +5,9 @@
 
 #define RECORD_LIST(X)                                                                                             \
     X(joint_gains) X(gain_set) X(pot_config) X(joint_config) X(core_config) X(config_copy) X(move_command)         \
-    X(core_command) X(core_inputs) X(core_outputs) X(pid_state) X(pid_demand) X(setpoint_state) X(governor_state) X(motor_config) X(transmission_config) X(encoder_config) X(encoder_state) X(motor_state) X(motor_sums) X(zero_state) X(observer_state) X(crash_record) X(board_abilities) X(pot_state) \
+    X(core_command) X(core_inputs) X(core_outputs) X(pid_state) X(pid_demand) X(setpoint_state) X(governor_state) \
+    X(motor_config) X(transmission_config) X(encoder_config) X(encoder_state) X(motor_state) X(motor_sums) \
+    X(zero_state) X(observer_state) X(crash_record) X(board_abilities) X(pot_state) \
     X(joint_state) X(core_state) X(pil_request) X(pil_answer) X(wire_setup) X(wire_periods) X(wire_counters)       \
     X(wire_state)
 

@@ -54,7 +54,8 @@ void clock_start(void)
     (void)RCC->apb1enr; /* a peripheral answers two of its bus's clocks after it got them */
     watch_supply();
     const bool external = hse_start();
-    RCC->pllcfgr = external ? PLL_FACTORS(PLL_HSE_M, PLL_HSE_N) | RCC_PLLCFGR_SRC_HSE : PLL_FACTORS(PLL_HSI_M, PLL_HSI_N);
+    RCC->pllcfgr = external ? PLL_FACTORS(PLL_HSE_M, PLL_HSE_N) | RCC_PLLCFGR_SRC_HSE
+                            : PLL_FACTORS(PLL_HSI_M, PLL_HSI_N);
     RCC->cr |= RCC_CR_PLLON;
     if (OVER_DRIVE != 0u) {
         over_drive();

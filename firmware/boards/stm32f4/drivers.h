@@ -31,8 +31,8 @@ void pins_connect(uint32_t user);
 /* Let a joint's potentiometer pin be the chip select of its absolute encoder, high. Startup only. */
 void pins_select_start(uint32_t joint);
 
-/* Make the pin of the sync LED (core_config's sync_led_pin) an output, unless the table or the debugger has it, or it is
- * beyond port C. Startup only, after pins_start. */
+/* Make the pin of the sync LED (core_config's sync_led_pin) an output, unless the table or the debugger has it, or it
+ * is beyond port C. Startup only, after pins_start. */
 void pins_light_start(uint32_t led_pin);
 
 /* Switch the LED on or off, where pins_light_start could. Tick only. */
@@ -56,8 +56,8 @@ bool drives_stopped(void);
 /* Start the converter; the timers trigger it. Startup, and the tick where it stands still. */
 void adc_start(void);
 
-/* Read what the converter saw since the last tick. Where it stood still every potentiometer reads open (65535), there is
- * no supply, and it is started again. Tick only. */
+/* Read what the converter saw since the last tick. Where it stood still every potentiometer reads open (65535), there
+ * is no supply, and it is started again. Tick only. */
 void adc_read(core_inputs *inputs);
 
 /* Set up the encoders that a configuration has, and wait up to 20 ms for each absolute one. Startup only. */

@@ -1,8 +1,9 @@
-/* Encoders: a timer counts the edges of a quadrature one; absolute ones (AS5047) are on one SPI, each with a chip select.
+/* Encoders: a timer counts the edges of a quadrature one; absolute ones (AS5047) are on one SPI, each with a chip
+ * select.
  *
- * A frame of SPI answers the one before it. Each tick asks for the angle first, which answers what was asked last in the
- * tick before, and then for the diagnosis, which answers with the angle: a fresh angle and a diagnosis one tick old, in
- * two frames. AS5047P datasheet, chapters 7.3 (frames, registers) and 5.6 (times). */
+ * A frame of SPI answers the one before it. Each tick asks for the angle first, which answers what was asked last in
+ * the tick before, and then for the diagnosis, which answers with the angle: a fresh angle and a diagnosis one tick
+ * old, in two frames. AS5047P datasheet, chapters 7.3 (frames, registers) and 5.6 (times). */
 #include "encoder.h"
 
 #include "drivers.h"

@@ -1,5 +1,6 @@
 /* The registers of the STM32F446 and STM32F411 that the boards use. Names are the reference manuals' (RM0390, whose
- * chapters are named; RM0383 has the same) in lower case; the processor's own are ARMv7-M's. A gap named reserved keeps the offsets. */
+ * chapters are named; RM0383 has the same) in lower case; the processor's own are ARMv7-M's. A gap named reserved keeps
+ * the offsets. */
 #ifndef ARMSIGHT_STM32F4_REGISTERS_H
 #define ARMSIGHT_STM32F4_REGISTERS_H
 
@@ -108,7 +109,8 @@ typedef struct dma_registers {
 #define DMA_CR_MSIZE_HALF FIELD(1, 13)
 #define DMA_CR_PL(priority) FIELD(priority, 16)
 #define DMA_CR_CHSEL(channel) FIELD(channel, 25)
-#define DMA_HTIF BIT(4) /* half of the transfer; streams 0 and 4; 1 and 5 six bits further, 2 and 6 sixteen, 3 and 7 22 */
+#define DMA_HTIF BIT(4) /* half of the transfer; streams 0 and 4; 1 and 5 six bits further, 2 and 6 sixteen, 3 and 7
+                           22 */
 #define DMA_TCIF BIT(5) /* the whole of it */
 #define DMA_FLAGS 0x3Du /* all five */
 

@@ -21,7 +21,8 @@ void pendsv_interrupt(void);
 /* Begin. Reset. */
 void reset(void);
 
-/* Switch the drives off, keep where it happened, and wait for the watchdog. Every fault, a failed clock, supply too low, unexpected interrupt. */
+/* Switch the drives off, keep where it happened, and wait for the watchdog. Every fault, a failed clock, supply too
+ * low, unexpected interrupt. */
 void fault(void);
 void fault_stop(const uint32_t *frame, uint32_t exception);
 
