@@ -77,8 +77,8 @@ def open_arm(name_or_path: str | Path) -> Arm:
     """Return the arm of a built-in model's name, of a .toml file or of a .urdf file.
 
     ``name_or_path``: such as "six_r", "my_arm.toml", "my_arm.urdf", or "my_arm.urdf#tool0" where the link tool0 is the
-    tool; without it the chain's last link is. Raises InputError: the name is unknown, the file is unreadable or holds no
-    arm, or a tool link for what is no .urdf file.
+    tool; without it the chain's last link is. Raises InputError: the name is unknown (the error lists all that are
+    known), the file is unreadable or holds no arm, or a tool link for what is no .urdf file.
     """
     text = str(name_or_path)
     path, link = split_arm(text)

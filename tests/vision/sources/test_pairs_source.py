@@ -213,6 +213,12 @@ def test_a_file_or_an_address_without_its_kind_is_given_one():
         open_source(__file__)
 
 
+@pytest.mark.parametrize("spec", ["folder:", "folder::", "usb::", "usb::0,1", "bag: "])
+def test_a_source_of_no_name_is_not_the_current_folder(spec):
+    with pytest.raises(InputError, match=f"'{spec}': expected '{spec.partition(':')[0]}:' and then what it opens"):
+        open_source(spec)
+
+
 @pytest.mark.parametrize("spec", ["film:a.mp4", "/no/such/folder", "usbcam", ""])
 def test_an_unknown_source_lists_the_known_ones(spec):
     with pytest.raises(InputError, match=r"not a source: known are folder:..., pairs:..., video:..., url:..., usb:..."):

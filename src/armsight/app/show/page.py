@@ -54,8 +54,8 @@ figure { margin: 0 0 1rem; } figure img { width: 100%; height: auto; display: bl
 figcaption { background: var(--soft); padding: .6rem 1.1rem; margin-top: .6rem; font-size: .95rem; }
 figcaption p { margin: .3rem 0; }
 @media screen and (max-width: 48rem) {  /* a row is a card: its name, and below it each value under its column's */
-  thead { display: none; } table, tbody { display: block; } table, table.headline { font-size: .85rem; }
-  tr { display: grid; grid-template-columns: repeat(auto-fill, minmax(6.2rem, 1fr)); gap: .2rem .7rem; padding: .45rem 0;
+  thead { display: none; } table, tbody { display: block; } table, table.headline { font-size: .82rem; }
+  tr { display: grid; grid-template-columns: repeat(auto-fill, minmax(6.6rem, 1fr)); gap: .2rem .4rem; padding: .45rem 0;
     align-items: end; border-bottom: 1px solid var(--line); }
   tr > * { border: 0; padding: 0; min-width: 0 !important; white-space: normal !important; } td:empty { display: none; }
   td::before { content: attr(data-column); display: block; color: var(--muted); font-size: .78rem; }

@@ -31,7 +31,7 @@ class Fact:
     values: Mapping[str, Any] = field(default_factory=dict)
 
 
-ON_PAGE = 6  # lines under a title that a page shows unfolded; half: a reader unfolds all, double: long pages
+ON_PAGE = 6  # lines that a page shows unfolded; half: a reader unfolds all, double: long pages
 
 
 @dataclass(frozen=True)
@@ -246,9 +246,7 @@ def _html(block: Block, images: Mapping[str, bytes]) -> str:
         case Fact(sentence) if sentence:
             return page.bullets([sentence])
         case Lines() if block.lines or block.none:
-            if not block.title or not block.lines:
-                return page.bullets(block.lines or [block.none])
-            first, more = block.lines[:ON_PAGE], block.lines[ON_PAGE:]
-            rest = page.folded(f"and {len(more)} more", page.bullets(more))
-            return f"<p>{page.text(block.title)}</p>\n{page.bullets(first)}{rest}"
+            first, more = block.lines[:ON_PAGE] or [block.none], block.lines[ON_PAGE:]
+            title = f"<p>{page.text(block.title)}</p>\n" if block.title and block.lines else ""
+            return title + page.bullets(first) + page.folded(f"and {len(more)} more", page.bullets(more))
     return ""

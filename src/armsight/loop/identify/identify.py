@@ -78,6 +78,10 @@ class LeftOut(NamedTuple):
     how: str  #: which poses those are, as text
     scale: float = 1.0  #: by how much their residuals made all sigmas larger; 1 where chance explains them
 
+    def __repr__(self) -> str:
+        """Return the errors, and on which poses."""
+        return f"LeftOut({self.validation!r}, {self.how})"
+
 
 @dataclass(frozen=True, eq=False)
 class Identified(Record):

@@ -134,7 +134,7 @@ class Follower:
         if not follows(target):
             raise InputError(
                 f"{target.body.name} cannot be followed: it needs three discs or more with known normals, and no "
-                "coded markers"
+                "coded markers; measure and measure_all take it"
             )
         discs = target.discs
         assert discs is not None

@@ -57,6 +57,8 @@ SOURCES: dict[str, Callable[[str], Source]] = {
 }
 
 
+#: Kinds of one path: an empty one would be the current folder.
+_PATHS = ("folder", "bag", "lerobot")
 #: Kinds that are cameras.
 LIVE = ("usb:", "url:")
 
@@ -66,7 +68,7 @@ def check_source(spec: str) -> None:
 
     Raises InputError: neither a known kind nor a folder.
     """
-    kind, colon, _ = spec.partition(":")
+    kind, colon, rest = spec.partition(":")
     if not (colon and kind in SOURCES) and not os.path.isdir(os.path.expanduser(spec)):
         known = ", ".join(f"{name}:..." for name in SOURCES)
         hint = ""
@@ -80,6 +82,8 @@ def check_source(spec: str) -> None:
             hint = f" ({'bag' if spec.endswith(SUFFIXES) else 'video'}:{spec}?)"
         gone = ", and there is no such folder" if os.sep in spec and not hint else ""
         raise InputError(f"{spec.rstrip(':')}: not a source{hint}: known are {known}, or the path of a folder{gone}")
+    if colon and kind in SOURCES and (rest.startswith(":") or (kind in _PATHS and not rest.strip())):
+        raise InputError(f"{spec!r}: expected '{kind}:' and then what it opens, with one colon (armsight record -h)")
 
 
 def open_source(spec: str | Path) -> Source:
