@@ -35,7 +35,7 @@ def rested(seed, rests=60):
 
 
 def test_tilt_and_the_zeros_that_gravity_shows_are_found_and_the_others_are_open():
-    off = []
+    off, zeros_off = [], []
     for seed in range(3):
         arm, said, q, readings, tilt, zeros = rested(700 + seed)
         shown, _ = gravity_shows(arm, said, q, readings)
@@ -44,7 +44,11 @@ def test_tilt_and_the_zeros_that_gravity_shows_are_found_and_the_others_are_open
         miss = np.array([s.value for s in shown]) - truth
         assert (np.abs(miss) < 3 * np.array([s.sigma for s in shown])).all()
         off.append(np.degrees(miss[:2]))
+        closed = [k for k, s in enumerate(shown) if s.name in ("zero 2+3+4", "zero 5")]
+        zeros_off.append(np.degrees(miss[closed]))
+        assert max(np.degrees(shown[k].sigma) for k in closed) < 0.06  # a link bent about a joint's axis is a zero, too
     assert np.sqrt(np.mean(np.square(off))) < 0.08  # two sigma of what is claimed
+    assert np.sqrt(np.mean(np.square(zeros_off))) < 0.06
 
 
 def test_joints_with_parallel_axes_are_one_set():

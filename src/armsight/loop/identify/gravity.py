@@ -44,14 +44,14 @@ class ArmRests(Carrier):
         free[at.backlash : at.compliance] = free[at.rest :] = False
         self._free, self._x, self.sigma = np.flatnonzero(free), np.zeros(at.size), self._model.sigmas[free]
         # Each rest is elsewhere in the backlash, and by the rest that no function of the joint explains.
-        self._own = 0.25 * (prior.backlash_rad**2 + prior.float_rad**2) + prior.rest_rad**2
-        self._direction, self._table = arm.direction, arm.table
+        own = np.sqrt(0.25 * (prior.backlash_rad**2 + prior.float_rad**2) + prior.rest_rad**2)
+        self.scatter = own * np.isin(self._free, at.zeros)
+        self._direction, self._table, self._between = arm.direction, arm.table, between(arm)
 
     def at(self, t_s: float) -> tuple[ToolMotion, Array]:
         """Return the tool's pose at a rest, and its derivative by the errors."""
         (T,), (H,) = self._model.poses(self._x, self._q[[int(t_s)]], np.zeros((1, 3, self._at.joints)))
-        by_zeros = H[:, self._at.zeros]
-        return ToolMotion(T, cov=self._own * by_zeros @ by_zeros.T), H[:, self._free]
+        return ToolMotion(T), H[:, self._free]
 
     def moved(self, step: Array) -> Self:
         """Return it with errors moved by a step."""
@@ -64,7 +64,8 @@ class ArmRests(Carrier):
         """Return how far the joints (n,) are beyond their readings, rad, the mean of the rests, and its covariance (n, n).
 
         That is the zero with what linearity and compliance add to it where the arm rested: a wave of the one cannot be
-        distinguished from the other there.
+        distinguished from the other there. A link's frame that is bent about y is rotated about the axes of the joints
+        before and after it, unless these are parallel: Denavit and Hartenberg's zeros hold that.
         """
         n, at = self._at.joints, self._at
         each = np.empty((len(self._q), n, at.size))
@@ -72,6 +73,10 @@ class ArmRests(Carrier):
             offsets_by(self._table, q, np.zeros((3, n)), by)
         by = each.mean(axis=0)
         by[np.arange(n), at.zeros] = self._direction
+        i = np.flatnonzero(np.abs(np.sin(self._between)) >= _PARALLEL)
+        bent, twist = at.zeros[i + 1] - 1, self._between[i]
+        by[i, bent] += self._direction[i] / np.sin(twist)
+        by[i + 1, bent] -= self._direction[i + 1] / np.tan(twist)
         return by @ self._x, by[:, self._free] @ cov @ by[:, self._free].T
 
 
@@ -89,10 +94,15 @@ class Shown(NamedTuple):
     open: bool
 
 
+def between(arm: Arm) -> Array:
+    """Return the angles (n - 1,) from each joint's axis to the next one's, rad."""
+    return arm.alpha[:-1] if arm.convention == "standard" else arm.alpha[1:]
+
+
 def parallel(arm: Arm) -> list[list[int]]:
     """Return the joints, from 0, in sets whose axes are parallel at all angles."""
-    sets, between = [[0]], arm.alpha[:-1] if arm.convention == "standard" else arm.alpha[1:]
-    for joint, twist in enumerate(between, 1):
+    sets = [[0]]
+    for joint, twist in enumerate(between(arm), 1):
         if abs(np.sin(twist)) < _PARALLEL:
             sets[-1].append(joint)
         else:

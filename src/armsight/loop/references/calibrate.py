@@ -56,6 +56,7 @@ class Carrier(ABC):
     """What carries the tool, with errors of its own that the readings show too: an arm."""
 
     sigma: Array  #: (K,) how far each error may be
+    scatter: Array  #: (K,) one sigma, about, by which each differs from reading to reading; how much is found
 
     @abstractmethod
     def at(self, t_s: float) -> tuple[ToolMotion, Array]:
@@ -69,7 +70,7 @@ class Carrier(ABC):
 class Known(Carrier):
     """A motion that is known, but for the covariance of its poses."""
 
-    sigma = np.zeros(0)
+    sigma = scatter = np.zeros(0)
 
     def __init__(self, motion: Callable[[float], ToolMotion]) -> None:
         self._motion = motion
@@ -96,7 +97,7 @@ class ReferenceCalibration(Record, Generic[R]):
     """A calibrated reference, and how far to believe it."""
 
     reference: R  #: with its parameters, their covariance, its delay and that's sigma
-    noise: dict[str, float]  #: channel -> how many times larger its noise is than its readings say
+    noise: dict[str, float]  #: channel, or "carrier" -> how many times larger its noise is than said
     used: NDArray[np.bool_]  #: (N,) whether a reading was used; the others are blunders
     left_out: Array  #: (N, m) error of the readings predicted by fits to the other blocks, measured minus predicted
     squares: Array  #: (N,) their squared Mahalanobis distance over m: 1 on average where the covariance is honest
@@ -155,17 +156,13 @@ class _SensorFit(Generic[R]):
     def __init__(self, reference: R, readings: Sequence[Reading], carrier: Carrier, fit_delay: bool) -> None:
         self._first, self._readings, self._delays = reference, readings, fit_delay
         self.channel = np.array([reading.channel for reading in readings])
-        self.names = [reference.channels[k] for k in np.unique(self.channel)]
-        self.sigma = np.sqrt(np.diag(reference.cov))
-        if fit_delay:
-            self.sigma = np.append(self.sigma, reference.sigma_delay_s)
-        self.sigma = np.append(self.sigma, carrier.sigma)
+        late = [reference.sigma_delay_s] * fit_delay
+        self.sigma = np.concatenate([np.sqrt(np.diag(reference.cov)), late, carrier.sigma])
         self.unknowns, self.begin = len(self.sigma), _State(reference, carrier, np.zeros(len(self.sigma)))
         noise = np.linalg.cholesky(np.array([reading.cov for reading in readings]))
-        self._own = {
-            name: noise * (self.channel == k)[:, None, None]
-            for k, name in zip(np.unique(self.channel), self.names, strict=True)
-        }
+        kinds, self._scattered = np.unique(self.channel), np.flatnonzero(carrier.scatter)
+        self.names = [reference.channels[k] for k in kinds] + ["carrier"] * bool(self._scattered.size)
+        self._own = [noise * (self.channel == k)[:, None, None] for k in kinds]
 
     def reference(self, at: _State[R], cov: Array) -> R:
         """Return the reference of a state with the covariance (Q, Q) of its unknowns."""
@@ -182,7 +179,7 @@ class _SensorFit(Generic[R]):
 
     def linear(self, at: _State[R]) -> Linear:
         """Return the residuals near a state."""
-        e, J, given = [], [], []
+        e, J, given, own = [], [], [], []
         for reading in self._readings:
             motion, errors = at.carrier.at(reading.t_s - at.reference.delay_s)
             expected = at.reference.expected(motion, reading.channel)
@@ -190,7 +187,9 @@ class _SensorFit(Generic[R]):
             e.append(expected.z - reading.z)
             J.append(np.column_stack([expected.by_parameters, *delay, expected.by_tool @ errors]))
             given.append(expected.by_tool @ motion.cov @ expected.by_tool.T)
-        return Linear(np.array(e), np.array(J), np.array(given), self._own, {}, self.sigma**-2.0, at.total)
+            own.append(expected.by_tool @ (errors * at.carrier.scatter)[:, self._scattered])
+        sources = dict(zip(self.names, (*self._own, np.array(own)), strict=False))
+        return Linear(np.array(e), np.array(J), np.array(given), sources, {}, self.sigma**-2.0, at.total)
 
     def solved(
         self, at: _State[R], linear: Linear, variances: Array, used: NDArray[np.bool_]
