@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import struct
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -25,8 +26,10 @@ from armsight.loop.identify.identify import identify
 from armsight.loop.identify.lengths import without_blunders
 from armsight.loop.identify.model import motion, nominal_table
 from armsight.loop.identify.selection import folds_of
+from armsight.loop.references.calibrate import PosePath, calibrate
 from armsight.loop.references.distance import Distance, follow_ranges
 from armsight.loop.references.lighthouse import Lighthouse, Sweeps, beginning, follow
+from armsight.loop.references.reference import Reading
 from armsight.robot.arm_file import open_arm
 
 FOLDS = 6
@@ -130,40 +133,73 @@ def lighthouse(folder: Path, seconds: float = 60.0) -> None:
 
 
 def uwb(folder: Path) -> None:
-    """Position in the plane: the smoother against plain least squares of each ten readings a second."""
-    for case in ("LOS", "NLOS"):
-        at = folder / case / "Trajectory_A" / "Case_1"
-        ranges = [np.loadtxt(at / f"{a}.csv", delimiter=",", skiprows=1) for a in ("A3", "A5", "A9", "A12")]
-        truth = np.loadtxt(at / "trajectory.csv", delimiter=",", skiprows=1)
-        truth[:, 0] *= 1e-9
-        anchors = np.array([r[0, 3:6] for r in ranges])
-        t, z = np.concatenate([r[:, 1] for r in ranges]) * 1e-9, np.concatenate([r[:, 6] for r in ranges])
-        channel = np.repeat(np.arange(4), [len(r) for r in ranges])
-        order = np.argsort(t)
-        order = order[(t[order] > truth[0, 0]) & (t[order] < truth[-1, 0])]
-        t, z, channel = t[order], z[order], channel[order]
-        sensor = Distance(
-            name="uwb", cov=np.eye(23), anchors=anchors, p_tool=np.zeros(3), offset=np.zeros(4), scale=np.ones(4)
-        )
+    """Position in the plane: the smoother against plain least squares of each ten readings a second.
+
+    Tag's point, delay, offsets and scales come from the other recording, for both; anchors are those of the recording.
+    """
+    takes = {case: ranges_of(folder / case / "Trajectory_A" / "Case_1") for case in ("LOS", "NLOS")}
+    for case, other in zip(takes, reversed(takes), strict=True):
+        anchors, t, channel, z, truth = takes[case]
+        known = range_sensor(*takes[other])
+        sensor = replace(known, anchors=anchors)
+        h, at = np.radians(np.unwrap(truth[:, 4], period=360.0)), t - sensor.delay_s
+
+        def tag(at: Array, truth: Array = truth, h: Array = h, p: Array = sensor.p_tool) -> Array:
+            heading = np.interp(at, truth[:, 0], h)
+            lever = p[0] * np.array([np.cos(heading), np.sin(heading)]) + p[1] * np.array(
+                [-np.sin(heading), np.cos(heading)]
+            )
+            return np.column_stack([np.interp(at, truth[:, 0], truth[:, c]) for c in (1, 2)]) + lever.T
+
         start = np.append(truth[0, 1:3], anchors[:, 2].mean())
-        path = follow_ranges(sensor, t - t[0], channel, z, start)
-        e = (path.p - np.column_stack([np.interp(t, truth[:, 0], truth[:, c]) for c in (1, 2, 3)]))[:, :2]
+        path = follow_ranges(sensor, t, channel, z, start)
+        e = path.p[:, :2] - tag(at)
         squares = np.einsum("ni,nij,nj->n", e, np.linalg.inv(path.cov[:, :2, :2]), e)
-        even = np.arange(t[0], t[-1], 0.1)
-        each = np.column_stack([np.interp(even, t[channel == c], z[channel == c]) for c in range(4)])
-        at_even = np.column_stack([np.interp(even, truth[:, 0], truth[:, c]) for c in (1, 2)])
+        even, right = np.arange(t[0], t[-1], 0.1), (z - sensor.offset[channel]) / sensor.scale[channel]
+        each = np.column_stack([np.interp(even, t[channel == c], right[channel == c]) for c in range(4)])
+        at_even = tag(even - sensor.delay_s)
         theirs, x = np.empty(len(even)), start
         for k, r in enumerate(each):
             fitted = least_squares(lambda v, r=r, a=anchors: np.linalg.norm(v - a, axis=1) - r, x)
             theirs[k] = np.linalg.norm(fitted.x[:2] - at_even[k])
             x = fitted.x if fitted.cost < 1.0 else x
         ours = np.linalg.norm(e, axis=1)
-        rms, other = (float(np.sqrt(np.mean(v**2))) for v in (ours, theirs))
+        rms, rms_plain = (float(np.sqrt(np.mean(v**2))) for v in (ours, theirs))
         print(
             f"uwb, {case}: median {np.median(ours):.2f} m, plain least squares {np.median(theirs):.2f}, ratio "
-            f"{np.median(ours) / np.median(theirs):.2f} (goal 0.70); RMS {rms:.2f} m, plain {other:.2f}; 95 % cover "
-            f"{100 * (squares < 5.99).mean():.0f} %"
+            f"{np.median(ours) / np.median(theirs):.2f} (goal 0.70); RMS {rms:.2f} m, plain {rms_plain:.2f}; 95 % cover "
+            f"{100 * (squares < 5.99).mean():.0f} %; delay {sensor.delay_s:.3f} s, {sensor.sigma_delay_s:.3f}, tag "
+            f"{sensor.p_tool.round(2)} m, by {other}"
         )
+
+
+def ranges_of(folder: Path) -> tuple[Array, Array, NDArray[np.int64], Array, Array]:
+    """Return anchors (4, 3), times (N,), channels (N,), ranges (N,) and truth (M, 5): time, position, heading, deg."""
+    ranges = [np.loadtxt(path, delimiter=",", skiprows=1) for path in folder.glob("A*.csv")]
+    ranges.sort(key=lambda r: tuple(r[0, 3:6]))  # their names are swapped between recordings
+    truth = np.loadtxt(folder / "trajectory.csv", delimiter=",", skiprows=1)
+    first, t, z = truth[0, 0], np.concatenate([r[:, 1] for r in ranges]), np.concatenate([r[:, 6] for r in ranges])
+    channel = np.repeat(np.arange(4), [len(r) for r in ranges])
+    order = np.argsort(t)
+    order = order[(t[order] > first + 1e9) & (t[order] < truth[-1, 0] - 1e9)]
+    truth[:, 0] = (truth[:, 0] - first) * 1e-9
+    return np.array([r[0, 3:6] for r in ranges]), (t[order] - first) * 1e-9, channel[order], z[order], truth
+
+
+def range_sensor(anchors: Array, t: Array, channel: NDArray[np.int64], z: Array, truth: Array) -> Distance:
+    """Return ranges calibrated by a path that is known: the tag's point, the delay, each offset and scale."""
+    Ts = np.tile(np.eye(4), (len(truth), 1, 1))
+    Ts[:, :3, 3], heading = truth[:, 1:4], np.radians(truth[:, 4])
+    Ts[:, :3, :3] = exp_so3(np.outer(heading, [0.0, 0.0, 1.0]))
+    path = PosePath(truth[:, 0], Ts)
+    cov = np.diag(np.append([0.3, 0.3, 1.5], np.tile([0.02, 0.02, 0.02, 0.5, 0.01], 4)) ** 2)
+    flat = {"p_tool": np.zeros(3), "offset": np.zeros(4), "scale": np.ones(4), "sigma_delay_s": 0.3}
+    readings = [
+        Reading(float(t[k]), int(channel[k]), z[k : k + 1], 0.01 * np.eye(1))
+        for k in range(0, len(t), 23)
+        if path.covers(float(t[k]), 0.8)
+    ]
+    return calibrate(Distance(name="uwb", cov=cov, anchors=anchors, **flat), readings, path, fit_delay=True).reference
 
 
 def clock_between(t: Array, p: Array, t_mocap: Array, p_mocap: Array) -> float:

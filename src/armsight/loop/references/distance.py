@@ -6,9 +6,9 @@ scale. Anchors nearly in one plane leave their mirror image open.
 Path of a point by ranges to anchors, as ultra-wideband gives them: biased for seconds, now and then far too long.
 
 In: ranges, each at its own time. Out: the point's path with covariance. A range reads too long or short by a bias of each
-anchor that fades within seconds (Gauss and Markov), is noisy, and has tails, longer ones to the far side, where a wall or a
-body stands between. The greatest likelihood does not find how large these are, as a slow bias looks like motion: they are
-given. An iterated extended Kalman smoother (Bell, SIAM J. Optimization 4, 1994), weights as of Student's distribution.
+anchor and one of all, which fade within seconds (Gauss and Markov), is noisy, and has tails, longer ones to the far side,
+where a wall or a body stands between. How large these are is given, as the greatest likelihood takes slow biases for
+motion. An iterated extended Kalman smoother (Bell, SIAM J. Optimization 4, 1994), with weights of Student's distribution.
 """
 
 from __future__ import annotations
@@ -159,7 +159,8 @@ class RangeNoise(NamedTuple):
     """How ranges and the body are off."""
 
     range_m: float = 0.1  #: white noise of a range, m
-    bias_m: float = 0.2  #: of an anchor's bias, m
+    bias_m: float = 0.1  #: of a bias of each anchor, m
+    common_m: float = 0.1  #: of one that all share, m
     fade_s: float = 20.0  #: in which a bias fades, s
     acceleration: float = 0.7  #: density of the body's acceleration, m/s2 per root of Hz
     upright: float = 0.1  #: acceleration along z over that in the plane; 1 for what flies
@@ -185,9 +186,10 @@ def follow_ranges(
         start: (3,) about where it begins, m.
         noise: of the sensor and the body; None: ultra-wideband on something that drives.
     """
-    noise, n = noise or RangeNoise(), 6 + len(anchors.anchors)
+    noise, n = noise or RangeNoise(), 7 + len(anchors.anchors)
     steps = [_transition(float(dt), n, noise) for dt in np.diff(t_s, prepend=t_s[0])]
-    sigma, path = np.repeat([START_M, START_M_S, noise.bias_m], [3, 3, n - 6]), np.zeros((0, n))
+    sigma = np.repeat([START_M, START_M_S, noise.bias_m, noise.common_m], [3, 3, n - 7, 1])
+    path = np.zeros((0, n))
     for _ in range(PASSES):
         now, ahead, found = (np.append(start, np.zeros(n - 3)), np.diag(sigma**2)), [], []
         for k, ((F, Q), c, read) in enumerate(zip(steps, channel, z, strict=True)):
@@ -196,8 +198,8 @@ def follow_ranges(
             at = path[k] if len(path) else x  # linearised where the pass before found it
             apart = at[:3] - anchors.anchors[c]
             far, H = float(np.linalg.norm(apart)), np.zeros(n)
-            H[:3], H[6 + c] = anchors.scale[c] * apart / far, 1.0
-            left = read - anchors.scale[c] * far - anchors.offset[c] - at[6 + c]
+            H[:3], H[[6 + c, -1]] = anchors.scale[c] * apart / far, 1.0
+            left = read - anchors.scale[c] * far - anchors.offset[c] - at[6 + c] - at[-1]
             e, known = left - H @ (x - at), float(H @ P @ H)
             size = noise.range_m if len(path) else np.sqrt(known + noise.range_m**2)
             R = noise.range_m**2 * (1.0 + (left / ((LONG if left > 0.0 else SHORT) * size)) ** 2)
@@ -218,5 +220,5 @@ def _transition(dt: float, n: int, noise: RangeNoise) -> tuple[Array, Array]:
     q = noise.acceleration**2 * np.array([1.0, 1.0, noise.upright**2])
     F[i, i + 3], F[b, b] = dt, np.exp(-dt / noise.fade_s)
     Q[i, i], Q[i, i + 3], Q[i + 3, i], Q[i + 3, i + 3] = q * dt**3 / 3, q * dt**2 / 2, q * dt**2 / 2, q * dt
-    Q[b, b] = noise.bias_m**2 * (1 - F[b, b] ** 2)
+    Q[b, b] = np.append(np.full(n - 7, noise.bias_m), noise.common_m) ** 2 * (1 - F[b, b] ** 2)
     return F, Q
