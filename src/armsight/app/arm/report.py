@@ -99,7 +99,6 @@ def _shown(joint: JointFigures, key: str) -> bool:
 def remarks(report: ArmReport) -> list[str]:
     """Return what a reader must know beside the tables."""
     lines = [*(f"do not trust this recording: {line}" for line in report.health), *report.notes]
-    lines += [f"backlash of {j.name}: {j.backlash_how}" for j in report.joints if j.backlash_deg is None]
     lines += [
         "Zero: true angle less reading; that of the first and of the last joint looks like another base and another tool.",
         "Backlash: behind the joint's sensor. Sides: reading from above less from below, at the same command. Droop: "
@@ -109,7 +108,8 @@ def remarks(report: ArmReport) -> list[str]:
         "Each part is what it moves the tool by, RMS, in the frames of the run; parts may cancel each other: then a "
         "share is negative. Controller: readings less commands, such as the droop under gravity.",
     ]
-    return [*lines, "Drift has no temperature beside it: runs do not record any."] if report.drift_mm_per_h else lines
+    lines += ["Drift has no temperature beside it: runs do not record any."] if report.drift_mm_per_h else []
+    return lines + [f"backlash of {j.name}: {j.backlash_how}" for j in report.joints if j.backlash_deg is None]
 
 
 def _map_figure(report: ArmReport, figure: FigureBase) -> None:
