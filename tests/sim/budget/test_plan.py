@@ -112,6 +112,7 @@ def test_between_a_chart_that_is_found_and_one_that_is_not_it_is_that_of_the_siz
             "does not focus nearer than 0.3 m.*a distance of 0.31 m can be had",
         ),
         ({"volume": "1x1x0.1m"}, "the field of view is"),
+        ({"distance": "0.6m"}, "volume and body are .* or a volume 0.26 m high"),
         ({"volume": "0.1x0.1x0.1m", "verging_deg": 90.0}, "look past each other"),
         ({"volume": "0.1x0.1x0.1m", "baseline": "3m"}, "the arm would cross it; at most 1.6 m"),
         ({"volume": "0.1x0.1x0.1m", "distance": "3m"}, "at least 8 are needed"),
