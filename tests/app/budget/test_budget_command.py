@@ -6,6 +6,8 @@ import re
 import numpy as np
 import pytest
 
+import armsight as armsight_package
+from armsight.app.budget.report import _map
 from armsight.sim.budget import result
 from armsight.sim.budget.plan import RigPlan
 from armsight.sim.workcell.body import body_target, body_text
@@ -43,7 +45,9 @@ def test_a_wish_that_is_not_reached_is_exit_code_1(armsight, monkeypatch):
     said = armsight("budget", *SMALL, "--want", "0.18mm")
     assert said.code == 1
     assert "0.18 mm requested: not reached" in said.out
-    assert armsight("budget", *SMALL, "--want", "5mm").code == 0
+    other = armsight("budget", *SMALL, "--want", "5mm", "preset=webcam-good-light", "--speed", "0m/s")
+    assert other.code == 0
+    assert "one trigger, own lighting, but preset webcam-good-light, skew_ms 4, readout_ms 14; " in other.out
 
 
 def test_a_wish_below_the_print_is_rejected_with_the_nearest(armsight):
@@ -148,13 +152,27 @@ def test_a_motion_file_gives_volume_and_speed(armsight, tmp_path, monkeypatch):
     assert 0.02 < float(found["plan"]["speed"].removesuffix("m/s")) < 1.0
 
 
+@pytest.mark.parametrize("objective", ["mean", "worst"])
+def test_the_map_shows_the_objective(objective):
+    found = armsight_package.budget(volume="0.2x0.2x0.2m", camera="machine-vision-2mp", objective=objective)
+    columns = [float(text.get_text()) for text in _map(found).axes[0].texts]
+    assert found.plan.overall(np.array(columns)) == pytest.approx(found.mm, abs=0.006)
+
+
 def test_a_plan_in_a_folder_with_an_equals_sign_is_a_plan(armsight, tmp_path):
     assert_rejected(armsight("budget", tmp_path / "seed=3" / "plan.toml"), f"{tmp_path}/seed=3/plan.toml: ")
 
 
 @pytest.mark.parametrize(
     ("key", "value"),
-    [("rate_hz", "0"), ("body_scale", "0"), ("warming_k", "nan"), ("pairs", "1000000"), ("skew_ms", "-5")],
+    [
+        ("rate_hz", "0"),
+        ("body_scale", "0"),
+        ("warming_k", "nan"),
+        ("pairs", "1000000"),
+        ("skew_ms", "-5"),
+        ("readout_ms", "-1"),
+    ],
 )
 def test_numbers_that_no_rig_has_are_named(armsight, tmp_path, key, value):
     (tmp_path / "plan.toml").write_text(f"{key} = {value}\n")

@@ -273,6 +273,40 @@ def test_the_objective_is_the_worst_or_the_mean_position():
     assert "95 % at the mean position" in repr(mean)
 
 
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"camera": "machine-vision-2mp"},
+        {"camera": "webcam-720p-cheap", "distance": "0.6m", "speed": "0m/s"},
+        {"camera": "webcam-720p", "speed": "0.5m/s", **_LATE},
+        {"camera": "webcam-720p", "speed": "1m/s", "objective": "mean"} | _LATE,
+    ],
+)
+def test_what_takes_long_is_left_out_of_a_bound_below_the_loss(given):
+    plan = RigPlan.read("", volume="0.2x0.2x0.2m", **given)
+    assert 0 < result.loss(plan, known=True) <= result.loss(plan)
+    assert not result.below(plan, result.loss(plan))
+    assert result.below(plan, 1.01 * result.loss(plan))
+
+
+def test_the_lens_of_a_webcam_is_not_exchanged_for_a_better_rig():
+    with pytest.raises(InputError, match=r"the field of view is .* a distance of 1 m"):
+        result.best(RigPlan.read("", camera="webcam-1080p-autofocus", distance="0.8m"))
+
+
+def test_a_small_aperture_is_dark_and_soft():
+    plan = RigPlan(camera="machine-vision-2mp", f_number=16.0)
+    usual, dark = RigPlan(camera="machine-vision-2mp").pipeline, plan.pipeline
+    assert dark.sensor.white_e == pytest.approx(usual.sensor.white_e / 16)
+    airy_px = 1.029 / 2.355 * 550e-6 * 16.0 * plan.focal_px / plan.focal_mm  # as wide at half its height
+    assert np.hypot(usual.psf_sigma_px, airy_px) == pytest.approx(dark.psf_sigma_px, rel=0.1)
+
+
+def test_a_board_of_metres_is_named():
+    with pytest.raises(InputError, match=r"chessboard:9x6:2m fills the images at \d+ m: .* is the unit right"):
+        planned(RigPlan(board="chessboard:9x6:2m"))
+
+
 def test_a_distance_that_is_left_out_is_one_that_may_be():
     assert [RigPlan.read("", distances=each).distance for each in ("1m,2m", "0.3m,50cm", "0.5m,1m")] == [
         "1m",

@@ -19,7 +19,6 @@ from armsight.app.show.table import TextTable
 from armsight.sim.budget.plan import KEYS, PRICES, RigPlan, catalogue, planned
 from armsight.sim.budget.result import AT_REST, NOT_MODELLED, RigBudget, with_pairs
 from armsight.sim.workcell.body import body_text
-from armsight.vision.calibrate.budget import Budget
 
 _SHOWN = 0.01  # share of lost shots that is shown; half: one in 200 is, double: one in 50 is not
 #: Names of all files that a report has.
@@ -61,10 +60,10 @@ def budget_report(found: RigBudget, alternatives: Sequence[RigBudget] = (), run:
     caption, title = "95 % of the errors in motion are within, mm.", "Error at 95 % over the volume, seen from above"
     sections: dict[str, Section] = {
         "result": ("Result", [Fact(shares), Fact(others), table, more, *_compared(found, alternatives), *beside]),
-        "map": ("Over the volume", [Plot("volume", partial(_map, found.found), caption, title)]),
+        "map": ("Over the volume", [Plot("volume", partial(_map, found), caption, title)]),
         "missing": ("Limits", [Lines(NOT_MODELLED, "not in the budget:")]),
     }
-    notes, cameras = [f"chosen: {_chosen(plan)}"], f"{plan.cameras.text}; {plan.baseline} apart"
+    notes, cameras = [f"chosen: {_chosen(plan)}"], f"{plan.cameras.text}{_unlike(plan)}; {plan.baseline} apart"
     if plan.rig:
         cameras = f"{plan.rig}: {{}}x{{}} px, {1e3 * plan.baseline_m:.4g} mm apart".format(*plan.image_size_px)
         if not {"camera", "preset"} & {*plan.named}:
@@ -144,6 +143,19 @@ def _answer(found: RigBudget) -> tuple[Grade, str]:
     return grade, f"{asked} requested: {reached}. {said}.{costs}."
 
 
+def _unlike(plan: RigPlan) -> str:
+    """Say in what the cameras are other than their class."""
+    keys = ("preset", "image", "f_number", "skew_ms", "start_ms", "readout_ms", "exposure_ms", "refocus_ppm")
+    said = [f"{key} {getattr(plan, key)}" for key in keys if key in plan.named]
+    if plan.preset:
+        said += [
+            f"{name}_ms {1e3 * plan.timing[name]:.2g}" for name in ("skew", "readout") if f"{name}_ms" not in plan.named
+        ]
+    if (own := plan.cameras.own_lens) and abs(now := plan.focal_px / plan.image_size_px[0] - own) > 1e-3:
+        said += [f"a lens of {own + now:.2f} widths in place of {own:.2f}"]
+    return f", but {', '.join(said)}" if said else ""
+
+
 def _chosen(plan: RigPlan) -> str:
     """Say what was left out."""
     shown = {
@@ -158,14 +170,14 @@ def _chosen(plan: RigPlan) -> str:
     return ", ".join(f"{key} {value}" for key, value in said if value != "")
 
 
-def _map(found: Budget) -> Figure:
-    """Draw the error at 95 % over the volume, seen from above: near below, the worst height of each column."""
+def _map(of: RigBudget) -> Figure:
+    """Draw the error at 95 % over the volume, seen from above: near below, of each column its worst or its mean height."""
     figure, ax = subplots(3.2)
-    level = 1e3 * found.at_level(found.cov())[0]
-    order = np.argsort(-level)
-    seen = np.round(1e4 * np.column_stack([found.p_left[:, 0], found.p_left @ found.forward]))[order]
-    k = order[np.unique(seen, axis=0, return_index=True)[1]]  # the worst height of each column
-    across, deep, level = 1e3 * found.p_left[k, 0], 1e3 * (found.p_left[k] @ found.forward), level[k]
+    found, every = of.found, 1e3 * of.found.at_level(of.found.cov())[0]
+    seen = np.round(1e4 * np.column_stack([found.p_left[:, 0], found.p_left @ found.forward]))
+    columns, which = np.unique(seen, axis=0, return_inverse=True)
+    level = np.array([of.plan.overall(every[which == k]) for k in range(len(columns))])
+    across, deep = columns.T / 10
     shown = ax.scatter(across, deep, c=level, s=420, marker="s", cmap="viridis")
     for x, y, each in zip(across, deep, level, strict=True):
         dark = each < (level.min() + level.max()) / 2

@@ -78,7 +78,8 @@ def marker_noise(pipeline: CameraPipeline, kind: str, size_px: float, moved_px: 
     sigma, found, asked = _noise(pipeline, kind, shown_px, moved_px * shown_px / size_px)
     if not sigma:
         blur = f", blurred over {moved_px:.1f} px" if moved_px else ""
-        raise InputError(f"a {kind} of {size_px:.1f} px{blur}: {found} of {asked} are found in a chart")
+        what = f"a {kind} of {size_px:.1f} px{blur}: {found} of {asked} are found in a chart"
+        raise InputError(f"{what}: expected half of them: a wider aperture, less motion or larger markers are needed")
     return sigma
 
 

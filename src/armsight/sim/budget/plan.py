@@ -24,7 +24,7 @@ from armsight.files import read_toml
 from armsight.geometry.pose import inverse, pose
 from armsight.geometry.rotation import exp_so3
 from armsight.sim.budget.chart import marker_noise
-from armsight.sim.camera.stages import CameraPipeline, Defocus
+from armsight.sim.camera.stages import CameraPipeline, Defocus, Lens
 from armsight.sim.example_rig import board_poses
 from armsight.sim.render.scene import chessboard
 from armsight.sim.workcell.body import body_target
@@ -78,6 +78,8 @@ _RANGES = {
     "lens_ppm_per_k": (0.0, 10000.0), "skew_ms": (0.0, 1000.0), "start_ms": (0.0, 1000.0), "exposure_ms": (0.001, 1000.0),
     "readout_ms": (0.0, 1000.0), "f_number": (0.5, 64.0), "rate_hz": (0.1, 1000.0), "backlash_deg": (0.0, 10.0),
 }  # fmt: skip
+#: Standard deviation of the Gaussian nearest to the Airy disc of green light, over the f-number, mm: 0.42 wavelengths.
+_AIRY_MM = 0.42 * 550e-6
 _OBJECTIVES: dict[str, Callable[[Array], Any]] = {"worst": np.max, "mean": np.mean}
 #: What a class of price means, euros for a pair of cameras with lenses.
 PRICES = "0 nothing, 1 below 100, 2 to 300, 3 to 800, 4 to 2,000, 5 above, in euros the pair"
@@ -100,6 +102,11 @@ class CameraClass:
     bytes_px: float
     usb: float
     refocus_ppm: float = 0.0
+
+    @property
+    def own_lens(self) -> float:
+        """Focal length, image widths, of a webcam, whose lens cannot be exchanged; 0 of the others."""
+        return self.focal_widths * (self.focus_m > 0 or self.refocus_ppm > 0)
 
 
 @cache
@@ -266,6 +273,10 @@ class RigPlan:
             raise InputError(f"distance {self.distance}: the distances that may be are {found[0]:g} to {found[1]:g} m")
         return found[0], found[1]
 
+    def left_out(self, key: str) -> bool:
+        """Whether a value says that something else, such as the class, decides: it is outside its range, and not named."""
+        return key in _RANGES and key not in self.named and getattr(self, key) == getattr(RigPlan, key) <= 0.0
+
     def overall(self, values: Array) -> float:
         """Return the worst or the mean of values over the volume."""
         return float(_OBJECTIVES[self.objective](values))
@@ -338,11 +349,17 @@ class RigPlan:
 
     @cached_property
     def pipeline(self) -> CameraPipeline:
-        """The camera's stages, its exposure as planned, and its light by the aperture where that is not the class's."""
+        """The camera's stages, its exposure as planned; light and diffraction by another aperture than the class's."""
         found = CameraPipeline.load(self.preset or self.cameras.preset)
         found = found if self.exposure_ms < 0 else found.exposed_for(1e-3 * self.exposure_ms)
-        share = (self.cameras.f_number / (self.f_number or self.cameras.f_number)) ** 2
-        return replace(found, sensor=found.sensor and replace(found.sensor, white_e=share * found.sensor.white_e))
+        usual, f = self.cameras.f_number, self.f_number or self.cameras.f_number
+        found = replace(
+            found, sensor=found.sensor and replace(found.sensor, white_e=(usual / f) ** 2 * found.sensor.white_e)
+        )
+        if f <= usual:
+            return found
+        psf_px = math.hypot(found.psf_sigma_px, _AIRY_MM * math.sqrt(f**2 - usual**2) * self.focal_px / self.focal_mm)
+        return replace(found, lens=Lens(psf_px))
 
     @cached_property
     def timing(self) -> dict[str, float]:
@@ -429,7 +446,7 @@ class RigPlan:
         """
         for key, (least, most) in _RANGES.items():
             value = getattr(self, key)
-            if value != getattr(RigPlan, key) and not least <= value <= most:
+            if not (least <= value <= most or self.left_out(key)):
                 raise InputError(f"{key} is {value}: expected {least:g} to {most:g}")
             if key in _OF_DEFAULT and self.body and value != 1.0:
                 raise InputError(f"{key} is {value:g}: it is of the default body, not of {self.body}")
@@ -490,8 +507,8 @@ class RigPlan:
         return {"pixel noise": math.sqrt(sharp), "defocus": math.sqrt(soft), "exposure blur": math.sqrt(moved)}
 
     @cached_property
-    def conditions(self) -> Conditions:
-        """Return what is not known."""
+    def known(self) -> Conditions:
+        """Return what is not known but for markers' noise, calibration and gates, which take longest to compute."""
         t, (speed, rotation) = self.timing, self.speeds
         arm, handeye = (0.0, 0.0), (0.0, 0.0)
         if self.arm:
@@ -502,22 +519,29 @@ class RigPlan:
             arm = math.sqrt(square[:3].sum()), math.sqrt(square[3:].sum())
         bent = length_m(self.body_print, "body_print"), length_m(self.body_bent, "body_bent")
         mount, lens = (1e-6 * each * self.warming_k for each in (self.mount_um_per_k, self.lens_ppm_per_k))
-        noise, gate, cov = self._noise_px(), Gates(), self.existing.cov if self.existing else np.zeros((0, 0))
         refocus = 1e-6 * (self.cameras.refocus_ppm if self.refocus_ppm < 0 else self.refocus_ppm)
-        if not self.existing:
-            keys = ("camera", "preset", "image", "baseline", "board", "pairs", "board_bent", "sets")
+        return Conditions(
+            board_scale=self.board_print, marker=self.marker_of, body_sigma_m=bent, body_scale=self.body_size,
+            mount_m=mount, lens_share=lens, refocus_share=refocus, skew_s=t["skew"], start_s=t["start"],
+            readout_s=t["readout"], stamp_s=t["stamp"], speed_m_s=speed, rotation_rad_s=rotation, handeye=handeye, arm=arm,
+        )  # fmt: skip
+
+    @cached_property
+    def conditions(self) -> Conditions:
+        """Return what is not known."""
+        t, noise, gate, cov = self.timing, self._noise_px(), Gates(), np.zeros((0, 0))
+        if self.existing:
+            cov = self.existing.cov
+        else:
+            keys = "camera", "preset", "image", "f_number", "baseline", "board", "pairs", "board_bent", "sets"
             kept = {key: getattr(self, key) for key in keys}
             widths, angle = self.focal_px / self.image_size_px[0], self.stereo_rig.convergence_deg
             cov = _calibrated(RigPlan(focal_widths=widths, verging_deg=angle, **kept))
         if self.apart:  # as `run` and `live` search
             loose, moved_m = replace(self.stereo_rig, cov=cov, sigma_px=LOOSE_PX), math.hypot(t["skew"], t["start"])
-            moved_m *= speed / math.sqrt(3)
+            moved_m *= self.speeds[0] / math.sqrt(3)
             gate = gates(loose, self.layout, self.views[len(self.views) // 2], math.hypot(*noise.values()), moved_m)
-        return Conditions(
-            noise, cov, self.board_print, self.marker_of, bent, self.body_size, mount, lens,
-            refocus, t["skew"], t["start"], t["readout"], t["stamp"], speed, rotation, gate,
-            handeye, arm,
-        )  # fmt: skip
+        return replace(self.known, noise_px=noise, cov_calibration=cov, gate=gate)
 
 
 #: Key -> its type: what a plan may say; and types in words.
@@ -543,18 +567,25 @@ def _calibrated(plan: RigPlan) -> Array:
     columns, rows = (int(n) for n in np.rint(np.ptp(board.body.points, axis=0)[:2] / size_m) + 1)
     rig, pattern = plan.stereo_rig, chessboard(columns, rows, size_m)
     sets = [board_poses(np.random.default_rng(seed), rig, pattern, plan.pairs) for seed in range(plan.sets)]
-    px, least_px = size_m * plan.focal_px / float(np.median(np.concatenate(sets)[:, 2, 3])), _LEAST_PX[kind]
-    if px < least_px:
+    away_m, least_px = float(np.median(np.concatenate(sets)[:, 2, 3])), _LEAST_PX[kind]
+    if away_m > _MOST_M:
+        raise InputError(
+            f"{plan.board} fills the images at {away_m:.0f} m: expected at most {_MOST_M:g} m: is the unit right?"
+        )
+    if (px := size_m * plan.focal_px / away_m) < least_px:
         raise InputError(f"a {kind} of {plan.board} is {px:.1f} px, at least {least_px:g} are needed")
     sigma, bent_m = marker_noise(plan.pipeline, kind, px), length_m(plan.board_bent, "board_bent")
     covs = [calibration_covariance(rig, board.body.points, Ts, sigma, bent_m) for Ts in sets]
     return np.asarray(np.mean(covs, axis=0))
 
 
-def planned(plan: RigPlan, cameras: int = 2) -> Budget:
-    """Return the budget of a plan: of its two cameras, of the left one alone, or of three in an equilateral triangle."""
+def planned(plan: RigPlan, cameras: int = 2, *, known: bool = False) -> Budget:
+    """Return the budget of a plan: of its two cameras, of the left one alone, or of three in an equilateral triangle.
+
+    ``known``: of what :attr:`RigPlan.known` says alone.
+    """
     plan.check()
-    layout, given, rig = plan.layout, plan.conditions, plan.stereo_rig
+    layout, given, rig = plan.layout, plan.known if known else plan.conditions, plan.stereo_rig
     points, normals = layout.body.points, layout.normals
 
     def of(pair: int | None) -> Budget:

@@ -12,6 +12,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -26,7 +27,7 @@ from armsight.vision.discs.bias import expect
 from armsight.vision.markers.targets import Composite
 from armsight.vision.pose.bundle import BundleModel, BundleState, Observations, minimise
 from armsight.vision.pose.measure import locate_composite, measure_detections
-from armsight.vision.pose.predict import PoseDerivatives, PredictedView, pose_derivatives, view
+from armsight.vision.pose.predict import PoseDerivatives, PredictedView, pose_derivatives, view, view_at
 from armsight.vision.rig import StereoRig
 
 #: Share of errors that a figure "at 95 %" covers.
@@ -171,17 +172,23 @@ def volume_views(
     ``of_three``: 0, 1 or 2, for a pair of three cameras at the corners of an equilateral triangle: volume and body as that
     pair has them, which looks past the triangle's middle. What it sees is not cut: a real camera would not be rolled.
     """
-    w, h, d = size_m / 2
-    positions = [(x, y, z) for z in (-d, 0.0, d) for y in (-h, 0.0, h) for x in (-w, 0.0, w)]
-    plain = [view(rig, points, normals, distance_m + z, (0.0, 0.0), (x, y)) for x, y, z in positions]
+    positions = np.array(list(product((-0.5, 0.0, 0.5), repeat=3)))[:, ::-1] * size_m
+
+    def views(roll: float, below: float) -> list[PredictedView]:
+        """Return the body rolled about the direction of view, and so far below: its pose is linear in its position."""
+        first, *others = (
+            view(rig, points, normals, distance_m + z, (0.0, 0.0), (x, y + below), roll)
+            for x, y, z in np.vstack([np.zeros(3), np.eye(3)])
+        )
+        along = np.array([other.T_left_body[:3, 3] - first.T_left_body[:3, 3] for other in others])
+        Ts = np.tile(first.T_left_body, (len(positions), 1, 1))
+        Ts[:, :3, 3] += positions @ exp_so3(np.array([0.0, 0.0, roll])).T @ along
+        return [view_at(rig, points, normals, T, first.forward) for T in Ts]
+
+    plain = views(0.0, 0.0)
     if of_three is None:
         return plain
-    roll, below = of_three * _THIRD, rig.baseline_m / (2 * np.sqrt(3.0))
-    c, s = np.cos(roll), np.sin(roll)
-    rolled = [
-        view(rig, points, normals, distance_m + z, (0.0, 0.0), (c * x - s * y, s * x + c * y + below), roll)
-        for x, y, z in positions
-    ]
+    rolled = views(of_three * _THIRD, rig.baseline_m / (2 * np.sqrt(3.0)))
     return [replace(one, seen=seen.seen) for one, seen in zip(rolled, plain, strict=True)]
 
 
