@@ -76,7 +76,13 @@ def test_check_says_rate_gap_and_noise_beside_that_of_the_class(sweep, capsys):
     assert found["accelerometer"]["noise_over_class"] == pytest.approx(0.72, rel=0.25)
     assert np.mean(found["accelerometer"]["random_walk_m_s_per_sqrt_s"]) == pytest.approx(0.0028, rel=0.25)
     assert found["settling"] is None
-    run("references", "check", folder / "references.toml")
+    (weak,) = said.lines[0]["weak"]
+    assert re.fullmatch(
+        r"imu: no reading for [\d.]+ s after [\d.]+ s \(gaps: 1\): readings were lost, or its clock jumped", weak
+    )
+    write(folder / "even.csv", np.column_stack([0.02 * np.arange(len(values)), values[:, 1:]]))
+    (folder / "even.toml").write_text('[imu]\nkind = "inertial"\nsource = "even.csv"\nrate_hz = 50.0\n')
+    run("references", "check", folder / "even.toml")
     assert capsys.readouterr().out.startswith("Good: what was recorded is as its class is")
 
 

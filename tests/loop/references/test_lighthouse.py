@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -40,7 +42,7 @@ def _moving(t: Array) -> tuple[Array, Array]:
     return p, exp_so3(w)
 
 
-def _sweeps(beacons: Lighthouse, seconds: float, seed: int, reflected: float = 0.0) -> Sweeps:
+def _sweeps(beacons: Lighthouse, seconds: float, seed: int, reflected: float = 0.0, pace: float = 1.0) -> Sweeps:
     rng = np.random.default_rng(seed)
     t, receiver, beacon, plane = [], [], [], []
     for b in (0, 1):
@@ -52,7 +54,7 @@ def _sweeps(beacons: Lighthouse, seconds: float, seed: int, reflected: float = 0
                 plane.append(np.full(4, k))
     parts = [np.concatenate(each) for each in (t, receiver, beacon, plane)]
     s = Sweeps(*parts, np.zeros(len(parts[0])))
-    angle = beacons.along(s, *_moving(s.t_s))[0] + NOISE_RAD * rng.standard_normal(len(s.t_s))
+    angle = beacons.along(s, *_moving(pace * s.t_s))[0] + NOISE_RAD * rng.standard_normal(len(s.t_s))
     lost = rng.random(len(angle)) < reflected
     return s._replace(angle=np.where(lost, angle + rng.uniform(-0.5, 0.5, len(angle)), angle))
 
@@ -104,6 +106,17 @@ def test_the_bundle_finds_the_beacons_while_the_body_moves() -> None:
     e = np.concatenate([path.p[k] - p, np.zeros_like(p)], axis=1)
     cov = path.covariance(k)
     assert np.mean(np.einsum("ki,kij,kj->k", e[:, :3], np.linalg.inv(cov[:, :3, :3]), e[:, :3])) / 3 < 4
+
+
+@pytest.mark.parametrize("pace", [0.0, 0.02, 1.0])
+def test_acceleration_is_as_large_as_the_path_shows_and_a_rest_is_one(pace: float) -> None:
+    true = _beacons()
+    known, s = replace(true, cov=0 * true.cov), _sweeps(true, 4.0, 12, 0.02, pace)
+    path = follow(known, s, *beginning(known, s))
+    k = np.arange(10, len(path.t_s) - 10, 5)
+    e, cov = path.p[k] - _moving(pace * path.t_s[k])[0], path.covariance(k)[:, :3, :3]
+    assert np.sqrt((e**2).sum(axis=1).mean()) < (3e-5 if pace < 0.1 else 2e-4)
+    assert np.mean(np.einsum("ki,kij,kj->k", e, np.linalg.inv(cov), e)) / 3 < 3
 
 
 def test_a_point_triangulated_from_beacons_has_an_honest_covariance() -> None:

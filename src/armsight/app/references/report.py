@@ -139,11 +139,15 @@ def checked(entries: list[Entry]) -> Report:
     return Report(name, "References", "", "", sections, notes, {"references": found}, assessed=answer)
 
 
-def _weak_stream(entry: Entry, stream: StreamCheck, axes: list[str], z: Array) -> list[str]:
+def _weak_stream(entry: Entry, stream: StreamCheck, axes: list[str], t_s: Array, z: Array) -> list[str]:
     """Return what is weak in how readings came, whatever they are."""
     name, weak = entry.reference.name, []
     if entry.rate_hz is not None and abs(stream.rate_hz / entry.rate_hz - 1) > RATE:
         weak.append(f"{name}: the rate is {stream.rate_hz:.4g} Hz, not {entry.rate_hz:g} as the file says")
+    if stream.gaps:
+        after_s = t_s[np.diff(t_s).argmax()]
+        gap = f"no reading for {stream.longest_gap_s:.2g} s after {after_s:.3f} s"
+        weak.append(f"{name}: {gap} (gaps: {stream.gaps}): readings were lost, or its clock jumped")
     if len(COLUMNS[type(entry.reference)]) > 1:  # one number repeats where its step is above the noise
         if stream.doubled > RATE:
             weak.append(f"{name}: {100 * stream.doubled:.0f} % of readings repeat the one before: it is read too often")
@@ -168,7 +172,7 @@ def _check(entry: Entry) -> tuple[dict[str, Any], list[str], list[str]]:
     for unit, scale in (("ms", 1e3), ("us", 1e6), ("ns", 1e9)):
         if entry.rate_hz is not None and abs(stream.rate_hz * scale / entry.rate_hz - 1) <= RATE:
             raise InputError(f"{source}: the rate is {stream.rate_hz:.4g} Hz, as if t_s were in {unit}; give s")
-    weak = _weak_stream(entry, stream, axes, z)
+    weak = _weak_stream(entry, stream, axes, t_s, z)
     if isinstance(entry.reference, Magnetometer):
         check_unit(str(source), z)
     if isinstance(entry.reference, Distance) and not np.median(np.abs(z)) < MOST_M:

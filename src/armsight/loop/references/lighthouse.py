@@ -8,8 +8,9 @@ has it: github.com/collabora/libsurvive). Each sweep is a reading of its own at 
 Path of a free body by readings, each at its own time, together with the parameters of the reference (a bundle).
 
 In: sweeps of beacons, and a pose every now and then to begin with. Out: poses at even times with covariance, and the
-reference with parameters and covariance. Between knots the body moves evenly; its acceleration is white noise. Readings are
-weighed by Cauchy's function, whose scale falls from round to round: reflections lose their weight and far starts arrive.
+reference with parameters and covariance. Between knots the body moves evenly; its acceleration is white noise of the
+most probable density. Readings are weighed by Cauchy's function, whose scale falls from round to round: reflections lose
+their weight and far starts arrive.
 The knots are a band, which is eliminated (Triggs et al., "Bundle adjustment: a modern synthesis", 2000).
 """
 
@@ -211,6 +212,8 @@ TAILS = 3.0  # sigmas; where a reading begins to lose weight; half: noise is thr
 STEPS = 12  # Levenberg-Marquardt steps of a round; half: slow rounds stop early
 SMALL = 1e-4  # relative fall of the cost that ends a round; half, double: nothing
 TRUST_M, TRUST_RAD = 0.02, 0.05  # damping of a knot's step at factor 1; half, double: nothing
+#: A knot's acceleration first, m/s2, rad/s2; rounds, probes of a trace, least share; half: rests wander, double: slow.
+BEGIN, MATCHED, PROBES, LEAST_SEEN = (10.0, 50.0), 8, 16, 1e-4
 KNOTS = 6  # numbers of a knot
 WINDOW_S = 0.02  # s; a revolution: sweeps taken for simultaneous to begin with; half: too few, double: the body moves
 MOST_OPEN, FAR_M = 12, 0.02  # sweeps of a window at least, and m that receivers are off their planes at most
@@ -242,16 +245,7 @@ class BodyPath(Record):
         return np.asarray(own + B @ self.reference.cov @ B.swapaxes(1, 2))
 
 
-def follow(
-    reference: Lighthouse,
-    sweeps: Sweeps,
-    t_s: Array,
-    p: Array,
-    R: Array,
-    *,
-    acceleration: tuple[float, float] = (10.0, 50.0),
-    scales: tuple[float, ...] = SCALES,
-) -> BodyPath:
+def follow(reference: Lighthouse, sweeps: Sweeps, t_s: Array, p: Array, R: Array) -> BodyPath:
     """Fit the path of a body and the parameters of its reference.
 
     Args:
@@ -260,22 +254,23 @@ def follow(
         t_s: (K,) even times of the knots, all sweeps between the first and the last.
         p: (K, 3) positions to begin at, base, m.
         R: (K, 3, 3) rotations to begin at.
-        acceleration: density of the body's acceleration at a knot, m/s2 and rad/s2.
-        scales: of the rounds, rad.
     """
-    bundle = _Bundle(reference, sweeps, t_s, acceleration)
+    bundle = _Bundle(reference, sweeps, t_s)
     state = (reference, p, R, np.zeros(len(reference.cov)))
-    for scale in scales:
+    for scale in SCALES:
         state = bundle.rounded(state, scale)
-    e = bundle.linear(state)[0]
-    sigma = float(np.median(np.abs(e)) / 0.6745)
-    band, border, H = bundle.information(bundle.linear(state), sigma)
+    for _ in range(MATCHED):
+        sigma = float(np.median(np.abs(bundle.linear(state)[0])) / 0.6745)
+        bundle.match(state, sigma)
+        state = bundle.rounded(state, sigma)
+    linear = bundle.linear(state)
+    band, X, _, H = bundle.eliminated(linear, state[3], sigma)
     cov = np.zeros_like(reference.cov)
-    free = bundle.free
-    cov[np.ix_(free, free)] = np.linalg.inv(H)
-    whole = np.zeros((len(border), len(cov)))
-    whole[:, free] = border
-    return BodyPath(t_s, state[1], state[2], replace(state[0], cov=cov), sigma, np.abs(e) < TAILS * sigma, band, whole)
+    cov[np.ix_(bundle.free, bundle.free)] = np.linalg.inv(H)
+    border = np.zeros((len(X), len(cov)))
+    border[:, bundle.free] = -X[:, 1:]
+    used = np.abs(linear[0]) < TAILS * sigma
+    return BodyPath(t_s, state[1], state[2], replace(state[0], cov=cov), sigma, used, band, border)
 
 
 def beginning(reference: Lighthouse, sweeps: Sweeps, rate_hz: float = 40.0) -> tuple[Array, Array, Array]:
@@ -309,7 +304,7 @@ _Linear = tuple[Array, Array, Array, Array]
 class _Bundle:
     """Normal equations of a path."""
 
-    def __init__(self, reference: Lighthouse, sweeps: Sweeps, t_s: Array, acceleration: tuple[float, float]) -> None:
+    def __init__(self, reference: Lighthouse, sweeps: Sweeps, t_s: Array) -> None:
         order = np.argsort(sweeps.t_s, kind="stable")
         self._order = np.argsort(order)
         self._sweeps, self._K, dt = sweeps.rows(order), len(t_s), float(t_s[1] - t_s[0])
@@ -319,7 +314,7 @@ class _Bundle:
         variance = np.diag(reference.cov)
         self.free = np.flatnonzero(variance > 0)
         self._known = 1 / variance[self.free]
-        self._smooth = np.repeat(1 / (np.square(acceleration) * dt**4), 3)
+        self._smooth = np.repeat(1 / (np.square(BEGIN) * dt**4), 3)
 
     def linear(self, state: _State) -> _Linear:
         """Return residuals (N,), their derivative (N, 12) by two knots and (N, P) by parameters, and bends (K - 2, 6)."""
@@ -347,12 +342,8 @@ class _Bundle:
             knots, own = self.step(linear, state[3], scale, damping)
             full = np.zeros(len(state[3]))
             full[self.free] = own
-            near = (
-                state[0].moved(full),
-                state[1] + knots[:, :3],
-                state[2] @ exp_so3(knots[:, 3:].copy()),
-                state[3] + full,
-            )
+            p, R = state[1] + knots[:, :3], state[2] @ exp_so3(knots[:, 3:].copy())
+            near = state[0].moved(full), p, R, state[3] + full
             tried = self.linear(near)
             now = self.cost(tried, near[3], scale)
             if now >= cost:
@@ -388,22 +379,33 @@ class _Bundle:
                     band[KNOTS * (u - v), at + KNOTS * v + c] += smooth * second[u] * second[v]
         return band, right, border
 
-    def information(self, linear: _Linear, scale: float) -> tuple[Array, Array, Array]:
-        """Return the band's factor, what the parameters move of the knots, and the parameters' information."""
-        band, _, border = self._normal(linear, scale)
-        factor = cholesky_banded(band, lower=True)
-        moved = cho_solve_banded((factor, True), border)
-        weight = 1 / (1 + (linear[0] / (TAILS * scale)) ** 2) / scale**2
-        return factor, -moved, (linear[2].T * weight) @ linear[2] + np.diag(self._known) - border.T @ moved
+    def match(self, state: _State, scale: float) -> None:
+        """Set the densities of acceleration to the most probable ones (MacKay, Neural Computation 4, 1992)."""
+        linear = self.linear(state)
+        factor = self.eliminated(linear, state[3], scale)[0]
+        signs = np.random.default_rng(0).choice([-1.0, 1.0], (*linear[3].shape, PROBES))
+        for kind in (slice(0, 3), slice(3, 6)):
+            right = np.zeros((self._K, KNOTS, PROBES))
+            for u, second in enumerate((1.0, -2.0, 1.0)):
+                right[u : self._K - 2 + u, kind] += second * signs[:, kind]
+            flat = right.reshape(-1, PROBES)
+            bends, trace = linear[3][:, kind], np.vdot(flat, cho_solve_banded((factor, True), flat)) / PROBES
+            seen = 1.0 - self._smooth[kind][0] * trace / bends.size
+            self._smooth[kind] = np.clip(seen, LEAST_SEEN, 1.0) * bends.size / (bends**2).sum()
 
-    def step(self, linear: _Linear, at: Array, scale: float, damping: float) -> tuple[Array, Array]:
-        """Return the step (K, 6) of the knots and (P,) of the free parameters."""
+    def eliminated(self, linear: _Linear, at: Array, scale: float, damping: float = 0.0) -> tuple[Array, ...]:
+        """Return the band's factor, what moves the knots (6 K, 1 + P), and of the parameters gradient and information."""
         e, _, own, _ = linear
         band, right, border = self._normal(linear, scale)
         band[0] += damping * np.tile(np.repeat([TRUST_M**-2.0, TRUST_RAD**-2.0], 3), self._K)
-        X = cho_solve_banded((cholesky_banded(band, lower=True), True), np.column_stack([right, border]))
+        factor = cholesky_banded(band, lower=True)
+        X = cho_solve_banded((factor, True), np.column_stack([right, border]))
         weight = 1 / (1 + (e / (TAILS * scale)) ** 2) / scale**2
-        H = (own.T * weight) @ own + np.diag((1 + damping) * self._known) - border.T @ X[:, 1:]
         g = own.T @ (weight * e) + self._known * at[self.free] - border.T @ X[:, 0]
+        return factor, X, g, (own.T * weight) @ own + np.diag((1 + damping) * self._known) - border.T @ X[:, 1:]
+
+    def step(self, linear: _Linear, at: Array, scale: float, damping: float) -> tuple[Array, Array]:
+        """Return the step (K, 6) of the knots and (P,) of the free parameters."""
+        _, X, g, H = self.eliminated(linear, at, scale, damping)
         x = -np.linalg.solve(H, g) if len(self.free) else g
         return -(X[:, 0] + X[:, 1:] @ x).reshape(-1, KNOTS), np.asarray(x)
