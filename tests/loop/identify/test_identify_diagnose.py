@@ -207,6 +207,29 @@ def test_rotations_of_something_else_are_rejected():
     assert "rotations are not of this arm" in said(w, replace(measured, R_rig_body=other))
 
 
+@pytest.mark.parametrize(
+    ("joint", "read", "expected"),
+    [
+        (2, lambda q: q[:, 2] + q[:, 1], "joint 3 (.*) is given together with joint 2: subtract q2 from q3"),
+        (2, lambda q: q[:, 2] - q[:, 1], "joint 3 (.*) is given together with joint 2: add q2 to q3"),
+        (5, lambda q: q[:, 5] + q[:, 4], "joint 6 (.*) is given together with joint 5: subtract q5 from q6"),
+        (3, lambda q: np.radians(q[:, 3]), "joint 4 (.*) alone is in radians: convert q4"),
+        (1, lambda q: q[:, 1] - np.radians(40), "joint 2 (.*) has another zero than .*: add (39|40)"),
+        (
+            3,
+            lambda q: np.pi / 2 - q[:, 3],
+            "joint 4 (.*) counts the other way, and .*the sign of q4, and then add (89|9[01])",
+        ),
+    ],
+)
+@pytest.mark.parametrize("name", ["ur5", "six_r"])
+def test_one_joint_that_is_read_wrongly_is_named(name, joint, read, expected):
+    w, measured = made(name, 31 + joint)
+    q = measured.q.copy()
+    q[:, joint] = read(q)
+    assert re.search(expected, said(w, replace(measured, q=q)))
+
+
 @pytest.mark.parametrize("shift", [1, -2])
 def test_rows_that_are_shifted_are_reported(shift):
     w, measured = made("ur5", 1)

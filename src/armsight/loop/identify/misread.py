@@ -10,7 +10,7 @@ Two quantiles of hand-eye residuals decide, or the linear placement; of equal re
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -48,6 +48,7 @@ EVALUATED = 60  # poses that a reading is evaluated by at most
 #: Rows in common at least where they are shifted, and shifts that are tried: those for which both sides rotate alike.
 COMMON, SHIFTS = 6, 4
 PART, TRIED = 6, 12  # rows at least on either side of where something may have been displaced, and rows that are tried
+ZERO_DEG = 30  # between zeros of a joint that are tried; half: twice the time, double: the best may be missed
 ORDERS = 12  # orders of the joints that are looked at: the angles between poses do not distinguish parallel axes
 MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])  # mirrors one axis; the other two are this one rotated
 #: Units that lengths may be in, m; scales that differ from a unit's by less than this part are the unit.
@@ -362,21 +363,56 @@ def _scaled(recording: PairedPoses) -> Iterator[_Reading]:
 
 def _joints(p: Poses, arm: Arm, q: Array) -> Iterator[tuple[Array, str]]:
     """Yield the flange (N, 4, 4) by other readings of the joints: another unit, sense, zero or order, or another arm."""
-    n = q.shape[1]
     if np.abs(radians := np.degrees(q)).max() < 2 * np.pi:
         yield arm.forward(radians), "the joints are in radians, not degrees: name their columns q1_rad .."
-    for joint, one in enumerate(np.eye(n)):
+    for joint, one in enumerate(np.eye(arm.joints)):
         said = f"joint {joint + 1} ({arm.joint_names[joint]})"
         way = f"{said} counts the other way than {arm.name}'s: change the sign of q{joint + 1}"
         yield arm.forward(q * (1 - 2 * one)), way
-        for degrees in (90, -90, 180) if 0 < joint < n - 1 else ():
-            zero = f"{said} has another zero than {arm.name}'s: add {degrees} deg to q{joint + 1}"
-            yield arm.forward(q + np.radians(degrees) * one), zero
+    rows = evenly(np.arange(len(q)), EVALUATED)
+    some = p.rows(rows)
+    for read, said in _one_joint(arm, q, lambda read: float(misfit(replace(some, A=arm.forward(read[rows])))[0])):
+        yield arm.forward(read), said
     for at in _orders(p, arm, q):
         named = ", ".join(f"q{k + 1}" for k in at)
         yield arm.forward(q[:, at]), f"the joints are in another order: {arm.name}'s are {named} here"
     for other, A in _models(arm, q):
         yield A, f"the joints fit --model {other}, not {arm.name}"
+
+
+def _one_joint(arm: Arm, q: Array, off: Callable[[Array], float]) -> Iterator[tuple[Array, str]]:
+    """Yield joints (N, n), one of them in another unit, coupled to another or of another zero, and what each means.
+
+    ``off``: says of joints how badly they fit. Of zeros, with and without the other sense, that which fits best counts.
+    """
+    from scipy.optimize import minimize_scalar  # takes a tenth of a second, which data that fit never need
+
+    for joint, one in enumerate(np.eye(arm.joints)):
+        column, said = f"q{joint + 1}", f"joint {joint + 1} ({arm.joint_names[joint]})"
+        for factor, unit in ((np.degrees(1.0), "radians"), (np.radians(1.0), "degrees")):
+            if np.abs(read := q * (1 + (factor - 1) * one)).max() < chain.MOST_RADIANS:
+                yield read, f"{said} alone is in {unit}: convert {column}"
+        for other in set(range(arm.joints)) - {joint}:
+            for sign, do in ((1, f"add q{other + 1} to"), (-1, f"subtract q{other + 1} from")):
+                coupled = f"{said} is given together with joint {other + 1}: {do} {column}"
+                yield q + sign * q[:, other, None] * one, coupled
+        if not 0 < joint < arm.joints - 1:
+            continue  # base and tool hold zeros of the first and the last
+        ways = (1, ""), (-1, "counts the other way, and ")
+        for counted, way, change in (
+            (q * (1 + (sign - 1) * one), way, f"change the sign of {column}, and then ") for sign, way in ways
+        ):
+
+            def worse(zero_deg: float, q: Array = counted, one: Array = one) -> float:
+                return off(q + np.radians(zero_deg) * one)
+
+            near = min(range(-180, 180, ZERO_DEG), key=worse)
+            ends = near - ZERO_DEG, near + ZERO_DEG
+            zero = round(float(minimize_scalar(worse, bounds=ends, method="bounded").x), 1)
+            text = (
+                f"{said} {way}has another zero than {arm.name}'s: {change if way else ''}add {zero:g} deg to {column}"
+            )
+            yield counted + np.radians(zero) * one, text
 
 
 def _orders(p: Poses, arm: Arm, q: Array) -> list[Rows]:
@@ -569,7 +605,7 @@ def check_plausible(arm: Arm, measured: Measured) -> None:
                 f"{change.before / change.left:.1f} times as well: {change_text(model, change)}; use one of both parts"
             )
         return
-    for q_read, p_read, said in _readings_of(measured, rows):
+    for q_read, p_read, said in _readings_of(arm, measured, rows):
         off = points_off(arm, q_read, p_read)
         if off.sized and off.right < min(at.right / BETTER, max(BAD_SHARE * _span(p_read), BAD_M)):
             raise InputError(
@@ -626,8 +662,8 @@ def points_off(arm: Arm, q: Array, p_rig: Array) -> Off:
     return Off(offs[0], offs[1], 1 / scale)
 
 
-def _readings_of(measured: Measured, rows: Rows) -> Iterator[tuple[Array, Array, str]]:
-    """Yield joints and points by other readings, and what each means: rows shifted, poses inverse, other units."""
+def _readings_of(arm: Arm, measured: Measured, rows: Rows) -> Iterator[tuple[Array, Array, str]]:
+    """Yield joints and points by other readings, and what each means: rows shifted, poses inverse, units, a joint."""
     n, q = len(measured), measured.q[rows]
     for shift in (1, -1, 2, -2, 3, -3):
         if n - abs(shift) >= FEWEST:
@@ -650,6 +686,12 @@ def _readings_of(measured: Measured, rows: Rows) -> Iterator[tuple[Array, Array,
     ):
         if np.abs(read).max() < chain.MOST_RADIANS:
             yield read, measured.p_rig[rows], f"the motions fit if the joint angles are in {unit} (OFF)"
+
+    def off(read: Array) -> float:
+        return points_off(arm, read, measured.p_rig[rows]).right
+
+    read, said = min(_one_joint(arm, q, off), key=lambda one: off(one[0]))
+    yield read, measured.p_rig[rows], f"{said} (OFF)"
 
 
 def _proposal(arm: Arm, q: Array, p: Array, off: float) -> str:
@@ -752,16 +794,27 @@ def _check_rotations(arm: Arm, measured: Measured, rows: Rows) -> None:
                 f"{measured.rotation} (off by {np.degrees(off):.2f} deg as they are, {np.degrees(offs[best]):.2f} deg so): "
                 f"give --columns rotation={same[0]}"
             )
+
+    def rotated(q: Array) -> float:
+        return _rotations_off(arm, q, R)
+
     near = CLEAR * max(points_off(arm, q, p).right, ALIKE_M)
     signs = itertools.product((1, -1), repeat=arm.joints)
     ways = [m for m in _tried(arm, q, p, ((tuple(range(arm.joints)), s) for s in signs)) if not m.left and m.off < near]
-    fits = {m: _rotations_off(arm, q * m.signs, R) for m in ways}
+    fits = {m: rotated(q * m.signs) for m in ways}
     least = max(min(fits.values(), default=np.inf), ALIKE_RAD)
     if least <= min(off / BETTER, BAD_RAD):
         simplest = min((m for m, at in fits.items() if at < CLEAR * least), key=lambda m: (m.number, fits[m]))
         raise InputError(
             f"the rotations fit this arm if {simplest.text} (off by {np.degrees(off):.1f} deg as they are, "
             f"{np.degrees(fits[simplest]):.2f} deg so): put the columns right"
+        )
+    if off < BAD_RAD / BETTER:
+        return
+    read, said = min(_one_joint(arm, q, rotated), key=lambda one: rotated(one[0]))
+    if max(least := rotated(read), ALIKE_RAD) <= min(off / BETTER, BAD_RAD):
+        raise InputError(
+            f"the rotations fit if {said} (off by {np.degrees(off):.1f} deg as they are, {np.degrees(least):.2f} deg so)"
         )
     if off > BAD_RAD:
         raise InputError(
