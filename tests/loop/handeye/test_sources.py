@@ -99,6 +99,33 @@ def test_an_arm_whose_geometry_is_off_is_recognised_and_the_covariance_allows_fo
     assert np.median(white) > 10 * np.median(of_links)  # what noise that changes from pose to pose would have claimed
 
 
+@pytest.mark.parametrize(("share", "said"), [([1, 1, 1], "target's size"), ([0, 0, 1], "depths")])
+def test_what_the_eye_sees_too_far_away_is_named_and_the_covariance_allows_for_it(share, said):
+    off, named = [], []
+    for seed in range(6):
+        poses, Z, X, links = made(seed, n=30, camera=(2e-4, 5e-4, 5e-4), in_hand=bool(seed % 2))
+        assert calibrate_poses(poses, links=links).mistaken_eye() == []
+        B = poses.B.copy()
+        B[:, :3, 3] *= 1 + 0.01 * np.array(share)
+        found = calibrate_poses(replace(poses, B=B), links=links)
+        off.append(nees(found, Z, X))
+        named.append([said in each and ("by 1.0" in each or "by 0.9" in each) for each in found.mistaken_eye()])
+    assert chi2.ppf(0.05, 12) < np.median(off) < chi2.isf(0.05, 12)
+    assert named == [[True]] * 6
+
+
+def test_an_arm_that_sags_is_not_taken_for_noise_though_its_joints_are_known():
+    off = []
+    for seed in range(4):
+        poses, Z, X, links = made(seed, n=30, camera=(2e-4, 5e-4, 5e-4), flange=(2e-4, 4e-4))
+        down = -poses.A[:, 2, :3]
+        sagged = exp_se3(np.concatenate([0 * down, 5e-3 * np.cross([0.0, 0.0, 1.0], down)], axis=1))
+        found = calibrate_poses(replace(poses, B=poses.B @ inverse(X) @ sagged @ X), links=links)
+        assert found.arm_off > 0.99
+        off.append(nees(found, Z, X))
+    assert np.median(off) < chi2.isf(0.05, 12)
+
+
 def test_what_an_arms_lengths_do_in_all_poses_alike_is_allowed_for():
     # Half a millimetre a link, without joints: a millimetre of the mounting, of which a fifth is in the residuals.
     off, claimed = [], []

@@ -60,7 +60,12 @@ def handeye_report(run: HandEyeAnswer) -> Report:
     worst = out[np.argsort(-found.distance[out])]
     blunders = [f"{names_[k]}: {np.sqrt(found.distance[k]):.0f} sigma from the others" for k in worst]
     why = _untrusted(run)
-    remarks = found.changed_at(names_), found.decided_by(names_).removeprefix("; "), _exchanged(run)
+    remarks = [
+        found.changed_at(names_),
+        found.decided_by(names_).removeprefix("; "),
+        *found.mistaken_eye(),
+        _exchanged(run),
+    ]
     decided = [Note("weak", each) for each in remarks if each]
     values = {
         **found.to_dict(),
@@ -128,10 +133,10 @@ def assess(run: HandEyeAnswer, why: list[str], *, weak: bool = False) -> tuple[G
     said += f" {1e3 * worst_m:.2f} mm"
     if worst_m > position_m or used < ADVISED:
         return "fair", f"Usable: {said} along its worst axis; more poses lower that: --plan {MORE} chooses them."
-    if position_m > GOOD_M:
-        return "fair", f"Usable: {said}; the arm's own error is the likeliest reason: armsight identify finds it."
     if weak:
         return "fair", f"Usable only where what is named as weak below is not so: {said}."
+    if position_m > GOOD_M:
+        return "fair", f"Usable: {said}; the arm's own error is the likeliest reason: armsight identify finds it."
     return "good", f"Good: {said}; leave camera and tool as they are mounted."
 
 

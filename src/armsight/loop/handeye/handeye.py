@@ -7,8 +7,8 @@ In: :class:`~armsight.loop.handeye.poses.Poses`, and where there are streams the
    least squares with the weights of Student's t; what is further than chance allows is left out as a blunder.
 2. Motions that leave a direction open are rejected (:func:`require_rotations`, :func:`require_known`).
 3. Variances of the sources (:mod:`armsight.loop.handeye.sources`) and transforms in turn, blunders left out. What changes
-   over time is taken up by the score of its variance at zero.
-4. Two models, an arm that is as its model says and one that is not (its links where the joints are known, else a smooth
+   over time, or is off in the eye, is taken up by the score of its variance at zero.
+4. Two models, an arm that is as its model says and one that is not (its links where the joints are known, and a smooth
    error over its poses), each integrated over what the residuals leave open about the variances, and weighted by their
    evidence (:mod:`armsight.estimate.variance`). An error that is the same in all poses is in no residual: what an arm's
    lengths may be off by (``LINK``, ``DRIFT``) is in the covariance by this weight alone.
@@ -55,6 +55,7 @@ from armsight.loop.handeye.poses import (
 )
 from armsight.loop.handeye.sources import (
     DRIFT,
+    EYE,
     LINKS,
     MAP_OF,
     OF_THE_ARM,
@@ -95,6 +96,7 @@ SURELY, SETTLED = 5.0, 0.1
 #: Times a position's error that the flange must spread for a scale. half: noise counts, double: a few cm are rejected.
 STILL = 3.0
 _TIMED = {name for pair in OVER_TIME for name in pair}  # sources that change over time
+_CHOSEN = _TIMED | {*EYE}  # sources that are taken up where the residuals speak for them
 ROUNDS = 6  # rounds of least squares and of leaving out
 
 
@@ -139,6 +141,7 @@ class HandEye(Record):
         common: (K,) the errors that all poses share (``Poses.common``), as found, in sigmas.
         common_m: what they move the body's middle by, RMS of the distance, m.
         leverage: (N,) by which factor a sigma grows where that pose is left out, the worst direction's; 1 unused.
+        eye_off: by which share what is seen is too near, or too far, and its sigma, by its source; where it was found.
         change: how what stands still, or what is held, was displaced while the poses were taken, which ``cov`` allows
             for; None where neither was.
     """
@@ -165,6 +168,7 @@ class HandEye(Record):
     common: Array
     common_m: float
     leverage: Array
+    eye_off: dict[str, tuple[float, float]]
     change: StateChange | None = None
 
     def __repr__(self) -> str:
@@ -187,6 +191,19 @@ class HandEye(Record):
             return ""
         size = "undetermined" if self.leverage[k] > UNDETERMINED else f"{self.leverage[k]:.0f} times less certain"
         return f"; one pose decides: without {names[k] if names else f'pose {k}'} a direction is {size}"
+
+    def mistaken_eye(self) -> list[str]:
+        """Return a remark for each source by which what is seen is surely too near or too far."""
+        of = {
+            "size": "the target's size and the robot's lengths do not agree{}: measure the target, or --scale",
+            "focal": "depths that the camera saw are off{}, lateral distances are not: is its focal length right?",
+        }
+        sure = {
+            name: f" by {abs(x):.2%} ± {sigma:.2%}"
+            for name, (x, sigma) in self.eye_off.items()
+            if abs(x) > SURELY * sigma
+        }
+        return [of[name].format(by) for name, by in sure.items()]
 
     def changed_at(self, names: Sequence[str] = ()) -> str:
         """Return a remark where something was displaced between two poses, by name or number; empty where not."""
@@ -321,11 +338,11 @@ class _Problem(Record):
         A[:, :3, 3] *= guess.per_m
         return replace(p, A=A)
 
-    def linear(self, guess: _Guess, arm: bool = False, times: bool = False) -> Linear:
+    def linear(self, guess: _Guess, arm: bool = False, chosen: bool = False) -> Linear:
         """Return the residuals at a guess, with the sources of their error.
 
-        Vision's shared errors are unknowns where the guess has them; ``arm``, ``times``: with what the arm, or time,
-        changes.
+        Vision's shared errors are unknowns where the guess has them; ``arm``, ``chosen``: with what the arm, or eye and
+        time, change.
         """
         poses = self.scaled(guess)
         e, J, carry = residuals(poses, guess.Z, guess.X)
@@ -342,14 +359,16 @@ class _Problem(Record):
             J = np.concatenate([J, poses.common if poses.in_hand else -poses.common], axis=2)
         known, at = np.repeat([0.0, 1.0], [before, common]), np.append(np.zeros(before), guess.common)
         maps, given = error_maps(poses, e, carry, self.speed, self.links), poses.cov
-        own = {name: M for name, M in maps.items() if name not in (*LINKS, "scale")}
+        own = {name: M for name, M in maps.items() if name not in (*LINKS, *EYE)}
         if self.covered:
             own["image"] = np.asarray(np.linalg.cholesky(given + 1e-18 * np.eye(6)))
             given = np.zeros_like(given)
         shared: dict[str, Array] = {}
         if arm:
-            shared = {name: maps[name] for name in LINKS} if "link_m" in maps else over_poses(self.poses.A, maps)
-        if times and self.t_s is not None:
+            shared = {name: maps[name] for name in LINKS if name in maps} | over_poses(self.poses.A, maps)
+        if chosen:
+            shared |= {name: maps[name] for name in EYE[self.free[0] :]}
+        if chosen and self.t_s is not None:
             shared |= over_time(self.t_s, poses, maps, self.free[0])
         return Linear(e, J, given, own, shared, known, at)
 
@@ -363,7 +382,7 @@ class _Problem(Record):
         position, rotation = _middle_sigmas(linear.e)
         lengths = dict.fromkeys(("flange_m", "time_drift_m", "time_walk_m"), position / guess.per_m)
         of = {name: position if name.endswith("_m") else rotation for name in linear.sources} | lengths
-        of |= {"scale_walk": 1e-2, "image": 1.0, "time_s": 1e-3}
+        of |= dict.fromkeys(("scale_walk", *EYE), 1e-2) | {"image": 1.0, "time_s": 1e-3}
         return of | dict(zip((*LINKS, *DRIFT), (*LINK, *DRIFT_SIZE), strict=True))
 
     def metric(self, guess: _Guess, cov: Array) -> tuple[_Guess, Array]:
@@ -664,11 +683,11 @@ def require_known(found: HandEye, Ts_rig_body: Array, most_m: float, most_rad: f
 def _taken_up(problem: _Problem, guess: _Guess, quick: bool) -> dict[str, float]:
     """Return the sources of an arm that is as its model says, with their most probable variances.
 
-    Of those that change over time and whose scores speak, it is each time the one that makes the residuals most probable.
+    Of those of eye and time whose scores speak, it is each time the one that makes the residuals most probable.
     """
-    times = not quick and problem.t_s is not None and len(problem.poses.A) >= MIN_SHARED
-    linear = problem.linear(guess, times=times)
-    means, pairs = problem.means(linear, guess), [pair for pair in OVER_TIME if pair[0] in linear.shared]
+    linear = problem.linear(guess, chosen=not quick and len(problem.poses.A) >= MIN_SHARED)
+    pairs: list[tuple[str, ...]] = [*OVER_TIME, *((name,) for name in EYE)]
+    means, pairs = problem.means(linear, guess), [pair for pair in pairs if pair[0] in linear.shared]
 
     start: dict[str, float] = {}
 
@@ -702,7 +721,9 @@ def _settled(
     for _ in range(ROUNDS):
         rows = evenly(np.flatnonzero(used), most)
         few, part = whole.rows(evenly(rows, min(most, MAX_VARIANCE))), whole.rows(rows)
-        estimated, linear = (p.linear(guess, times=not _TIMED.isdisjoint(variances)).of(variances) for p in (few, part))
+        estimated, linear = (
+            p.linear(guess, chosen=not _CHOSEN.isdisjoint(variances)).of(variances) for p in (few, part)
+        )
         found = most_probable(estimated, few.means(estimated, guess), variances)
         variances = dict(zip(linear.sources, found.tolist(), strict=True))
         solved = solve(linear, found)
@@ -728,16 +749,16 @@ def _weighed(
     guess, used, variances, most = _settled(whole, guess, used, quick)
     rows = evenly(np.flatnonzero(used), most)
     progress("hand-eye: an arm as its model")
-    best = nominal = _Model.of(whole, guess, rows, variances, False, quick)
+    best = nominal = _Model.of(whole, guess, rows, variances, (), quick)
     arm_off, x, cov, likelihoods = 0.0, nominal.x, nominal.cov, {_said(nominal.linear.sources): nominal.density}
     if not quick:
         progress("hand-eye: an arm that is not")
-        other = _Model.of(whole, guess, rows, variances, True, quick)
+        other = _Model.of_arm(whole, guess, rows, variances)
         arm_off = float(expit(other.evidence - nominal.evidence + np.log(ARM_OFF / (1 - ARM_OFF))))
         best = other if arm_off > 0.5 and len(rows) >= MIN_SHARED else nominal
         likelihoods[_said(other.linear.sources)] = other.density
         for said, alone in (("robot", ("flange_m", "flange_rad")), ("camera", ("lateral_m", "depth_m", "seen_rad"))):
-            likelihoods[said] = _Model.of(whole, guess, rows, dict.fromkeys(alone, 0.0), False, True).density
+            likelihoods[said] = _Model.of(whole, guess, rows, dict.fromkeys(alone, 0.0), (), True).density
         # The arm is used by its model: where its links are not known, the mounting is the one that suits the model.
         suits, suits_left = _suiting(whole, guess, nominal)
         x = arm_off * other.x + (1 - arm_off) * nominal.x if whole.links is not None else suits
@@ -776,6 +797,7 @@ def _weighed(
         common=moved.common,
         common_m=float(np.sqrt((off_common**2).sum(axis=-1).mean())) / moved.per_m if moved.common.size else 0.0,
         leverage=np.ones(len(whole.poses.A)),
+        eye_off=best.eye_off(),
     )
     require_known(found, whole.poses.B, OPEN_M, OPEN_RAD)
     return replace(found, leverage=_leverage(found, whole.poses))
@@ -801,12 +823,17 @@ class _Model(Record):
 
     @staticmethod
     def of(
-        whole: _Problem, guess: _Guess, rows: NDArray[np.int64], start: dict[str, float], arm: bool, quick: bool
+        whole: _Problem,
+        guess: _Guess,
+        rows: NDArray[np.int64],
+        start: dict[str, float],
+        arm: tuple[str, ...],
+        quick: bool,
     ) -> _Model:
-        """Weigh the sources of ``start``, and with ``arm`` the arm's own; ``quick``: without integrating."""
+        """Weigh the sources of ``start`` and those of the arm, ``arm``; ``quick``: without integrating."""
         few, part = whole.rows(evenly(rows, MAX_VARIANCE)), whole.rows(rows)
-        names = (*start, *((LINKS if whole.links is not None else DRIFT) if arm else ()))
-        estimated, linear = (p.linear(guess, arm, not _TIMED.isdisjoint(names)).of(names) for p in (few, part))
+        names = (*start, *arm)
+        estimated, linear = (p.linear(guess, bool(arm), not _CHOSEN.isdisjoint(names)).of(names) for p in (few, part))
         means = few.means(estimated, guess)
         probable = most_probable(estimated, means, {name: v for name, v in start.items() if v > 0})
         solved, P = solve(linear, probable), linear.J.shape[2]
@@ -820,6 +847,18 @@ class _Model(Record):
     def density(self) -> float:
         """Mean logarithm of the probability density of a pose left out."""
         return float(log_density(*left_out(self.solved)).mean())
+
+    @staticmethod
+    def of_arm(whole: _Problem, guess: _Guess, rows: NDArray[np.int64], start: dict[str, float]) -> _Model:
+        """Weigh the sources of ``start`` and the arm's own: where its links are known, those, or a smooth error, too."""
+        others = (DRIFT,) if whole.links is None else (LINKS, (*LINKS, *DRIFT))
+        return max((_Model.of(whole, guess, rows, start, arm, False) for arm in others), key=lambda one: one.evidence)
+
+    def eye_off(self) -> dict[str, tuple[float, float]]:
+        """Return the error of each source that is one number of the eye, and its sigma."""
+        s, sources = self.solved, self.linear.sources
+        at = {name: int(np.flatnonzero(s.of == sources.index(name))[0]) for name in EYE if name in sources}
+        return {name: (float(s.x[k]), float(np.linalg.norm(s.root[k]))) for name, k in at.items()}
 
     def about(self, x: Array) -> Array:
         """Return the mean square (P, P) of the error of another step (P,)."""
@@ -855,7 +894,7 @@ def _suiting(whole: _Problem, guess: _Guess, nominal: _Model) -> tuple[Array, Ar
 
 def _said(names: tuple[str, ...]) -> str:
     """Return sources as people read them."""
-    found = [SAID.get(name.rpartition("_")[0] if name != "scale_walk" else name) for name in names]
+    found = [SAID.get(name, SAID.get(name.rpartition("_")[0])) for name in names]
     return ", ".join(dict.fromkeys(name for name in found if name)) or "robot and camera"
 
 

@@ -17,6 +17,11 @@ Shared, by the arm (one of the two pairs):
 - ``drift_m``, ``drift_rad``: the same where they are not known: a constant error and a smooth function of the pose, a
   Gaussian process (Rasmussen and Williams, "Gaussian Processes for Machine Learning", 2006, eq. 2.31).
 
+Shared, by the eye:
+
+- ``size``: all that is seen is too far away by one share: the target's size is wrong, or the arm's lengths are.
+- ``focal``: only its depth is: the camera's focal length is wrong.
+
 Shared, over time:
 
 - ``time_drift_m``, ``time_drift_rad``: the arm, a smooth function of time (it warms up).
@@ -38,6 +43,7 @@ from armsight.loop.handeye.poses import Poses
 
 #: Sources of the arm that are not independent from pose to pose: with its model, and without.
 LINKS, DRIFT = ("link_m", "link_rad"), ("drift_m", "drift_rad")
+EYE = ("size", "focal")  # what is constantly off in the eye
 #: Sources that change over time, each a pair or one: what is taken up together.
 OVER_TIME = (
     ("time_drift_m", "time_drift_rad"),
@@ -48,7 +54,7 @@ OVER_TIME = (
 OF_THE_ARM = ("flange_m", "flange_rad", *LINKS, *DRIFT, *OVER_TIME[0], *OVER_TIME[1])  # sources that are the arm's
 #: Shared source -> the map that says what it does to a pose.
 MAP_OF = {name: f"flange_{name.rpartition('_')[2]}" for name in (*DRIFT, *OVER_TIME[0], *OVER_TIME[1])} | {
-    "scale_walk": "scale"
+    "scale_walk": "size"
 }
 #: What people read of a source, by its name without the unit.
 SAID = {
@@ -58,6 +64,8 @@ SAID = {
     "time_walk": "robot walking over time",
     "walk": "camera walking",
     "scale_walk": "camera's scale walking",
+    "size": "target's size or robot's lengths off",
+    "focal": "focal length off",
 }
 #: Where a drift over poses has forgotten itself: this rotation, rad, or this way, m; and over time, a share of the whole.
 FORGETS_RAD, FORGETS_M, FORGETS_SHARE = 1.0, 0.4, 0.15
@@ -85,7 +93,8 @@ def error_maps(
         "lateral_m": axes[..., :2],
         "depth_m": axes[..., 2:],
         "seen_rad": about,
-        "scale": np.concatenate([inverse(poses.B)[:, :3, 3:], np.zeros((n, 3, 1))], axis=1),
+        "size": np.concatenate([inverse(poses.B)[:, :3, 3:], np.zeros((n, 3, 1))], axis=1),
+        "focal": axes[..., 2:] * poses.B[:, 2, 3, None, None],
     }
     if speed is not None:
         maps["time_s"] = carry @ speed[..., None]
@@ -131,5 +140,5 @@ def over_time(t_s: Array, poses: Poses, maps: dict[str, Array], scale: bool) -> 
         for name, part in (("walk_m", axes[..., :3]), ("walk_rad", axes[..., 3:])):
             columns[name] = np.cumsum(spread(np.vstack([0 * steps, np.diag(steps)]), part), axis=0)
     if scale:
-        columns["scale_walk"] = spread(walk, maps["scale"])
+        columns["scale_walk"] = spread(walk, maps["size"])
     return columns
