@@ -114,13 +114,13 @@ def test_what_the_eye_sees_too_far_away_is_named_and_the_covariance_allows_for_i
     assert named == [[True]] * 6
 
 
-def test_an_arm_that_sags_is_not_taken_for_noise_though_its_joints_are_known():
+def test_an_arm_that_bends_by_its_pose_is_not_taken_for_noise_though_its_joints_are_known():
     off = []
     for seed in range(4):
         poses, Z, X, links = made(seed, n=30, camera=(2e-4, 5e-4, 5e-4), flange=(2e-4, 4e-4))
         down = -poses.A[:, 2, :3]
-        sagged = exp_se3(np.concatenate([0 * down, 5e-3 * np.cross([0.0, 0.0, 1.0], down)], axis=1))
-        found = calibrate_poses(replace(poses, B=poses.B @ inverse(X) @ sagged @ X), links=links)
+        bent = exp_se3(np.concatenate([0 * down, 5e-3 * np.cross([0.0, 0.0, 1.0], down)], axis=1))
+        found = calibrate_poses(replace(poses, B=poses.B @ inverse(X) @ bent @ X), links=links)
         assert found.arm_off > 0.99
         off.append(nees(found, Z, X))
     assert np.median(off) < chi2.isf(0.05, 12)
