@@ -850,9 +850,16 @@ class _Model(Record):
 
     @staticmethod
     def of_arm(whole: _Problem, guess: _Guess, rows: NDArray[np.int64], start: dict[str, float]) -> _Model:
-        """Weigh the sources of ``start`` and the arm's own: where its links are known, those, or a smooth error, too."""
-        others = (DRIFT,) if whole.links is None else (LINKS, (*LINKS, *DRIFT))
-        return max((_Model.of(whole, guess, rows, start, arm, False) for arm in others), key=lambda one: one.evidence)
+        """Weigh the sources of ``start`` and the arm's own, a few choices of them, and return the one of most evidence.
+
+        The arm's are its links where they are known, or those and a smooth error; what the eye seems to have may be its.
+        """
+        arms = (DRIFT,) if whole.links is None else (LINKS, (*LINKS, *DRIFT))
+        begins = (start, {name: start[name] for name in start if name not in EYE})[
+            : 1 + (not start.keys().isdisjoint(EYE))
+        ]
+        models = [_Model.of(whole, guess, rows, begin, arm, False) for begin in begins for arm in arms]
+        return max(models, key=lambda model: model.evidence)
 
     def eye_off(self) -> dict[str, tuple[float, float]]:
         """Return the error of each source that is one number of the eye, and its sigma."""
