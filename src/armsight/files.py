@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 #: Largest documents (JSON, TOML, XML) and tables that are read: parsed they take 10 to 40 times as much memory.
 DOCUMENT_MB = 8  # half: a recording's truth of 10,000 shots is rejected; double: a hostile file takes 600 MB
+_TOML_DIGITS = 100_000  # of a number; half: nothing notable, double: it takes 24 MB
 _JSON_PARTS = (
     1_000_000  # lists, mappings and pairs of values of a JSON text; half: long tracks are rejected; double: 400 MB
 )
@@ -183,15 +184,26 @@ def read_toml(path: str | Path) -> dict[str, Any]:
     Raises:
         InputError: as :func:`read_text`, or not TOML; the message names the line.
     """
-    import tomllib
-
     text = read_text(path)
     try:
-        return tomllib.loads(text)
+        return parse_toml(text)
     except ValueError as error:  # also a number of thousands of digits
         raise InputError(f"{path}: not TOML: {error}") from None
     except RecursionError:
         raise InputError(f"{path}: not TOML that can be read: nested too deep") from None
+
+
+def parse_toml(text: str) -> dict[str, Any]:
+    """Parse TOML of moderate numbers: tomllib takes 120 bytes for each digit of one.
+
+    Raises:
+        ValueError: not TOML.
+    """
+    import tomllib
+
+    if any(len(run[0]) > _TOML_DIGITS for run in re.finditer(r"[0-9A-Fa-f_]+", text)):
+        raise ValueError(f"a number of more than {_TOML_DIGITS} digits")
+    return tomllib.loads(text)
 
 
 def _encoding(path: str | Path, data: bytes) -> str:

@@ -15,7 +15,6 @@ import io
 import json
 import re
 import tokenize
-import tomllib
 import zipfile
 import zlib
 from collections.abc import Callable, Hashable, Mapping
@@ -27,7 +26,7 @@ import numpy as np
 import yaml
 
 from armsight.errors import InputError, naming
-from armsight.files import DOCUMENT_MB, as_input_error, parsed_json, read_bytes, read_text
+from armsight.files import DOCUMENT_MB, as_input_error, parse_toml, parsed_json, read_bytes, read_text
 from armsight.tables.lengths import number
 
 #: A value of a file of another program: a number, a text, a list or a mapping, unknown until checked.
@@ -355,7 +354,7 @@ def _literal(text: str, path: str | Path) -> Foreign:
 def _toml_or_ini(text: str, path: str | Path) -> dict[str, Foreign]:
     """Return TOML, or INI with numbers where its values are some."""
     try:
-        return tomllib.loads(text)
+        return parse_toml(text)
     except (ValueError, RecursionError) as error:
         problem = error
     if Path(path).suffix.lower() == ".toml":

@@ -19,7 +19,6 @@ import json
 import logging
 import os
 import re
-import tomllib
 import unicodedata
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -32,7 +31,7 @@ from numpy.typing import NDArray
 
 from armsight.data import Array, Record
 from armsight.errors import InputError, nearest
-from armsight.files import read_text, read_toml
+from armsight.files import parse_toml, read_text, read_toml
 from armsight.geometry.check import checked
 from armsight.loop.references.distance import Distance
 from armsight.loop.references.heading import Magnetometer
@@ -102,7 +101,7 @@ def read_references(path: Path) -> list[Entry]:
 
 def entries_of(text: str, where: Path) -> list[Entry]:
     """Return the references of the text of such a file, which a run keeps; ``where``: the run's file, for messages."""
-    return [_entry(where, name, table) for name, table in tomllib.loads(text).items()]
+    return [_entry(where, name, table) for name, table in parse_toml(text).items()]
 
 
 def _entry(path: Path, name: str, table: dict[str, Any]) -> Entry:
