@@ -464,10 +464,12 @@ static void sample(motor_state *motor, const motor_config *config, float ir_v, f
     const float seen_a = number_size(motor->part_a) / (float)(motor->driven_ticks - motor->part_ticks);
     const float kept_a = SAMPLE_KEEPS * motor->current_a;
     motor->current_a = seen_a > kept_a ? seen_a : kept_a;
-    motor->dither_vv *= DITHER_KEPT;
-    motor->dither_va *= DITHER_KEPT;
-    motor->dither_aa *= DITHER_KEPT;
-    motor->dithers *= DITHER_KEPT;
+    if (motor->last_v != 0.0f) { /* else nothing answers any more, and the last answer stays */
+        motor->dither_vv *= DITHER_KEPT;
+        motor->dither_va *= DITHER_KEPT;
+        motor->dither_aa *= DITHER_KEPT;
+        motor->dithers *= DITHER_KEPT;
+    }
     motor->none_samples = answers_as_none(motor, config) ? motor->none_samples + 1u : 0u;
     motor->withheld_rad *= SAMPLE_KEEPS;
     motor->gap_rad *= SAMPLE_KEEPS;
@@ -590,7 +592,7 @@ void motor_measure(motor_state *motor, const motor_config *config, float supply_
         changed(motor, config, change_rad_s, current_a);
     }
     const float change_v = voltage_v - motor->last_v;
-    if (sampled || number_size(change_v) > DITHER_SUPPLY * supply_v) {
+    if (change_v != 0.0f && (sampled || number_size(change_v) > DITHER_SUPPLY * supply_v)) {
         dither(motor, change_v, current_a - motor->last_a);
     }
     motor->last_v = voltage_v;
