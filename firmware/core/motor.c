@@ -978,7 +978,7 @@ bool motor_disobeys(const motor_state *motor, const motor_config *config, float 
         return false;
     }
     if (off) { /* the current drives it on, or would if nothing held it: shorted windings brake */
-        return terminal_v * ir_v > DEAD_SHARE * terminal_v * terminal_v &&
+        return terminal_v * ir_v > DEAD_SHARE * STUCK_SUPPLY * supply_v * number_size(terminal_v) &&
                terminal_v * way_rad > -number_size(terminal_v) * WINDOW_NOISE_RAD;
     }
     return applied_v * error_rad > 0.0f && way_rad * error_rad < 0.0f && number_size(way_rad) > DISOBEY_RAD &&
