@@ -10,9 +10,9 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
 
-#: Names that a message lists, in their order; of more, those near what was given, _NEAR at most. Half: the columns of a
+#: Names that a message lists, in their order; of more, those near what was given, NAMED at most. Half: the columns of a
 #: table of poses are not all shown; double: lines of 300 characters.
-_LISTED, _NEAR = 15, 5
+_LISTED, NAMED = 15, 5
 
 
 class ArmsightError(Exception):
@@ -57,11 +57,18 @@ def noted(notes: Sequence[str]) -> Iterator[None]:
         raise
 
 
+def some(names: Iterable[object]) -> str:
+    """Return names as text, of many the first few and how many more there are."""
+    listed = list(map(str, names))
+    more = f" and {len(listed) - NAMED} more" if len(listed) > NAMED else ""
+    return ", ".join(listed[:NAMED]) + more
+
+
 def nearest(name: object, known: Iterable[str]) -> str:
     """Return the known names as text: of many those that begin so or are spelt alike, else the first; how many more."""
     names, text = list(known), str(name)
     if len(names) <= _LISTED:
         return ", ".join(names) or "none"
-    near = [each for each in names if text and each.startswith(text)][:_NEAR] or get_close_matches(text, names, _NEAR)
+    near = [each for each in names if text and each.startswith(text)][:NAMED] or get_close_matches(text, names, NAMED)
     listed = near or names[:_LISTED]
     return f"{', '.join(listed)} and {len(names) - len(listed)} more"

@@ -20,7 +20,7 @@ from collections.abc import Generator, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
-from armsight.errors import InputError
+from armsight.errors import InputError, some
 
 if TYPE_CHECKING:
     from _typeshed import ReadableBuffer
@@ -300,10 +300,9 @@ def _with_points(path: str | Path, rows: list[list[str]]) -> list[list[str]]:
     return [[cell.replace(",", ".") if DECIMAL_COMMA.fullmatch(cell.strip()) else cell for cell in row] for row in rows]
 
 
-def columns_unused(names: Sequence[str], most: int = 8) -> str:
-    """Return which columns of a table were not read, as text, the first of many."""
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return f"columns not used: {', '.join(names[:most])}{more}"
+def columns_unused(names: Sequence[str]) -> str:
+    """Return which columns of a table were not read, as text."""
+    return f"columns not used: {some(names)}"
 
 
 class _NamedFile(io.FileIO):

@@ -46,7 +46,7 @@ def test_columns_may_stand_anywhere_and_a_marker_twice(read):
         ("shot,camera,u_px\n", "line 1: no column marker, v_px"),
         (HEADER + "1,left,9,1\n", "line 2: 4 fields, the header has 5"),
         (HEADER + "1,left,9,1,2\n1,top,9,1,2\n", "line 3: camera 'top'; it must be left or right"),
-        (HEADER + "1,left,99,1,2\n", "line 2: unknown marker '99'; body ball has 9, 10, 11 ... 13"),
+        (HEADER + "1,left,99,1,2\n", "line 2: unknown marker '99'; body ball has 9, 10, 11, 12, 13"),
         (HEADER + "1,left,9,one,2\n", "line 2: u_px is 'one', it must be a number"),
         (HEADER + "1,left,9,1,\n", "line 2: v_px is '', it must be a number"),
         (HEADER + "1,left,9,1,NaN\n", "line 2: v_px is NaN, it must be a finite number of pixels"),

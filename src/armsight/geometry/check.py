@@ -10,6 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from armsight.errors import InputError
 
+#: How far R R^T may be from 1 of a rotation that was computed, and of a printed one: three digits leave 1e-3, six 1e-6.
+RIGID, PRINTED = 1e-6, 2e-3
+
 
 def numbers(value: object) -> NDArray[np.float64]:
     """Return a value as an array of numbers.
@@ -40,3 +43,9 @@ def checked(value: ArrayLike, shape: tuple[int | None, ...], name: str) -> NDArr
     if not np.isfinite(array).all():
         raise InputError(f"{name} contains NaN or infinity; every entry must be a finite number")
     return array
+
+
+def off_rotation(R: NDArray[np.float64]) -> float:
+    """Return how far R R^T is from 1, of R (3, 3): 0 for rotations and mirrored ones, at least 3 for damaged numbers."""
+    near = np.clip(R, -2.0, 2.0)  # squares of damaged numbers overflow
+    return float(np.abs(near @ near.T - np.eye(3)).max())

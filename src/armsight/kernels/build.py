@@ -81,7 +81,6 @@ def this_machine() -> str:
 
 @functools.cache
 def _imported(path: Path) -> list[Path]:
-    """Return the files of the package that a module imports from, at its top."""
     found = []
     for node in ast.parse(path.read_text(encoding="utf-8")).body:
         names: list[str] = []
@@ -155,7 +154,6 @@ def _numba_types() -> Any:  # noqa: ANN401 - numba's own annotations of it do no
 
 
 def _types(text: str, function: Any) -> tuple[Any, ...]:  # noqa: ANN401
-    """Return numba's types of a signature."""
     types = _numba_types()
 
     numbers = {name: getattr(types, f"{_KINDS[name[0]]}{8 * int(name[1])}") for name in _LETTERS if name != "?"}

@@ -161,7 +161,6 @@ def _matrix(path: str | Path, given: object, joints: int) -> Array:
 
 
 def _row(where: str, row: dict[str, Any]) -> dict[str, Any]:
-    """Read one joint, in SI."""
     row = dict(row)
     out: dict[str, Any] = {"name": row.pop("name", None)}
     out["direction"] = _number(where, "direction", row.pop("direction", 1))

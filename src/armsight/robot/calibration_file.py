@@ -136,7 +136,6 @@ def _origins(path: str | Path, nominal: Arm) -> list[Array]:
 
 
 def _names(arm: Arm) -> tuple[str, ...]:
-    """Return what a file calls an arm's joints."""
     return (
         UR_NAMES
         if arm.joint_names[0] == "shoulder_pan" and arm.joints == 6

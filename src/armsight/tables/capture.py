@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from armsight.errors import InputError
+from armsight.errors import InputError, some
 from armsight.tables.lengths import NO_NUMBER, number
 from armsight.tables.nested import PREFIX
 from armsight.tables.programs import ProgramPoints
@@ -31,7 +31,6 @@ _ADVICE = {
 }
 #: Motive's names of units, and Vicon's.
 _UNITS_M = {"meters": 1.0, "centimeters": 0.01, "millimeters": 1e-3, "inches": 0.0254, "m": 1.0, "cm": 0.01, "mm": 1e-3}
-_LISTED = 5  # damaged lines that a note names; half: one more look at the file, double: a longer note
 _Bodies = dict[str, dict[str, int]]  # name of a body -> our name -> its column
 _Line = tuple[int, list[str]]  # its number and its cells
 
@@ -73,8 +72,7 @@ def capture_rows(path: Path, text: str, side: str, whose: str | None) -> Program
         raise InputError(f"{said}: none of its {len(read)} frames is readable: export it again")
     note = f"{path}: read as {program}'s, lengths in {export.unit}"
     if damaged := [str(line) for line, cells in read if not cells]:
-        more = f" and {len(damaged) - _LISTED} more" if len(damaged) > _LISTED else ""
-        note += f"; damaged: line {', '.join(damaged[:_LISTED])}{more}"
+        note += f"; damaged: line {some(damaged)}"
     return ProgramPoints(["t_s", *_POSITION, *rotation], rows, None, (note,))
 
 

@@ -193,7 +193,6 @@ def _of_file(path: Path, side: str, whose: str | None, names: Mapping[str, str] 
 
 
 def _delimited(path: Path, text: str, written: list[tuple[int, str]], named: Collection[str]) -> Cells:
-    """Return the cells of a table, whatever separates them."""
     rows = _with_content(_separated(path, text.splitlines(), written[0][1] if written else ""))
     if not rows:
         raise InputError(f"{path}: no rows; one line a pose is needed")
@@ -233,7 +232,6 @@ def _with_content(cells: list[list[str]]) -> list[tuple[int, list[str]]]:
 
 
 def _separated(path: Path, lines: list[str], first: str) -> list[list[str]]:
-    """Return the cells of lines, separated as those of the first one with content are."""
     if "|" in first:
         bare = ["" if _RULE.fullmatch(line.strip()) else line.strip().strip("|") for line in lines]
         return [[] if not line else line.split("|") for line in bare]

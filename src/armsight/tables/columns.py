@@ -22,6 +22,7 @@ import numpy as np
 from armsight.data import Array
 from armsight.errors import InputError, nearest
 from armsight.files import is_long, long_rows, read_table
+from armsight.geometry.check import PRINTED, off_rotation
 from armsight.geometry.rotation import nearest_rotation
 from armsight.tables.cells import Rows, renamed
 from armsight.tables.lengths import NO_NUMBER, number
@@ -40,7 +41,6 @@ COLUMNS = (
     *("t_s", *NAMES),
 )
 MOST_RAD = 4 * np.pi  # no joint rotates further, rad; larger numbers of radians are degrees
-LOOSE = 2e-3  # how far a matrix may be from a rotation: what six digits leave
 #: LeRobot's names of an SO-100's or SO-101's joints, from the base on; its position columns end so; percent reach this.
 LEROBOT = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll")
 _LEROBOT_POSITION, _LEROBOT_GRIPPER, _MOST_PERCENT = ".pos", "gripper", 100.001
@@ -466,13 +466,13 @@ class Columns:
 
     def _checked(self, R: Array) -> Array:
         for (line, _), one in zip(self.rows, R, strict=True):
-            off, determinant = float(np.abs(one @ one.T - np.eye(3)).max()), float(np.linalg.det(one))
-            if off < LOOSE and determinant < 0:
+            off = off_rotation(one)
+            if off < PRINTED and np.linalg.det(one) < 0:
                 raise InputError(
                     f"{self.path}: line {line}: the 3x3 part is left-handed (determinant -1): an axis is mirrored; robot "
                     "and camera poses are right-handed: exchange no axes without a sign"
                 )
-            if off >= LOOSE:
+            if off >= PRINTED:
                 raise InputError(
                     f"{self.path}: line {line}: the 3x3 part is no rotation (R R^T differs from 1 by {off:.2g})"
                 )

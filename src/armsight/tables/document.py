@@ -75,7 +75,6 @@ def read_document(path: str | Path) -> dict[str, Foreign]:
 
 
 def _only(documents: list[Foreign], path: str | Path) -> Foreign:
-    """Return the one document of a file."""
     if len(documents) > 1:
         raise InputError(
             f"{path}: holds {len(documents)} YAML documents, separated by ---; expected one: keep one of them"
@@ -205,7 +204,6 @@ def _of_text(text: str, path: str | Path) -> list[Foreign]:
 
 
 def _json(text: str, path: str | Path) -> list[Foreign]:
-    """Return JSON, JSON Lines as a list, or YAML in the form of JSON."""
     try:
         return [parsed_json(text, path)]
     except InputError:
@@ -273,7 +271,6 @@ class _Yaml:
         ]
 
     def _value(self, event: _Event, depth: int) -> Foreign:
-        """Return the value that begins with an event."""
         before, alias = self._count, isinstance(event, yaml.AliasEvent)
         if alias and event.anchor not in self._anchors:
             _reject(event, f"no anchor &{event.anchor} before it")
@@ -388,5 +385,4 @@ def _node(element: ElementTree.Element) -> Foreign:
 
 
 def _or_number(text: str) -> Foreign:
-    """Return a number where a text is one."""
     return text.strip() if (found := number(text)) is None else found

@@ -93,7 +93,6 @@ def document_rows(path: Path, text: str, side: str, whose: str | None) -> tuple[
 
 
 def _records(path: Path, document: Any, side: str, whose: str | None) -> list[Record]:  # noqa: ANN401
-    """Return the records of a document, each with one pose."""
     if isinstance(document, list) and len(document) > _MOST_RECORDS:
         raise InputError(f"{path}: holds {_content(document)}, more than {_MOST_RECORDS} poses: split it")
     records, items = list[Record](), _items(document)
@@ -164,7 +163,6 @@ def _array(node: object) -> np.ndarray[Any, np.dtype[np.float64]] | None:
 
 
 def _items(node: Any) -> list[tuple[Any, str | None]]:  # noqa: ANN401
-    """Return the records of a document, each with its name where it has one."""
     if (array := _array(node)) is not None:
         whole = array.ndim < 2 or array.shape in ((4, 4), (3, 4))
         return [(one.tolist(), None) for one in ([array] if whole else array)]
@@ -235,7 +233,6 @@ def _positions_beside_rotations(node: Mapping[str, Any]) -> dict[str, Record]:
 
 
 def _is_joints(record: Record, unit: str = "") -> bool:
-    """Return whether a record is of joints, in units that match a pattern."""
     known = all(re.fullmatch(unit, key) for key in record) if unit else True
     return known and not {key.partition("_")[0] for key in record} & {*_XYZ, *"XYZ"}
 

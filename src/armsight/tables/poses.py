@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array, Record
-from armsight.errors import InputError
+from armsight.errors import InputError, some
 from armsight.files import columns_unused
 from armsight.geometry.pose import pose
 from armsight.tables.cells import Cells, Renames, Rows, read_cells, read_columns
@@ -37,7 +37,6 @@ REACH_M = 3.0
 MOST_DEG = 360.0  # an angle in degrees is not larger
 MIXED = 200.0  # lengths that differ by more than this factor in one table are not in one unit
 _MEASURED = {"status", "reason", "x_m"}  # columns of what `armsight measure` writes
-_LISTED = 3  # rows that a note names; half: one more look at the file, double: a longer note
 
 
 class ArmJoints(Protocol):
@@ -83,8 +82,7 @@ class PoseTable(Record):
             return self
         gone = [f"line {line} ({why})" for line, why in zip(self.lines, self.missed, strict=True) if why]
         kept = np.array([not why for why in self.missed])
-        where = ", ".join(gone[:_LISTED]) + (", .." if len(gone) > _LISTED else "")
-        note = f"{self.path}: {len(gone)} of {len(kept)} rows have no pose, and are left out: {where}"
+        note = f"{self.path}: {len(gone)} of {len(kept)} rows have no pose, and are left out: {some(gone)}"
         return replace(
             self,
             lines=self.lines[kept],

@@ -34,7 +34,6 @@ _PARTS = {
 
 
 def _pattern(text: str) -> str:
-    """Return a pattern with its parts."""
     for part, pattern in _PARTS.items():
         text = text.replace(part, pattern)
     return text
@@ -292,13 +291,11 @@ def _pose_points(
 
 
 def _line(text: str, found: re.Match[str]) -> int:
-    """Return the line that a match begins in."""
     return bisect_left(_line_ends(text), found.start() + len(found[0]) - len(found[0].lstrip())) + 1
 
 
 @functools.lru_cache(maxsize=2)
 def _line_ends(text: str) -> list[int]:
-    """Return where the lines of a text end."""
     return [end.start() for end in re.finditer("\n", text)]
 
 

@@ -79,7 +79,6 @@ def described(document: Mapping[str, Any], most: int = 12) -> str:
 
 
 def _regular(value: object) -> bool:
-    """Say whether a list has a shape."""
     try:
         return np.asarray(value).dtype != object
     except ValueError:

@@ -16,13 +16,11 @@ from pathlib import Path
 import numpy as np
 
 from armsight.data import SIDES, Array, Body, Correspondences, Ids, Record
-from armsight.errors import InputError
+from armsight.errors import InputError, nearest
 from armsight.files import read_table
 from armsight.tables.lengths import number
 
 COLUMNS = ("shot", "camera", "marker", "u_px", "v_px")
-#: How many lines with the same mistake are named before the rest is counted.
-NAMED = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +61,7 @@ def read_detections(path: str | Path, body: Body) -> list[SeenShot]:
             raise InputError(f"{path}: line {line}: camera {camera!r}; it must be left or right")
         if marker not in index:
             raise InputError(
-                f"{path}: line {line}: unknown marker {marker!r}; body {body.name} has {_some(body.point_names)}"
+                f"{path}: line {line}: unknown marker {marker!r}; body {body.name} has {nearest(marker, body.point_names)}"
             )
         uv = np.array([_number(text, path, line, name) for text, name in ((u, "u_px"), (v, "v_px"))])
         ids, pixels = shots.setdefault(shot, (([], []), ([], [])))
@@ -118,7 +116,3 @@ def _number(text: str, path: str | Path, line: int, column: str) -> float:
     if not np.isfinite(value):
         raise InputError(f"{path}: line {line}: {column} is {text}, it must be a finite number of pixels")
     return value
-
-
-def _some(names: tuple[str, ...]) -> str:
-    return ", ".join(names[:NAMED]) + (f" ... {names[-1]}" if len(names) > NAMED else "")

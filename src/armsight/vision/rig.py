@@ -17,7 +17,7 @@ import numpy as np
 from armsight.data import Array, Record
 from armsight.errors import InputError
 from armsight.files import parsed_json, read_text, require_version, write_text
-from armsight.geometry.check import checked
+from armsight.geometry.check import RIGID, checked, off_rotation
 from armsight.geometry.pose import exp_se3, inverse, transform
 from armsight.vision.camera import DISTORTION_MODELS, Camera
 
@@ -27,8 +27,6 @@ if TYPE_CHECKING:
 FORMAT = "armsight-rig"
 VERSION = 1
 COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-#: How far a rotation may be from orthonormal, and the last row of a transform from 0 0 0 1.
-_ROTATION_TOLERANCE = 1e-6
 #: In the provenance of a rig that must not be used: by how much held-out pairs contradict it, px.
 CONTRADICTED = "contradicted_by_px"
 #: How far a covariance may be from symmetric, as a share of the two standard deviations.
@@ -127,9 +125,9 @@ class StereoRig(Record):
         super().__post_init__()
         checked(self.T_left_right, (4, 4), "T_left_right")
         R = self.T_left_right[:3, :3]
-        if np.abs(R).max() > 2 or np.abs(R @ R.T - np.eye(3)).max() > _ROTATION_TOLERANCE or np.linalg.det(R) < 0:
+        if off_rotation(R) > RIGID or np.linalg.det(R) < 0:
             raise InputError("T_left_right must hold a rotation: its upper left 3x3 block is not orthonormal")
-        if np.abs(self.T_left_right[3] - [0, 0, 0, 1]).max() > _ROTATION_TOLERANCE:
+        if np.abs(self.T_left_right[3] - [0, 0, 0, 1]).max() > RIGID:
             raise InputError(f"the last row of T_left_right must be 0 0 0 1, got {_row(self.T_left_right[3])}")
         checked(self.cov, (self.parameter_count, self.parameter_count), "rig covariance")
         _check_covariance(self.cov, self.parameter_names)
@@ -325,7 +323,6 @@ class StereoRig(Record):
 
 
 def _row(numbers: Array) -> str:
-    """Return numbers as people write them."""
     return " ".join(f"{n:g}" for n in numbers)
 
 
@@ -390,7 +387,6 @@ def _disc_noise(entry: object) -> tuple[CameraNoise, CameraNoise] | None:
 
 
 def _camera(entry: dict[str, Any]) -> Camera:
-    """Build a camera from its entry in a rig file."""
     model = str(entry["distortion_model"])
     size = checked(entry["image_size_px"], (2,), "image_size_px")
     if not ((size >= 1) & (size == size.round())).all():

@@ -22,13 +22,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.app.check.evaluate import evaluate
-from armsight.app.check.rows import NAMED
 from armsight.app.check.run_folder import WINDOW_S, JointTrack, Noise, attained_in, joint_track, noise_of, segments_of
 from armsight.app.run.motion_file import motion_text
 from armsight.app.run.tracks import read_track
 from armsight.app.show.encode import json_of
 from armsight.data import Array, Record
-from armsight.errors import InputError
+from armsight.errors import InputError, some
 from armsight.estimate.solve import regression
 from armsight.files import as_input_error, read_json, read_toml
 from armsight.geometry.pose import mean_pose
@@ -226,9 +225,8 @@ def evaluate_arm(folder: Path, arm: Arm, *, progress: Callable[[str], None] = la
     kept = rests.rows(found.solution.used)
     notes = []
     if len(found.left_out):
-        times = ", ".join(f"{t:.0f}" for t in rests.t_s[found.left_out][:NAMED])
-        more = ", ..." if len(found.left_out) > NAMED else ""
-        notes.append(f"left out as mistakes: {len(found.left_out)} of {len(rests.q)} rests, at {times}{more} s")
+        times = some(f"{t:.0f}" for t in rests.t_s[found.left_out])
+        notes.append(f"left out as mistakes: {len(found.left_out)} of {len(rests.q)} rests, at {times} s")
     off, parts = _split(arm, kept, found)
     lever, backlash, latencies = gravity_levers(arm, kept.q), joint_backlashes(found, measured), _latencies(folder, arm)
     joints = [_joint(arm, i, kept, found, lever[:, i], backlash[i]._asdict(), latencies[i]) for i in range(arm.joints)]

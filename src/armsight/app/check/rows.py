@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from armsight.data import Array, Record
-from armsight.errors import InputError
+from armsight.errors import NAMED, InputError
 from armsight.files import table_text
 from armsight.geometry.pose import pose
 from armsight.geometry.rotation import from_quaternion_wxyz, quaternion_wxyz
@@ -24,8 +24,6 @@ _SIGMA, _COMMON = (tuple(f"{kind}_{name}" for name in _POSITION) for kind in ("s
 NEEDED = ("pose", *_POSITION, *_COMMAND[:3])
 #: Groups of columns: a row has all of a group or none of it.
 _TOGETHER = (_QUATERNION, _COMMAND[3:], _SIGMA, _COMMON)
-#: So many things that were left out are named.
-NAMED = 5
 #: Half of the rows further off their commands than this, m, are an error: units or frames are mixed up.
 _FAR_M = 0.1
 #: Commands of one pose differ by rounding at most: by this much, m, and in their rotation matrices.

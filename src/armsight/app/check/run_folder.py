@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from armsight.app.check import MANY
 from armsight.app.check.rows import SAME_M, Attained, Reversal, Row, first_few
 from armsight.app.run.report import VERSION
 from armsight.app.run.tracks import ToolTrack, read_track
@@ -35,16 +36,15 @@ from armsight.tables.columns import Columns
 
 #: A rest is evaluated over its last part, this long, s: longer averages more shots, and more of the settling.
 WINDOW_S = 0.3
-#: A rest, and a path, is evaluated that was seen in this many shots; a path at so many path points.
-_REST_SHOTS, _PATH_SHOTS, _PATH_POINTS = 3, 10, 40
-#: Paths whose first, middle and last positions are this near to each other are one path, m.
+#: A rest is evaluated that was seen in this many shots, a path at so many path points.
+_REST_SHOTS, _PATH_POINTS = 3, 40
+#: Paths whose first, middle and last positions are this near to each other are one path, m; its direction is taken so far
+#: to either side.
 _SAME_M = 1e-4
 #: A circle is whole from this angle on, rad.
 _WHOLE_RAD = 2 * np.pi * 0.999
 #: Between two shots further apart than this many path points the path was not seen: the cycle is left out.
 _GAP = 2.5
-#: Half of the length over which a path's direction is taken, m.
-_AHEAD_M = 1e-4
 #: A joint reverses where it moves by this much before and after, rad: less does not take up its backlash.
 _MOVES_RAD = float(np.radians(0.5))
 #: Joints that reverse within this share of the circle's time do so together.
@@ -266,8 +266,8 @@ def _paths(segments: list[PathSegment], noise: Noise) -> tuple[list[Row], set[st
     for segment in segments:
         if segment.kind not in ("line", "circle"):
             continue
-        if len(segment.seen) < _PATH_SHOTS:
-            notes.append(f"left out: {segment.name}, seen in {len(segment.seen)} shots; {_PATH_SHOTS} are needed")
+        if len(segment.seen) < MANY:
+            notes.append(f"left out: {segment.name}, seen in {len(segment.seen)} shots; {MANY} are needed")
             continue
         ends = _ends(segment)
         same = (g for g in groups if g[0].kind == segment.kind and np.abs(_ends(g[0]) - ends).max() < _SAME_M)
@@ -311,7 +311,7 @@ def _path(name: str, group: list[PathSegment], noise: Noise, notes: list[str]) -
         was = segment.seen.Ts_base_tool[:, :3, 3]
         s = np.interp(segment.seen.t_s - segment.reference.t_s[0], since, gone)
         for _ in range(4):  # to the foot of the perpendicular: the time of the shot has no effect
-            ahead = on(s + _AHEAD_M) - on(s - _AHEAD_M)
+            ahead = on(s + _SAME_M) - on(s - _SAME_M)
             ahead /= np.maximum(np.linalg.norm(ahead, axis=1), 1e-12)[:, None]
             s = np.clip(s + ((was - on(s)) * ahead).sum(axis=1), 0.0, gone[-1])
         s, first = np.unique(s, return_index=True)

@@ -18,7 +18,8 @@ from armsight.errors import ArmsightError
 from armsight.vision.source import LIVE_S
 from armsight.vision.sources import Source
 
-#: How long after a failure a source is opened again, s.
+#: s between two tries of what is slow or rarely changes: opening cameras, searching an unknown board; half: a core is busy,
+#: double: a person waits.
 AGAIN_S = 2.0
 _UNTIMED_S, _LONGEST_PAUSE_S = 0.1, 1.0  # between shots of a recording without times; at most
 

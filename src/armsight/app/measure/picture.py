@@ -28,12 +28,12 @@ from armsight.vision.rig import StereoRig
 Canvas = NDArray[np.uint8]
 Colour = tuple[int, int, int]
 
-PAPER: Colour = (255, 255, 255)
-INK, MUTED, RED = (bgr(colour) for colour in (plotting.INK, plotting.MUTED, plotting.RED))
+PAPER, INK, MUTED, RED, _PALE = map(bgr, ("#ffffff", plotting.INK, plotting.MUTED, plotting.RED, "#ffa0a0"))
 BLANK = 200  # grey value where there is no image
 LINE = 24  # height of a line of text, px
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
-_SHIFT, _FAR = 4, 1e5  # OpenCV takes coordinates in sixteenths of a pixel; points further away, px, are not drawn
+#: OpenCV takes coordinates in sixteenths of a pixel; points further away, px, are not drawn, nor residuals enlarged more.
+_SHIFT, _FAR = 4, 1e5
 _SPELT = str.maketrans({"±": "+-", "…": "...", "°": " deg", "σ": "sigma", "µ": "u", "×": "x"})
 
 
@@ -46,12 +46,11 @@ _PER_ROW = (WIDTH - _GAP) // (2 * _TILE + _GAP)
 _MIDDLE = np.full(2, (_TILE - 1) / 2)
 #: Up to this many points are all shown enlarged; of more only the worst few.
 _ALL, _WORST = 12, 6
-#: Enlargement of a detail; less where its disc would not fit; of a residual at the most; arms of a cross in an image, px.
-_ZOOM, _MOST, _CROSS_PX = 8.0, 1e5, 3.0
+#: Enlargement of a detail; less where its disc would not fit; arms of a cross in an image, px.
+_ZOOM, _CROSS_PX = 8.0, 3.0
 #: Length of the longest residual, px of the picture: in an enlarged detail, where sigma counts as well, and in the images.
 _REACH, _LONGEST = 0.42 * _TILE, 40.0
 _RIM, _CROSS, _ARROW, _SIGMA = (255, 200, 40), (70, 220, 70), (30, 110, 255), (235, 70, 225)
-_PALE = (160, 160, 255)
 
 
 @dataclass(frozen=True, eq=False)
@@ -314,7 +313,7 @@ class _Panel:
 def _factor(lengths: Array, reach: float) -> float:
     """Return a round factor that makes the longest of lengths at most ``reach``; 1 where all are zero."""
     longest = float(np.nan_to_num(lengths).max(initial=0.0))
-    return nice(min(reach / longest, _MOST)) if longest > 0 else 1.0
+    return nice(min(reach / longest, _FAR)) if longest > 0 else 1.0
 
 
 def _details(marks: Marks, shown: list[int], panels: list[_Panel], in_images: float) -> list[Canvas]:

@@ -22,12 +22,11 @@ from armsight.app.progress import bar
 from armsight.app.show.messages import note, say, silence_stdout, warn
 from armsight.app.stream.datum import Published
 from armsight.data import Body, Dropped, Missed, PoseEstimate, Shot
-from armsight.errors import ArmsightError, InputError
+from armsight.errors import NAMED, ArmsightError, InputError
 from armsight.files import RowFile, check_writable
 from armsight.loop.finding import make_finding
 from armsight.loop.health import HealthFinding, HealthMonitor, health_lines, unseen_lines
 from armsight.loop.running.data import Fanout, HealthNotes, Publisher, ShotDatum
-from armsight.vision.detections import NAMED
 from armsight.vision.follow.follower import measurer
 from armsight.vision.markers.marker import Target
 from armsight.vision.markers.targets import open_fixed

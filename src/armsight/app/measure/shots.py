@@ -22,10 +22,10 @@ import numpy as np
 from armsight.app.measure.command import MeasureOptions
 from armsight.app.show.messages import note
 from armsight.data import SIDES, Body, Image, Missed, PoseEstimate, Shot
-from armsight.errors import InputError
+from armsight.errors import NAMED, InputError
 from armsight.files import check_writable
 from armsight.loop.finding import HealthFinding, make_finding
-from armsight.vision.detections import NAMED, SeenShot, read_detections
+from armsight.vision.detections import SeenShot, read_detections
 from armsight.vision.follow.follower import Follower, follows
 from armsight.vision.image import grey, one_image
 from armsight.vision.markers.board import BOARDS, board_in_view
@@ -105,7 +105,6 @@ def _timed(first: Sequence[tuple[float | None, PoseEstimate | Missed]]) -> list[
 
 
 def _shutters(rig: StereoRig, body: Body, shots: Sequence[TimedShot], requested: Requested) -> Shutters:
-    """Return the shutters that a user requests, found where they are not given."""
     given = Shutters(requested.skew_s or 0.0, requested.readout_s or 0.0, np.zeros((2, 2)))
     if requested.skew_s is not None:
         return given

@@ -34,8 +34,10 @@ _GREEN, _PURPLE, _LOST = "#3f8f5f", "#7b52ab", "#f6dcdc"
 TIME, SHOT = "time since the first shot, s", "shot"
 #: How a shot was found -> its colour in the band, the usual ones first.
 _WAYS = {"followed": _GREEN, "measured": BLUE, "searched": ORANGE, "lost": RED, "missed": RED}
-#: Strips; so many shots can be distinguished as dots; from so many on lines are thinner.
-_STRIPS, _DOTS_UP_TO, _THIN_FROM = 9, 80, 1000
+#: Strips: the pose, two of sigmas, one of residuals.
+_STRIPS = 2 * len(ANGLES) + 3
+#: So many shots can be distinguished as dots; from so many on lines are thinner.
+_DOTS_UP_TO, _THIN_FROM = 80, 1000
 #: Sigmas that differ by a larger factor are plotted on a logarithmic scale; a longer interval, in median steps, is a gap.
 _LOG_FROM, _GAP_STEPS = 20.0, 3.0
 #: Where a legend stands.

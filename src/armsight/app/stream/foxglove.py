@@ -19,6 +19,7 @@ from armsight.data import SIDES, Array, Image, Missed, PoseEstimate, Shot
 from armsight.geometry.pose import left_axes
 from armsight.loop.running.data import EventDatum, JointsDatum, NoteDatum, ShotDatum, quaternion
 from armsight.vision.rigfiles.rigfile import rectification
+from armsight.vision.sources.bag.reader import S_NS
 
 #: A protobuf message.
 Message: TypeAlias = Any
@@ -28,7 +29,6 @@ _COMPRESS_EVERY_S, _QUALITY = 1.0, 85
 _JOINTS_EVERY_S = 0.02
 #: The ellipsoid has this many sigmas, and at least this radius, m, to be seen.
 _SIGMAS, _LEAST_M = 3.0, 2e-4
-_NS = 1_000_000_000
 _GREEN, _RED, _YELLOW = (0.1, 0.8, 0.2, 1.0), (0.9, 0.2, 0.1, 1.0), (1.0, 0.8, 0.1, 0.4)
 _LEVELS = {"info": 2, "warning": 3, "error": 4}
 #: What must be there to make messages.
@@ -75,7 +75,7 @@ class Messages:
         """Yield the topic and the message of all that a datum says."""
         from google.protobuf.timestamp_pb2 import Timestamp
 
-        seconds, nanos = divmod(nanoseconds(datum.time_s), _NS)
+        seconds, nanos = divmod(nanoseconds(datum.time_s), S_NS)
         stamp = Timestamp(seconds=seconds, nanos=nanos)
         if isinstance(datum, ShotDatum):
             yield from self._of_shot(datum, stamp)

@@ -23,13 +23,11 @@ _VERSION = 1
 _POLYNOMIAL, _MASK = 0x42F0E1EBA9EA3693, (1 << 64) - 1
 #: Codes of STATUS: all is well; the device is not ready.
 _OK, _NOT_FOUND = 1, 7
-_FRACTION = 1 << 32  # times are seconds and fractions of 2^-32 s
 
 
 def message(kind: str, name: str, t_s: float, body: bytes) -> bytes:
     """Return a message of OpenIGTLink, of TRANSFORM, POSITION or STATUS; the name has at most 20 characters."""
-    seconds = int(max(t_s, 0.0))
-    stamp = (seconds << 32) | int((max(t_s, 0.0) - seconds) * _FRACTION)
+    stamp = int(max(t_s, 0.0) * 2**32)  # in units of 2^-32 s
     return _HEADER.pack(_VERSION, kind.encode(), name.encode()[:20], stamp, len(body), crc64(body)) + body
 
 
@@ -60,7 +58,6 @@ def crc64(data: bytes) -> int:
 
 @cache
 def _table() -> tuple[int, ...]:
-    """Return the CRC of every byte."""
     found = []
     for byte in range(256):
         crc = byte << 56

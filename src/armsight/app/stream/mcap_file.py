@@ -52,7 +52,7 @@ _SCHEMA = json.dumps({"type": "object"}).encode()
 _Record: TypeAlias = Any
 
 _MAGIC = b"\x89MCAP0\r\n"
-_MESSAGE, _SCHEMAS, _CHANNEL, _CHUNK_INDEX, _STATISTICS, _METADATA_INDEX = 0x05, 0x03, 0x04, 0x08, 0x0B, 0x0D
+_MESSAGE = 0x05  # opcode of a message
 #: Opcode, length of what follows, channel, sequence, log time, publish time.
 _HEAD = struct.Struct("<BQHIQQ")
 _HEAD_BYTES = _HEAD.size - 9  # without opcode and length
@@ -339,11 +339,13 @@ class McapWriter:
 
     def finish(self) -> None:
         """Write what was added, and the index."""
+        from mcap.opcode import Opcode
+
         self.flush()
         self._write(self._bytes(self._records.DataEnd(data_section_crc=0)))
         begin, offsets = self._at, []
-        groups = {_SCHEMAS: self._schemas, _CHANNEL: self._channels, _STATISTICS: [self._statistics()]}
-        groups |= {_CHUNK_INDEX: self._chunk_indexes, _METADATA_INDEX: self._metadata_indexes}
+        groups = {Opcode.SCHEMA: self._schemas, Opcode.CHANNEL: self._channels, Opcode.STATISTICS: [self._statistics()]}
+        groups |= {Opcode.CHUNK_INDEX: self._chunk_indexes, Opcode.METADATA_INDEX: self._metadata_indexes}
         summary = b""
         for opcode, records in groups.items():
             data = b"".join(self._bytes(record) for record in records)

@@ -362,7 +362,6 @@ class Board(Closing):
         self._link.close()
 
     def _send(self, kind: str, *values: object) -> int:
-        """Send a numbered command of this session and return its number."""
         self._say(kind, self._next(), self._number, *values)
         return self._sequence
 

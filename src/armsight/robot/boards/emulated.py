@@ -141,7 +141,6 @@ class EmulatedLink:
             raise DeviceError("the emulated board is closed")
 
     def _arriving(self) -> bytes:
-        """Return the bytes that reach the board in this tick."""
         self._credit += self._bytes_per_tick
         if not self._to_board:
             self._credit = 0.0

@@ -132,21 +132,20 @@ class QemuEmulator:
         return f": {said}" if said else ""
 
 
-_FLASH, _FLASH_BYTES = 0, 0x40000
-_RAM, _RAM_BYTES = 0x20000000, 0x10000
-_CONTROL, _CONTROL_BYTES = 0xE000E000, 0x1000  # the processor's own registers: here plain memory
+#: Addresses of both memories, and of the processor's own registers: here plain memory.
+_FLASH, _RAM, _CONTROL = range(0x40000), range(0x20000000, 0x20010000), range(0xE000E000, 0xE000F000)
 _FPU_ON = 0x40000000  # FPEXC.EN
 _THUMB = 1
 #: What calls a function, at the end of the flash where nothing else lies: ``blx r4; wfi; b _END``. By the procedure call
 #: standard a function leaves r4 and the stack pointer as they were, so neither has to be set again for the next tick. The
 #: wait for an interrupt ends the emulation; where it ends by an address, Unicorn translates the code there anew every time.
-_CALL, _CALLER = _FLASH_BYTES - 16, b"\xa0\x47\x30\xbf\x02\xe0"
+_CALL, _CALLER = len(_FLASH) - 16, b"\xa0\x47\x30\xbf\x02\xe0"
 _END = _CALL + 12
 
 
 def _fill(code: int, data: int, _uc: object, address: int, _access: int, entry: Any, _user: object) -> bool:  # noqa: ANN401
     """Map a page that is not in the TLB to itself: code may be read and run, data read and written."""
-    entry.paddr, entry.perms = address, code if address < _FLASH + _FLASH_BYTES else data
+    entry.paddr, entry.perms = address, code if address in _FLASH else data
     return True
 
 
@@ -166,12 +165,12 @@ class UnicornEmulator:
         self._symbols, self._sizes = elf.symbols, elf.sizes
         self.uc: Any = unicorn.Uc(unicorn.UC_ARCH_ARM, unicorn.UC_MODE_THUMB | unicorn.UC_MODE_MCLASS)
         self.uc.ctl_set_cpu_model(arm_const.UC_CPU_ARM_CORTEX_M4)
-        self.uc.mem_map(_FLASH, _FLASH_BYTES)
-        self.uc.mem_map(_CONTROL, _CONTROL_BYTES)
+        for memory in (_FLASH, _CONTROL):
+            self.uc.mem_map(memory.start, len(memory))
         # The board's RAM is memory of ours, so that frames need no call to be written or read. No code runs there.
-        self._ram = mmap.mmap(-1, _RAM_BYTES)
+        self._ram = mmap.mmap(-1, len(_RAM))
         data = unicorn.UC_PROT_READ | unicorn.UC_PROT_WRITE
-        self.uc.mem_map_ptr(_RAM, _RAM_BYTES, data, np.frombuffer(self._ram, np.uint8).ctypes.data)
+        self.uc.mem_map_ptr(_RAM.start, len(_RAM), data, np.frombuffer(self._ram, np.uint8).ctypes.data)
         # The processor's own map lets code run in RAM, and Unicorn takes every store to such a page through a slow path
         # that looks for translated code: more than half of a tick's time. These permissions are in place of that map.
         self.uc.ctl_set_tlb_mode(unicorn.UC_TLB_VIRTUAL)
@@ -201,8 +200,7 @@ class UnicornEmulator:
         self.uc = None
 
     def _address(self, name: str) -> slice:
-        """Return the bytes of the RAM that a variable takes."""
-        start = self._symbols[name] - _RAM
+        start = self._symbols[name] - _RAM.start
         return slice(start, start + self._sizes[name])
 
     def _call(self, function: int) -> None:

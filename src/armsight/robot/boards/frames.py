@@ -11,12 +11,11 @@ from armsight.robot.boards import headers
 JOINTS, WIRE_BYTES = headers.number("JOINTS"), headers.number("FRAME_BYTES")  # most bytes either way in one tick
 REQUEST_MAGIC, ANSWER_MAGIC, VERSION = (headers.number(f"FRAME_{name}") for name in ("REQUEST", "ANSWER", "VERSION"))
 #: What a request may do before its tick.
-RESTART_POWER, RESTART_WATCHDOG = 1, 2
+RESTART_POWER, RESTART_WATCHDOG = range(1, 3)
 REQUEST, OUTPUTS, ANSWER = (headers.record(name) for name in ("pil_request", "core_outputs", "pil_answer"))
 
 
 def _at(frame: np.dtype[np.void], name: str) -> int:
-    """Return where a field lies in a frame, bytes."""
     fields = frame.fields
     assert fields is not None
     return int(fields[name][1])

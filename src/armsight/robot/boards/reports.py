@@ -153,7 +153,6 @@ def readings_of(messages: list[Message], times_s: list[float]) -> SensorReadings
 
 
 def _faults(bits: int, joint_bits: list[int]) -> tuple[JointFault, ...]:
-    """Return the latched faults, those of the joints first."""
     of_joints = [JointFault(fault, j) for j, own in enumerate(joint_bits) for fault in codes.faults_in(own)]
     of_named_joints = {each.fault for each in of_joints}
     return tuple(of_joints + [JointFault(fault) for fault in codes.faults_in(bits) if fault not in of_named_joints])

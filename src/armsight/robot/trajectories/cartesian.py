@@ -89,7 +89,6 @@ def _lasting(shortest: PathMotion, duration_s: float) -> PathMotion:
 
 
 def _rejection(path: Path, obstacle: Obstacle, t_s: float) -> MotionRejected:
-    """Return the rejection of a motion at an obstacle, at a time, s."""
     p_base = path.at(np.array([obstacle.share])).T_base_tool[0, :3, 3]
     return MotionRejected(obstacle.reason, share=obstacle.share, t_s=t_s, p_base=p_base)
 

@@ -117,6 +117,5 @@ def check_limits(arm: Arm, trajectory: Trajectory) -> None:
 
 
 def _rejection(arm: Arm, trajectory: Trajectory, reason: str, t_s: float) -> MotionRejected:
-    """Return the rejection of a motion in joints at a time, s."""
     share = t_s / trajectory.duration_s if trajectory.duration_s > 0 else 0.0
     return MotionRejected(reason, share=share, t_s=t_s, p_base=arm.forward(trajectory.at(t_s).q)[:3, 3])

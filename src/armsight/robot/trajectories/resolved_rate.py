@@ -268,6 +268,5 @@ def _check(arm: Arm, path: Path, law: Profile, run: _Run, tolerance_m: float) ->
 
 
 def _rejection(path: Path, law: Profile, reason: str, t_s: float) -> MotionRejected:
-    """Return the rejection of a tracked motion at a time, s."""
     share = float(law.at(t_s).q[0])
     return MotionRejected(reason, share=share, t_s=t_s, p_base=path.at(np.array([share])).T_base_tool[0, :3, 3])

@@ -127,7 +127,6 @@ def rotation_of(rpy: Array) -> Array:
 
 
 def _vector(where: str, element: ET.Element | None, key: str, default: str) -> Array:
-    """Read the numbers of an attribute, as many as its default has."""
     text = default if element is None else element.get(key, default)
     tag = "" if element is None else element.tag
     try:
@@ -154,7 +153,6 @@ def _number(where: str, element: ET.Element, key: str) -> float | None:
 
 
 def _arm(path: str | Path, robot: ET.Element, chain: list[Joint], revolute: list[Joint]) -> Arm:
-    """Return the arm of a chain of joints from the base to the tool."""
     links = [ChainLink(np.eye(4), np.zeros(3))]
     for joint in chain:
         if joint.rotary:

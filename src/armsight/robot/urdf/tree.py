@@ -15,12 +15,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 from armsight.data import Array
-from armsight.errors import InputError
+from armsight.errors import NAMED, InputError, some
 from armsight.robot.kinematics.table import FEWEST_JOINTS, MOST_JOINTS
 
 ROTARY = ("revolute", "continuous")
 MOVING = (*ROTARY, "prismatic", "floating", "planar")
-_SHOWN = 6  # names that a message lists at most
 _FLANGE = "tool0"  # what ROS calls an arm's flange where a tool is mounted (REP 199)
 #: A last joint of such a name is a gripper's.
 _GRIPPERS = ("grip", "jaw", "finger", "knuckle", "thumb")
@@ -118,7 +117,7 @@ class Tree:
         """Return the link that is the tool where none is named: the end of the one arm of the tree; else InputError."""
         arms = self._arms()
         ends = [tip for arm in arms for tip in self._tips(arm)]
-        links = ", or ".join(ends[:_SHOWN])
+        links = ", or ".join(ends[:NAMED])
         if not arms:
             raise InputError(f"{self._path}: {self._why_none()}")
         if len(arms) > 1:
@@ -149,7 +148,6 @@ class Tree:
         return flanges[0]
 
     def _why_none(self) -> str:
-        """Return why no arm is found in the tree."""
         rotary = [joint.name for joint in self._joints if joint.rotary]
         if there := ", or ".join(self._tools()):
             return (
@@ -157,8 +155,8 @@ class Tree:
                 f"that is the tool, {self._path}#{there}"
             )
         if others := [joint for joint in self._joints if joint.other]:
-            return f"only arms of {_COUNT} rotary joints are read here; {_named(others[:_SHOWN])}"
-        names = f" ({', '.join(rotary[:_SHOWN])}{', ..' if len(rotary) > _SHOWN else ''})" if rotary else ""
+            return f"only arms of {_COUNT} rotary joints are read here; {_named(others[:NAMED])}"
+        names = f" ({some(rotary)})" if rotary else ""
         return f"{len(rotary)} rotary joints{names}; an arm here has {_COUNT} in a row"
 
     def _interrupting(self, arm: str) -> list[Joint]:
@@ -176,7 +174,7 @@ class Tree:
     def _tools(self) -> list[str]:
         """Return the first of the links that end an arm, those behind most joints first."""
         ends = [link for link, chain in self._chains.items() if _is_arm(chain) and link in self._tips(link)]
-        return sorted(ends, key=lambda link: -sum(joint.rotary for joint in self._chains[link]))[:_SHOWN]
+        return sorted(ends, key=lambda link: -sum(joint.rotary for joint in self._chains[link]))[:NAMED]
 
     def _rigid(self, link: str) -> list[str]:
         """Return a link and those that fixed joints hang on it."""
@@ -226,5 +224,4 @@ def _is_arm(chain: list[Joint]) -> bool:
 
 
 def _named(joints: list[Joint]) -> str:
-    """Return joints and how they move, as text."""
     return ", ".join(f"{j.name!r} is {'a mimic' if j.kind in ROTARY else j.kind}" for j in joints)

@@ -87,7 +87,6 @@ def _mass(origin: Array, radius: float) -> float:
 
 
 def _efforts(origins: list[Array], radii: list[float]) -> list[float]:
-    """Return the greatest effort of each joint, N m."""
     efforts = []
     for joint in range(len(radii) - 1):
         reach = torque = 0.0

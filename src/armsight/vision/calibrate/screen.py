@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array, Record
+from armsight.errors import NAMED
 from armsight.vision.calibrate.result import RejectedPair
-from armsight.vision.detections import NAMED
 from armsight.vision.pose.bundle import DAMPING, NEAR, BundleModel, BundleSolution, BundleState, Observations, minimise
 
 #: A corner this many standard deviations off the robust fit is gross: one in 10^7 for clean noise.

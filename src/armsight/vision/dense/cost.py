@@ -121,7 +121,6 @@ def prepare(left: Image, right: Image, pad: int) -> CensusPair:
 
 @kernel(nogil=True, inline="always")
 def _above(a: np.uint8, b: np.uint8) -> np.uint8:
-    """Return a - b where that is above zero, else zero."""
     return np.uint8(max(a, b) - b)
 
 
@@ -161,7 +160,6 @@ def raw_row(pair: CensusPair, y: int, first: int, count: int, size: np.uintp, ou
 
 @kernel(nogil=True)
 def _add_rows(raw: Bytes, above: np.uintp, at: np.uintp, below: np.uintp, out: Bytes) -> None:
-    """Add three rows of raw costs."""
     for i in range(np.uintp(out.shape[0])):
         out[i] = np.uint8(np.uint8(raw[above + i] + raw[at + i]) + raw[below + i])
 

@@ -83,10 +83,7 @@ _LAYOUTS = (
 )
 #: Weights of the benchmark's third version: these of its training scenes count half, for they are very hard.
 _HALF = {"pianol", "playroom", "playtable", "shelves", "vintage"}
-#: Scale of the truth of the 2001 scenes, of Tsukuba, and by the width of a full-size image of the others' layouts.
-_SCALE_2001 = 8
 _OF_2001 = {"sawtooth", "venus", "bull", "poster", "barn1", "barn2", "map"}
-_WIDTH_2003, _WIDTH_2006 = 1800, 1240
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +99,6 @@ class MiddleburyScene(Record):
 
 
 def _find(folder: Path, stem: str) -> Path | None:
-    """Return the file of a stem, whatever kind of image it is."""
     return next((folder / (stem + suffix) for suffix in _SUFFIXES if (folder / (stem + suffix)).is_file()), None)
 
 
@@ -117,13 +113,12 @@ def _files(folder: Path) -> tuple[Path, Path, Path] | None:
 
 
 def _scale(name: str, truth: Path, width: int) -> float:
-    """Return what an 8-bit truth's values are to be divided by."""
+    """Return what an 8-bit truth is to be divided by: as often as an image is smaller than its layout has them."""
     if truth.stem == "disp3":
         return 16.0
     if name.lower() in _OF_2001:
-        return _SCALE_2001
-    full = _WIDTH_2006 if truth.stem == "disp1" else _WIDTH_2003
-    return float(max(1, round(full / width)))
+        return 8.0
+    return float(max(1, round((1240 if truth.stem == "disp1" else 1800) / width)))  # of 2005 and 2006, of 2003
 
 
 def _read_truth(path: Path, name: str) -> Array:

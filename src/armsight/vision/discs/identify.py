@@ -338,7 +338,6 @@ def _ambiguous(target: DiscTarget, best: Hypothesis, rival: Hypothesis) -> str:
 
 
 def _counts(discs: tuple[Discs, Discs]) -> str:
-    """Return the number of discs in each image, as text."""
     return (
         " and ".join(f"{len(seen.uv)} discs in the {side}" for side, seen in zip(SIDES, discs, strict=True)) + " image"
     )

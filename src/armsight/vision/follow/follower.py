@@ -273,7 +273,6 @@ class Follower:
     def _pair(
         self, left: NDArray[np.uint8], right: NDArray[np.uint8], T: Array, twist: Array, seconds: float, margin: float
     ) -> tuple[int, float, float]:
-        """Run the compiled call."""
         least = max(search.LEAST_CONTRAST, 5.0 * self._noise)
         arguments = (self._limits, self._found, self._cov_noise, self._work, self._outline)
         return follow_pair(left, right, T, twist, seconds, self._scene, margin, self._noise, least, *arguments)

@@ -20,11 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import SIDES, Array, Body, Dropped, Missed, Points, PoseEstimate
+from armsight.errors import some
 from armsight.estimate.chance import chi_square_limit
 from armsight.geometry.pose import inverse, pose, transform
 from armsight.geometry.rigid import collinear, fit_rigid, fit_scale
 from armsight.geometry.rotation import skew
-from armsight.vision.detections import NAMED
 from armsight.vision.pose.pnp import consensus_poses
 from armsight.vision.pose.posefit import PixelObservations, PoseFit, fit_pose, whitened
 from armsight.vision.rig import StereoRig
@@ -88,9 +88,7 @@ def _wrong_size(rig: StereoRig, body: Body, points: Points, T_left_body: Array) 
     """
     scale, sigma = _scale(rig, body.points[points.ids], points, T_left_body)
     if wrong := _wrong_markers(rig, body, points, T_left_body, scale):
-        more = f" and {len(wrong) - NAMED} more" if len(wrong) > NAMED else ""
-        named = ", ".join(wrong[:NAMED])
-        return f"markers of {body.name} have another size than its file says: {named}{more}; correct the file"
+        return f"markers of {body.name} have another size than its file says: {some(wrong)}; correct the file"
     if abs(scale - 1) <= max(_SIZE_TOLERANCE, _SIZE_SIGMAS * sigma):
         return None
     off = f"its points lie {scale:.3f} times as far apart as those of {body.name}"

@@ -16,6 +16,7 @@ from armsight.geometry.pose import pose, transform
 from armsight.vision.camera import Camera
 from armsight.vision.pose.posefit import PixelObservations, fit_pose
 
+#: Fewest points that have one pose, and with which exchanged cameras are distinguishable from bad detections.
 MIN_POINTS = 4
 
 
@@ -72,7 +73,6 @@ _AGREE_SHARE, _AGREE_PX = 0.03, 2.0
 _MOST_TRIPLES = 600
 _SAME_ROTATION_RAD = 0.05
 _MOST_CANDIDATES = 8
-_POLISH_STEPS = 20
 
 
 def consensus_poses(points: Array, camera: Camera, ids: Ids, uv: Array) -> list[Candidate]:
@@ -140,5 +140,5 @@ def _polished(p: Array, camera: Camera, T: Array, uv: Array) -> Array:
     """Minimise one camera's pixel distance from a good start."""
     n = len(p)
     observations = PixelObservations(np.zeros(n, np.int64), np.arange(n), uv, np.tile(np.eye(2), (n, 1, 1)))
-    fit = fit_pose((camera, camera), np.eye(4), p, observations, T, robust=False, steps=_POLISH_STEPS)
+    fit = fit_pose((camera, camera), np.eye(4), p, observations, T, robust=False)
     return T if fit is None else fit.T_left_body

@@ -20,6 +20,7 @@ import numpy as np
 
 from armsight.data import Array
 from armsight.errors import InputError, naming
+from armsight.geometry.check import PRINTED, off_rotation
 from armsight.geometry.pose import inverse
 from armsight.geometry.rotation import exp_so3
 from armsight.tables.document import Foreign
@@ -100,7 +101,6 @@ def _words(name: str) -> list[str]:
 
 
 def _numbers(value: Foreign) -> Array:
-    """Return a value as finite numbers, empty where it is none."""
     try:
         numbers = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError):
@@ -109,7 +109,6 @@ def _numbers(value: Foreign) -> Array:
 
 
 def _is_matrix(name: str, value: Foreign) -> bool:
-    """Say whether a value has the form of a camera matrix, or is called one."""
     K, words = _numbers(value), _words(name)
     if _DERIVED & set(words):
         return False
@@ -124,7 +123,6 @@ def _is_distortion(name: str, value: Foreign) -> bool:
 
 
 def _is_size(name: str, value: Foreign) -> bool:
-    """Say whether a value is called an image's size."""
     return _stem(name) in SIZE and _numbers(value).size == 2
 
 
@@ -217,7 +215,7 @@ def _is_rotation(name: str, value: Foreign) -> bool:
     R = _numbers(value)
     if R.shape != (3, 3) or not np.abs(R).max() < 2 or plain(name) in ("r1", "r2") or _DERIVED & set(_words(name)):
         return False
-    return bool(np.abs(R @ R.T - np.eye(3)).max() < rigfile.LOOSEST_ROTATION and np.linalg.det(R) > 0)
+    return bool(off_rotation(R) < PRINTED and np.linalg.det(R) > 0)
 
 
 def _is_translation(name: str, value: Foreign) -> bool:

@@ -121,7 +121,6 @@ def mrcal_entry(document: Document) -> Mapping[str, Foreign]:
 
 
 def _basalt_recognises(documents: Sequence[Document]) -> bool:
-    """Say whether a file has Basalt's only entry with cameras in it."""
     return any(isinstance(value := document.get("value0"), Mapping) and "T_imu_cam" in value for document in documents)
 
 
@@ -184,7 +183,6 @@ def _caliscope_pose(entries: Entries, name: str) -> tuple[Array, list[str]]:
 
 
 def _multical_recognises(documents: Sequence[Document]) -> bool:
-    """Say whether a file has cameras and poses of them."""
     return any(
         all(isinstance(document.get(key), Mapping) for key in ("cameras", "camera_poses")) for document in documents
     )
@@ -261,7 +259,6 @@ def _reference(entries: Entries, name: str) -> str:
 
 
 def _socket(number: int) -> str:
-    """Return the name of a socket of Luxonis' boards."""
     return f"CAM_{chr(ord('A') + number)}"
 
 
@@ -318,7 +315,6 @@ def _stereolabs_read(documents: Sequence[Document], paths: Sequence[Path], optio
 
 
 def _orbslam_recognises(documents: Sequence[Document]) -> bool:
-    """Say whether a file has both cameras' parameters under ORB-SLAM's names."""
     return any({"Camera1.fx", "LEFT.K"} & set(document) for document in documents)
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from armsight.data import Array
 from armsight.errors import InputError, naming
 from armsight.files import replacing
-from armsight.geometry.check import checked
+from armsight.geometry.check import PRINTED, checked, off_rotation
 from armsight.geometry.pose import inverse, mean_pose, pose
 from armsight.tables.document import Foreign
 from armsight.tables.lengths import BASELINE, check_length, fitting, metric
@@ -38,8 +38,6 @@ LONG_M = 2.0  # half: rooms' rigs are remarked; double: 30 cm read as inches are
 #: OpenCV's alpha (of fisheyes: balance) of every rectification that is written: 0, as ROS's calibrator has it, scales the
 #: rectified images so that all of their pixels are valid; 1 would keep all pixels of the raw images, and black edges.
 ALPHA = 0.0
-#: A printed rotation may be this far from orthonormal: three digits leave 1e-3, six leave 1e-6.
-LOOSEST_ROTATION = 2e-3
 #: Lengths beyond this are damaged numbers in any unit; half, double: the same.
 _FARTHEST = 1e9
 #: Keys of a camera that armsight cannot represent.
@@ -176,11 +174,10 @@ def rigid(R: Foreign, t: Foreign, name: str) -> tuple[Array, list[str]]:
     T = pose(checked(R, (3, 3), name), checked(t, (3,), f"translation of {name}"))
     if np.abs(T[:3, 3]).max() > _FARTHEST:
         raise InputError(f"translation of {name} has {np.abs(T[:3, 3]).max():.2g} units: a damaged number?")
-    near = np.clip(T[:3, :3], -2.0, 2.0)  # squares of damaged numbers overflow
-    off = float(np.abs(near @ near.T - np.eye(3)).max())
-    if off <= LOOSEST_ROTATION and np.linalg.det(T[:3, :3]) < 0:
+    off = off_rotation(T[:3, :3])
+    if off <= PRINTED and np.linalg.det(T[:3, :3]) < 0:
         raise InputError(f"{name} is not a rotation: it is left-handed (determinant -1), an axis is mirrored")
-    if off > LOOSEST_ROTATION:
+    if off > PRINTED:
         raise InputError(f"{name} is not a rotation: R R^T differs from the identity by {off:.2g}")
     if off < 1e-12:
         return T, []

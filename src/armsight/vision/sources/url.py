@@ -264,7 +264,6 @@ def open_url(rest: str) -> UrlSource:
 
 
 def _stream(url: str) -> Stream:
-    """Return the stream at an address, not yet connected."""
     try:
         parts = urlsplit(url)
         if parts.scheme in STREAMS and parts.hostname and parts.port != 0:

@@ -28,9 +28,8 @@ from armsight.errors import DeviceError, InputError
 from armsight.vision.image import jpeg_in
 from armsight.vision.source import Source
 from armsight.vision.sources.capture import STALL_S, QuietCapture, Rhythm, allowed_skew, open_capture
-from armsight.vision.sources.v4l2 import EXPOSURE_UNIT_MS
+from armsight.vision.sources.v4l2 import EXPOSURE_UNIT_MS, V4l2
 
-_MANUAL, _AUTO = 1, 3  # of V4L2's auto_exposure: manual mode, aperture priority mode
 _QUEUE = 4  # frames OpenCV's V4L2 lets the driver queue
 _CATCH_UP = 30  # grabs after which two cameras that never come close in time are given up
 _FORM = "usb:LEFT,RIGHT[@WIDTHxHEIGHT][@FPS][,exposure=5ms|auto][,gain=20][,format=MJPG]"
@@ -40,9 +39,8 @@ _MJPG = cv2.VideoWriter.fourcc(*"MJPG")
 Settings = dict[int, tuple[str, float]]
 
 
-_COMMAND = (
-    80  # characters of another process' command in a message; half: its configuration is cut, double: a long line
-)
+#: Characters of another process' command in a message; half: its configuration is cut, double: a long line.
+_COMMAND = 80
 #: How a camera's JPEG is decoded: unrotated, as recordings of it are read.
 _FLAGS = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
 
@@ -209,11 +207,11 @@ def parsed_usb(rest: str) -> tuple[list[str], Settings]:
     if fps:
         settings[cv2.CAP_PROP_FPS] = (f"{fps} frames per second", float(fps))
     if exposure[1]:
-        settings[cv2.CAP_PROP_AUTO_EXPOSURE] = (f"manual exposure ({_MANUAL})", _MANUAL)
+        settings[cv2.CAP_PROP_AUTO_EXPOSURE] = (f"manual exposure ({V4l2.EXPOSURE_MANUAL})", V4l2.EXPOSURE_MANUAL)
         units = round(float(exposure[1]) / EXPOSURE_UNIT_MS)
         settings[cv2.CAP_PROP_EXPOSURE] = (f"exposure {units} (x {EXPOSURE_UNIT_MS} ms)", units)
     elif asked:
-        settings[cv2.CAP_PROP_AUTO_EXPOSURE] = (f"automatic exposure ({_AUTO})", _AUTO)
+        settings[cv2.CAP_PROP_AUTO_EXPOSURE] = (f"automatic exposure ({V4l2.EXPOSURE_AUTO})", V4l2.EXPOSURE_AUTO)
     if gain:
         settings[cv2.CAP_PROP_GAIN] = (f"gain {gain}", float(gain))
     return devices, settings

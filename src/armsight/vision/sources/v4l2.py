@@ -7,6 +7,7 @@ stable path, pixel formats, sizes and frame rates. Structures as in the kernel's
 from __future__ import annotations
 
 import dataclasses
+import enum
 import errno
 import fcntl
 import os
@@ -16,17 +17,30 @@ from pathlib import Path
 
 from armsight.files import natural_key
 
-#: request number -> how many bytes; videodev2.h's _IOWR('V', n, struct ...).
-QUERYCAP, ENUM_FMT, ENUM_FRAMESIZES, ENUM_FRAMEINTERVALS = 0x80685600, 0xC0405602, 0xC02C564A, 0xC034564B
-QUERYCTRL = 0xC0445624
-#: Controls by their numbers in v4l2-controls.h, a flag of a control, and the unit of exposure_time_absolute, ms.
-_EXPOSURE, _GAIN, _DISABLED, EXPOSURE_UNIT_MS = 0x009A0902, 0x00980913, 0x0001, 0.1
-_CAPTURE, _DEVICE_CAPS = 0x00000001, 0x80000000
-_VIDEO_CAPTURE = 1  # V4L2_BUF_TYPE_VIDEO_CAPTURE
-_DISCRETE = 1  # V4L2_FRMSIZE_TYPE_DISCRETE, V4L2_FRMIVAL_TYPE_DISCRETE
+#: Unit of exposure_time_absolute, ms.
+EXPOSURE_UNIT_MS = 0.1
 
 #: (device, request, buffer) -> the buffer the driver filled in; OSError when it has no answer.
 Ioctl = Callable[[int, int, bytes], bytes]
+
+
+class V4l2(enum.IntEnum):
+    """Numbers of videodev2.h and v4l2-controls.h; a request, _IOWR('V', n, struct ...), says how many bytes it takes."""
+
+    QUERYCAP = 0x80685600
+    ENUM_FMT = 0xC0405602
+    QUERYCTRL = 0xC0445624
+    ENUM_FRAMESIZES = 0xC02C564A
+    ENUM_FRAMEINTERVALS = 0xC034564B
+    EXPOSURE = 0x009A0902
+    EXPOSURE_MANUAL = 1  # values of auto_exposure
+    EXPOSURE_AUTO = 3  # aperture priority mode
+    GAIN = 0x00980913
+    DISABLED = 0x0001  # a flag of a control
+    CAPTURE = 0x00000001
+    DEVICE_CAPS = 0x80000000
+    BUF_TYPE_VIDEO_CAPTURE = 1
+    DISCRETE = 1  # kind of a size and of an interval
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,8 +83,8 @@ class VideoDevice:
 def capability(buffer: bytes) -> tuple[str, str, str, bool]:
     """Read struct v4l2_capability: driver, card, bus, and whether this device delivers images."""
     driver, card, bus, _, capabilities, device = struct.unpack_from("=16s32s32sIII", buffer)
-    mine = device if capabilities & _DEVICE_CAPS else capabilities
-    return _text(driver), _text(card), _text(bus), bool(mine & _CAPTURE)
+    mine = device if capabilities & V4l2.DEVICE_CAPS else capabilities
+    return _text(driver), _text(card), _text(bus), bool(mine & V4l2.CAPTURE)
 
 
 def pixel_format(buffer: bytes) -> tuple[str, str]:
@@ -82,26 +96,26 @@ def pixel_format(buffer: bytes) -> tuple[str, str]:
 def frame_size(buffer: bytes) -> tuple[int, int, tuple[int, int] | None]:
     """Read struct v4l2_frmsizeenum: width and height, px, and where sizes go in steps the smallest."""
     kind, *n = struct.unpack_from("=8x7I", buffer)
-    return (n[0], n[1], None) if kind == _DISCRETE else (n[1], n[4], (n[0], n[3]))
+    return (n[0], n[1], None) if kind == V4l2.DISCRETE else (n[1], n[4], (n[0], n[3]))
 
 
 def frame_rates(buffer: bytes) -> tuple[float, ...]:
     """Read struct v4l2_frmivalenum: frames per second; where they go in steps the slowest and the fastest."""
     kind, *n = struct.unpack_from("=16x5I", buffer)
-    intervals = [n[0:2]] if kind == _DISCRETE else [n[2:4], n[0:2]]
+    intervals = [n[0:2]] if kind == V4l2.DISCRETE else [n[2:4], n[0:2]]
     return tuple(round(below / above, 3) for above, below in intervals if above)
 
 
 def describe(device: int, ioctl: Ioctl) -> tuple[Format, ...]:
     """Ask an open device for its formats, sizes and frame rates."""
     formats = []
-    for found in _each(device, ioctl, ENUM_FMT, struct.Struct("=2I56x"), _VIDEO_CAPTURE):
+    for found in _each(device, ioctl, V4l2.ENUM_FMT, struct.Struct("=2I56x"), V4l2.BUF_TYPE_VIDEO_CAPTURE):
         fourcc, description = pixel_format(found)
         code = fourcc.ljust(4).encode("latin1")
         sizes = []
-        for size in _each(device, ioctl, ENUM_FRAMESIZES, struct.Struct("=I4s36x"), code):
+        for size in _each(device, ioctl, V4l2.ENUM_FRAMESIZES, struct.Struct("=I4s36x"), code):
             width, height, smallest = frame_size(size)
-            rates = _each(device, ioctl, ENUM_FRAMEINTERVALS, struct.Struct("=I4s2I36x"), code, width, height)
+            rates = _each(device, ioctl, V4l2.ENUM_FRAMEINTERVALS, struct.Struct("=I4s2I36x"), code, width, height)
             sizes.append(Size(width, height, tuple(fps for rate in rates for fps in frame_rates(rate)), smallest))
         formats.append(Format(fourcc, description, tuple(sizes)))
     return tuple(formats)
@@ -110,11 +124,11 @@ def describe(device: int, ioctl: Ioctl) -> tuple[Format, ...]:
 def control_range(device: int, ioctl: Ioctl, control: int, unit: float = 1.0) -> tuple[float, float] | None:
     """Ask an open device for the smallest and the largest value of a control; None where it has none, or it is disabled."""
     try:
-        answer = ioctl(device, QUERYCTRL, struct.pack("=I64x", control))
+        answer = ioctl(device, V4l2.QUERYCTRL, struct.pack("=I64x", control))
     except OSError:
         return None
     low, high, _, _, flags = struct.unpack_from("=40x4iI", answer)
-    return None if flags & _DISABLED else (round(low * unit, 6), round(high * unit, 6))
+    return None if flags & V4l2.DISABLED else (round(low * unit, 6), round(high * unit, 6))
 
 
 def find_cameras(sys: Path = Path("/sys/class/video4linux"), dev: Path = Path("/dev")) -> list[VideoDevice]:
@@ -132,11 +146,11 @@ def find_cameras(sys: Path = Path("/sys/class/video4linux"), dev: Path = Path("/
             cameras.append(dataclasses.replace(entry, problem=_why(error)))
             continue
         try:
-            driver, card, bus, captures = capability(_ioctl(handle, QUERYCAP, bytes(104)))
+            driver, card, bus, captures = capability(_ioctl(handle, V4l2.QUERYCAP, bytes(104)))
             if captures:
                 entry = dataclasses.replace(entry, name=card, driver=driver, bus=bus, formats=describe(handle, _ioctl))
-                exposure_ms = control_range(handle, _ioctl, _EXPOSURE, EXPOSURE_UNIT_MS)
-                gain = control_range(handle, _ioctl, _GAIN)
+                exposure_ms = control_range(handle, _ioctl, V4l2.EXPOSURE, EXPOSURE_UNIT_MS)
+                gain = control_range(handle, _ioctl, V4l2.GAIN)
                 cameras.append(dataclasses.replace(entry, exposure_ms=exposure_ms, gain=gain))
         except OSError as error:
             cameras.append(dataclasses.replace(entry, problem=_why(error)))

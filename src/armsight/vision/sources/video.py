@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from armsight import MOST_PIXELS
 from armsight.data import Array, Image, Shot
-from armsight.errors import InputError
+from armsight.errors import InputError, some
 from armsight.files import check_readable
 from armsight.vision.source import Source
 from armsight.vision.sources.pairs import split_names
@@ -47,8 +47,6 @@ _EVERY = 4
 _REPEAT_SHARE, _NEARBY, _LEAST_CHANGE = 1 / 16, 3, 0.25
 #: Repeated and interpolated frames are said from this share on: what moves and stops has a few that look like it.
 _REPEATS_SAID = 0.15
-#: So many of them are named.
-_LISTED = 8
 #: A frame is interpolated if a mixture of its neighbours is so much nearer to it than mixtures are to frames nearby. The
 #: share of one neighbour in it is at least this, otherwise it is a repeated one. Only pixels count that differ by so many
 #: grey levels between the neighbours: noise where nothing moves is averaged by codecs, too.
@@ -407,8 +405,7 @@ def _one_clock(first: Film, last: Film) -> tuple[str, ...]:
 
 def _listed(numbers: Sequence[int]) -> str:
     """Name the first few frames of many."""
-    more = f" and {len(numbers) - _LISTED} more" if len(numbers) > _LISTED else ""
-    return f"frames {', '.join(map(str, numbers[:_LISTED]))}{more} (from 0)"
+    return f"frames {some(numbers)} (from 0)"
 
 
 def _mixture(before: Array, frame: Array, after: Array) -> tuple[float, float]:

@@ -49,7 +49,6 @@ def bag_rig(bag: Bag, named: dict[str, str] | None = None) -> StereoRig:
 
 
 def _beside(image_topic: str, topics: list[str]) -> str:
-    """Return the camera_info in the namespace of an image topic."""
     parts = image_topic.split("/")
     while parts:
         parts.pop()

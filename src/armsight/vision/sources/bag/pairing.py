@@ -26,7 +26,6 @@ _JUMP_S, _JUMP_PERIODS = 1.0, 4.0
 _TOGETHER = 5
 #: A pair is never further apart than this, s, however slow the topics are; half, double: the same for all above 1 Hz.
 _APART_S = 0.5
-_NS = 1e-9
 
 
 @dataclass(frozen=True)
@@ -49,7 +48,7 @@ class Stamps:
     @property
     def period_s(self) -> float:
         """Median interval, s; infinite where there are fewer than two times."""
-        return _period_ns(np.array(self.t_ns, np.int64)) * _NS
+        return _period_ns(np.array(self.t_ns, np.int64)) / S_NS
 
 
 def _period_ns(t: _Times) -> float:
@@ -91,7 +90,7 @@ def stamps_of(
             if unlike or np.abs(t[good] - t[k]).min() < period / 2:  # or it is where another was
                 unknown.add(k)
     if jumps:
-        times, by_s = f"{len(jumps)} time{'' if len(jumps) == 1 else 's'}", jumps[0][1] * _NS
+        times, by_s = f"{len(jumps)} time{'' if len(jumps) == 1 else 's'}", jumps[0][1] / S_NS
         notes.append(f"{topic}: its clock jumps {times}, first by {by_s:+.3f} s: shots are paired on either side of it")
     if repeats:
         notes.append(f"{topic}: {len(repeats)} of {len(t)} messages were recorded twice: each counts once")
@@ -119,7 +118,7 @@ def _jumps(t: _Times, arrival: _Times) -> tuple[tuple[int, int], ...]:
     order = np.lexsort((t, arrival))
     early, came = t[order], arrival[order]
     period = _period_ns(t)
-    least = max(_JUMP_S / _NS, _JUMP_PERIODS * period)
+    least = max(_JUMP_S * S_NS, _JUMP_PERIODS * period)
     step, took = (np.diff(median_filter(each, _TOGETHER, mode="nearest")).astype(float) for each in (early, came))
     at = np.flatnonzero((step < -least) | (step - took > least)) + 1
     spacing = np.diff(np.sort(t)).astype(float)
@@ -170,7 +169,7 @@ def pair(left: Stamps, right: Stamps, allowed_s: float | None = None) -> Pairing
             why = f"{other.topic} none within {1e3 * allowed_s:.1f} ms"
             why = "recorded twice: it counts once" if n in of.repeats else why
             why = "of arrival, no stamp, and others near it came late" if n in of.unknown else why
-            alone[side, n] = f"{of.topic} has a message at {of.t_ns[n] * _NS:.3f} s, {why}"
+            alone[side, n] = f"{of.topic} has a message at {of.t_ns[n] / S_NS:.3f} s, {why}"
     counts = [
         sum(side == each for each, _ in alone) - len(of.repeats | of.unknown) for side, of in enumerate((left, right))
     ]
@@ -179,7 +178,7 @@ def pair(left: Stamps, right: Stamps, allowed_s: float | None = None) -> Pairing
             f"{counts[0]} of {len(a)} messages of {left.topic} and {counts[1]} of {len(b)} of {right.topic} have no "
             f"partner within {1e3 * allowed_s:.1f} ms"
         )
-    skews: Array = np.array([b[n] - a[k] for k, n in pairs]) * _NS
+    skews: Array = np.array([b[n] - a[k] for k, n in pairs]) / S_NS
     due = {(0, k): int(t) for k, t in enumerate(a)} | {(1, n): int(t) for n, t in enumerate(b)}
     pairs.sort(key=lambda pair_: due[0, pair_[0]])
     return Pairing(tuple(pairs), alone, allowed_s, float(np.median(skews)), tuple(notes), due)
@@ -200,7 +199,7 @@ def _mutual(
         groups.append(rows)
     (one, other), (ours, theirs) = ([list(rows.values()) for rows in groups], [np.array([*rows]) for rows in groups])
     there, back = _nearest(ours, theirs), _nearest(theirs, ours)
-    apart_s = np.abs(theirs[there] - ours) * _NS
+    apart_s = np.abs(theirs[there] - ours) / S_NS
     found = [(one[k], other[n]) for k, n in enumerate(there) if back[n] == k and apart_s[k] <= allowed_s]
     return both, [pair_ for mates in found for pair_ in zip(*mates, strict=False)], float(apart_s.min())
 
@@ -210,7 +209,7 @@ def _shared(left: Stamps, right: Stamps) -> Sequence[tuple[int, int]]:
     if len(left.jumps_ns) != len(right.jumps_ns):
         return right.jumps_ns
     return [
-        (at, by if abs(by - ours) < _JUMP_S / 2 / _NS else ours)
+        (at, by if abs(by - ours) < _JUMP_S / 2 * S_NS else ours)
         for (_, by), (at, ours) in zip(left.jumps_ns, right.jumps_ns, strict=True)
     ]
 

@@ -36,8 +36,7 @@ _COMPRESSIONS = ("", "lz4", "zstd")
 _CHUNK_MB = 100
 #: Bytes before the stamp of a message that begins with a header: ROS 1 has a sequence number, CDR says its byte order.
 _BEFORE_STAMP = 4
-_SECOND_NS = 1_000_000_000
-S_NS = float(_SECOND_NS)
+S_NS = 1_000_000_000
 #: Suffixes of recordings; in a folder files of the first that is there are one recording.
 SUFFIXES = (".mcap", ".db3", ".bag")
 _INSTALL = 'pip install "armsight[ros]"'
@@ -72,12 +71,12 @@ class BagMessage:
         """Return the time stamp of its header, ns; 0 where the sender set none."""
         if self.encoding == "protobuf":
             stamp = self.decode().timestamp
-            return int(stamp.seconds) * _SECOND_NS + int(stamp.nanos)
+            return int(stamp.seconds) * S_NS + int(stamp.nanos)
         if self.encoding not in ("ros1", "cdr") or len(self.data) < _BEFORE_STAMP + 8:
             return 0
         big = self.encoding == "cdr" and not self.data[1] & 1  # second byte of CDR: its byte order
         seconds, nanoseconds = struct.unpack_from(">iI" if big else "<iI", self.data, _BEFORE_STAMP)
-        return int(seconds) * _SECOND_NS + int(nanoseconds)
+        return int(seconds) * S_NS + int(nanoseconds)
 
 
 class Bag:

@@ -130,10 +130,10 @@ def _transforms(message: Decoded) -> Iterator[tuple[int, str, str, Array]]:
     """Yield stamp, ns, parent, child and pose (4, 4) of each transform of a message."""
     for each in getattr(message, "transforms", [message]):
         if hasattr(each, "parent_frame_id"):
-            stamp_ns = int(each.timestamp.seconds) * int(S_NS) + int(each.timestamp.nanos)
+            stamp_ns = int(each.timestamp.seconds) * S_NS + int(each.timestamp.nanos)
             parent, child, t, r = each.parent_frame_id, each.child_frame_id, each.translation, each.rotation
         else:
-            stamp_ns = int(each.header.stamp.sec) * int(S_NS) + int(each.header.stamp.nanosec)
+            stamp_ns = int(each.header.stamp.sec) * S_NS + int(each.header.stamp.nanosec)
             parent, child = each.header.frame_id, each.child_frame_id
             t, r = each.transform.translation, each.transform.rotation
         quaternion = np.array([r.x, r.y, r.z, r.w], float)
