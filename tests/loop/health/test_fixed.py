@@ -8,7 +8,9 @@ from arm_rig import off, small
 from faults import AT_S, watched_arm
 
 from armsight.geometry.pose import inverse, log_se3
+from armsight.loop.estimators import Innovation, Outcome
 from armsight.loop.health.change import widened
+from armsight.loop.health.fixed import ShakeWatch
 
 
 @pytest.mark.parametrize("seed", [30, 31])
@@ -64,3 +66,21 @@ def test_what_is_given_out_of_a_rig_that_drifts_far_is_as_uncertain_as_it_is_wro
     error = off(moved.tracked.Ts_base_tool[rows], moved.Ts_true[rows])
     squares = np.einsum("ni,ni->n", error, np.linalg.solve(moved.tracked.covs[rows], error[..., None])[..., 0])
     assert np.mean(squares) < 6.0
+
+
+@pytest.mark.parametrize("shake_m", [0.0, 2e-4])
+def test_a_rig_that_shakes_is_named_while_the_arm_stands_and_an_arm_that_wanders_is_not(shake_m):
+    rng, watch, arm, noise = np.random.default_rng(61), ShakeWatch(), np.zeros(6), 1e-8 * np.eye(6)
+    for k in range(1200):
+        t_s = k / 60.0
+        added = 4e-8 * np.ones(6) * (t_s % 1.0 < 0.6)  # in motion
+        arm = arm + np.sqrt(added) * rng.normal(size=6)
+        seen = arm + 1e-4 * rng.normal(size=6) + shake_m * np.sin(10 * np.pi * t_s) * np.eye(6)[1]
+        given = seen, noise, np.eye(6), np.ones(6), np.zeros((6, 6)), Outcome.USED
+        watch.take(Innovation(t_s, np.eye(4), *given, None, lambda seen=seen: (seen, np.eye(6)), added, noise))
+    if not shake_m:
+        assert watch.change is None
+        return
+    (found,) = watch.findings()
+    assert found.cause == "fixed"
+    assert found.size == pytest.approx(1e3 * shake_m / np.sqrt(2), rel=0.15)  # root mean square

@@ -504,11 +504,12 @@ class KalmanEstimator:
         felt = self._felt(before, t_s, report=report is not None)
         steps = () if felt is before else felt.steps
         before, joints = self._anew(felt, times)
-        step = self._model.moved(before, joints, times, learning=LEARNING)
+        learns = self._model.moved(before, joints, times, learning=LEARNING)
+        step = self._model.moved(before, joints, times)
         given, beside = pose_measurement, before.beside
         if self._unit is not None:
             pose_measurement = replace(given, cov_noise=ALIKE * given.cov_noise)
-        at, chi = self._model.predicted(before, step, joints, pose_measurement, jitter_s)
+        at, chi = self._model.predicted(before, learns, joints, pose_measurement, jitter_s)
         outcome = self._gate(at, chi)
         if report is not None and self._mistimed(at, chi, outcome):
             outcome = Outcome.OUTLIER

@@ -221,8 +221,11 @@ _LEAST = 8
 #: Half: a jump counts for as long as a window does, double: shaking is found after twice the time.
 _NEWEST, _ODD, _FEWEST = 20, 0.25, 4
 
-#: Length of a window of innovations, s; half: shaking below 4 Hz is taken for the arm, double: the arm for shaking.
+#: Length of a window, s; half: shaking below 1 Hz is taken for the arm, double: the arm for shaking.
 _WINDOW_S = 1.0
+#: A window ends where the arm may have wandered by so many sigmas of a shot; half: an arm that creeps is not watched,
+#: double: its wandering hides what shakes.
+_WANDERED = 1.0
 
 
 class Unrest:
@@ -233,7 +236,8 @@ class Unrest:
         suspected: the same by the newest window alone, while nothing is certain.
     """
 
-    def __init__(self, size: int) -> None:
+    def __init__(self, size: int, terms: int = _TERMS) -> None:
+        self._terms = terms  # of the polynomial that is removed of each window
         self._windows = tuple[tuple[Any, ...], ...]()  # replaced, never changed: a copy goes on alone
         self.cov = self.suspected = np.zeros((size, size))
 
@@ -245,7 +249,7 @@ class Unrest:
         """
         if len(t_s) < _LEAST or not np.ptp(t_s) > 0.0:
             return
-        Q = np.linalg.qr(np.vander((t_s - t_s.mean()) / np.ptp(t_s), _TERMS))[0]
+        Q = np.linalg.qr(np.vander((t_s - t_s.mean()) / np.ptp(t_s), self._terms))[0]
         kept = np.eye(len(t_s)) - Q @ Q.T
         left, noise = kept @ values, np.einsum("nk,kij->nij", kept**2, excess * covs)
         # A shot says of a variance as much as the square of its information.
@@ -261,11 +265,10 @@ class Unrest:
         if not self.cov.any():
             self.suspected = self._beyond([self._windows[-1]], SUSPECTED)
 
-    @staticmethod
-    def _beyond(windows: Sequence[tuple[Any, ...]], chance: float) -> Array:
+    def _beyond(self, windows: Sequence[tuple[Any, ...]], chance: float) -> Array:
         """Return the covariance (D, D) of what windows vary beyond their noise, in axes of less than a chance."""
         _, counts, seen, expected, once, twice = (sum(part) for part in zip(*windows, strict=True))
-        freedom = float(once**2 / twice) * (1.0 - _TERMS * len(windows) / counts)
+        freedom = float(once**2 / twice) * (1.0 - self._terms * len(windows) / counts)
         L = np.linalg.cholesky(expected / once)
         inner = np.linalg.solve(L, np.linalg.solve(L, seen / once).T)
         values, vectors = np.linalg.eigh((inner + inner.T) / 2.0)
@@ -275,21 +278,32 @@ class Unrest:
 
 
 class ShakeWatch:
-    """Watches whether rig and arm shake against each other, by what the estimator leaves of poses within a second."""
+    """Watches whether rig and arm shake against each other while the arm stands, by the model as it was learned.
+
+    The estimator would follow what shakes: an arm in motion wanders as much.
+    """
 
     def __init__(self) -> None:
-        self._unrest, self._window = Unrest(6), list[tuple[float, Array, Array]]()
+        self._unrest, self._window = Unrest(6, terms=1), list[tuple[float, Array, Array]]()
+        self._wandered: Array | float = 0.0  # variances (K,) of the arm's error since the window began
         self.change: Change | None = None
 
     def take(self, innovation: Innovation) -> None:
         """Take what the estimator did with a measurement, in order of time."""
-        if innovation.outcome is not Outcome.USED or innovation.noise is None or innovation.added is None:
+        noise, added, reference = innovation.noise, innovation.added, innovation.reference
+        if innovation.outcome is not Outcome.USED or noise is None or added is None or reference is None:
             return
-        if self._window and not 0.0 <= innovation.t_s - self._window[0][0] < _WINDOW_S:
+        e, H = reference()
+        wandered = self._wandered * innovation.kept**2 + added
+        wander = (H * wandered) @ H.T
+        late = self._window and not 0.0 <= innovation.t_s - self._window[0][0] < _WINDOW_S
+        if late or (self._window and np.trace(np.linalg.solve(noise, wander)) > len(e) * _WANDERED**2):
             self._decide(innovation)
+            wandered, wander = 0.0 * wandered, 0.0 * wander
+        self._wandered = wandered
         R = np.kron(np.eye(2), innovation.T_base_tool[:3, :3])
-        noise = innovation.noise + (innovation.by_state * innovation.added) @ innovation.by_state.T
-        self._window.append((innovation.t_s, R @ innovation.z, R @ noise @ R.T))
+        # About its mean a random walk varies by a third of what it does about its begin.
+        self._window.append((innovation.t_s, R @ e, R @ (noise + wander / 3.0) @ R.T))
 
     def _decide(self, newest: Innovation) -> None:
         """Compare a window with its noise."""
