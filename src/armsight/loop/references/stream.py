@@ -29,16 +29,14 @@ SATURATED = 5
 REPEATS, STEPS = 0.05, 1.5
 #: A rest: blocks of this length, s, whose spread is at most so many times that of the quietest fifth, for so long, s.
 BLOCK_S, QUIET, REST_S = 0.25, 2.0, 1.0
-#: Means of neighbouring blocks of a rest differ by at most so many sigmas of chance.
+#: So many sigmas are chance at most: between neighbouring blocks of a rest, and of a vibration against none.
 STEADY = 6.0
 #: One number rests where its changes from reading to reading are so large a share of its noise, 1 where that is white;
 #: half: slow motion is a rest, double: nothing is.
 WHITE = 0.65
-#: A stop is looked for so long before a rest, s, in such steps, s; half: slow vibration is missed, double: slower.
-STOP_S, STEP_S = 1.5, 0.005
-#: The last of these steps is gone through in so many; half: times are 1 ms worse, double: slower.
-FINE = 5
-#: A vibration leaves so much of itself at most, or so many times the noise; half: a second mode hides the first.
+#: So long, s, of a rest is fitted with the vibration before it; half: slow ones are less exact, double: slower.
+TAIL_S = 1.5
+#: A vibration leaves so much of its amplitude and so many times the noise at most; half: a second mode hides the first.
 LEAVES, NOISE = 0.08, 1.5
 #: What is damped more than this, of critical, is no vibration but how a motion ends.
 MOST_DAMPED = 0.3
@@ -183,63 +181,67 @@ def _rests(z: Array, period: float) -> tuple[slice, ...]:
 
 def settling(t_s: Array, force: Array, rests: Sequence[slice]) -> Settling | None:
     """Return how a tool settles by specific forces (N, 3), m/s2, at times (N,), s, before rests; None: nothing is seen."""
-    found = [one for rest in rests if rest.start and (one := _stop(t_s, force, rest)) is not None]
-    if not found:
-        return None
-    frequency, damping, amplitude, time = np.median(np.array(found), axis=0)
-    return Settling(len(found), float(frequency), float(damping), float(amplitude), float(time))
+    found = [one for k, rest in enumerate(rests) if (one := _stop(t_s, force, rests[k - 1].stop if k else 0, rest))]
+    return Settling(len(found), *map(float, np.median(np.array(found), axis=0))) if found else None
 
 
-def _stop(t_s: Array, force: Array, rest: slice) -> tuple[float, float, float, float] | None:
-    """Return frequency, Hz, damping, amplitude, m, and settling time, s, of a vibration before a rest; None without one."""
-    noise = force[rest].std(axis=0, ddof=1)
-    step = max(round(STEP_S * (rest.stop - rest.start) / (t_s[rest.stop - 1] - t_s[rest.start])), 1)
-    end, fine = min(rest.start + 50 * step, rest.stop), max(step // FINE, 1)
-    first = max(rest.start - round(STOP_S / STEP_S) * step, 0)
-    best, start, at = None, None, rest.start - step
-    while True:
-        begin = at - step
-        one = _vibration(t_s[begin:end] - t_s[begin], force[begin:end], start) if begin > first else None
-        if one is None or (one[2] > np.maximum(NOISE * noise, LEAVES * np.linalg.norm(one[1]))).any():
-            if step <= fine:
-                break
-            step = fine  # the stop lies within the last step
-            continue
-        at, best = begin, (one[0], float(np.linalg.norm(one[1])))
-        start = one[0] if best[1] > STEADY * noise.max() else None
-    if best is None or start is None:
+def _stop(t_s: Array, force: Array, first: int, rest: slice) -> tuple[float, float, float, float] | None:
+    """Return frequency, Hz, damping, amplitude, m, and settling time, s, of a vibration before a rest; None without one.
+
+    Rows before ``first`` are of other stops. The stop is where a cumulated sum, backwards in time, of what the vibration
+    leaves passes its limit; the vibration is fitted from where that sum begins to rise (Page, Biometrika 41, 1954).
+    """
+    noise = np.maximum(force[rest].std(axis=0, ddof=1), 1e-12)
+    at, end, step, start = rest.start, min(np.searchsorted(t_s, t_s[rest.start] + TAIL_S), rest.stop), 8, None
+    clean = 0  # row after a stop that is seen, from which on nothing speaks against the vibration
+    while step and at > first:
+        begin = max(at - step, first)
+        found, _, left, swing, gain = _vibration(t_s[begin:end] - t_s[begin], force[begin:end] / noise, start)
+        rise = np.cumsum((left**2 / (1.0 + (LEAVES * swing) ** 2) - NOISE**2).sum(axis=1)[::-1])
+        passed = rise - np.minimum.accumulate(np.minimum(rise, 0.0)) > STEADY**2
+        if passed.any():
+            clean, step = end - 1 - int(rise[: passed.argmax() + 1].argmin()), step // 2
+        else:
+            at, step, start = begin, step if clean else 2 * step, found if gain > STEADY**2 else None
+    rows = slice(clean or at, end)
+    found, amplitudes, *_, gain = _vibration(t_s[rows] - t_s[at], force[rows] / noise, start)
+    if not clean or gain < STEADY**2:
         return None
-    (speed, decay), amplitude_m_s2 = best
+    speed, decay = map(float, np.exp(found))
     natural = float(np.hypot(speed, decay))
-    amplitude_m = amplitude_m_s2 / natural**2
+    amplitude_m = float(np.linalg.norm(amplitudes * noise)) / natural**2
     return natural / (2 * np.pi), decay / natural, amplitude_m, max(float(np.log(amplitude_m / SETTLED_M)) / decay, 0.0)
 
 
-def _vibration(
-    t: Array, f: Array, start: tuple[float, float] | None
-) -> tuple[tuple[float, float], Array, Array] | None:
-    """Return rad/s and decay, 1/s, of a vibration in columns (N, 3), amplitudes at its begin and what it leaves (3,)."""
-    if start is None:
-        power = (np.abs(np.fft.rfft((f - f.mean(axis=0)) * np.hanning(len(t))[:, None], axis=0)) ** 2).sum(axis=1)
-        k = int(power[1:].argmax()) + 1
-        start = 2 * np.pi * k / (t[-1] - t[0]), 0.3 * k / (t[-1] - t[0])
+def _vibration(t: Array, f: Array, start: Array | None) -> tuple[Array, Array, Array, Array, float]:
+    """Return the best vibration in columns (N, 3), of one sigma each, at times (N,), s.
 
-    def parts(p: Array) -> tuple[Array, Array]:
+    Logarithms of rad/s and decay (2,), amplitudes (3,) at time 0, what it leaves (N, 3), its swing (N, 1), and by how much
+    the sum of squares falls because it decays, zero where it is none. Without a start, that of the spectrum.
+    """
+    if start is None:  # the first half has more of what decays than the second, and as much of what hums
+        half, size = len(t) // 2, 4 * len(t)
+        halves = np.stack([f[:half], f[half : 2 * half]]) - f[half:].mean(axis=0)
+        power, later = (np.abs(np.fft.rfft(halves, size, axis=1)) ** 2).sum(axis=2)[:, 8:] + 1e-12
+        speed = (((power - later) / np.sqrt(power + later)).argmax() + 8) * np.pi / (2 * (t[-1] - t[0]))
+        start = np.log([speed, 0.05 * speed])
+
+    def parts(p: Array) -> tuple[Array, Array, Array]:
         speed, decay = np.exp(p)
         fall = np.exp(-decay * t)
         by = np.column_stack([fall * np.cos(speed * t), fall * np.sin(speed * t), np.ones_like(t)])
         factors, *_ = np.linalg.lstsq(by, f, rcond=None)
-        return f - by @ factors, factors
+        return f - by @ factors, np.hypot(factors[0], factors[1]), fall
 
     def residuals(p: Array) -> Array:
         return parts(p)[0].ravel()
 
-    got = least_squares(residuals, np.log(start), max_nfev=30).x
-    speed, decay = map(float, np.exp(got))
-    if decay > MOST_DAMPED * speed or not 2 * np.pi < speed * t[-1] < 0.8 * np.pi * len(t):  # a period at least
-        return None
-    left, factors = parts(got)
-    return (speed, decay), np.hypot(factors[0], factors[1]), left.std(axis=0)
+    got: Array = least_squares(residuals, start, max_nfev=30).x
+    (left, amplitudes, fall), steady = parts(got), parts(np.array([got[0], -np.inf]))[0]
+    (speed, decay), span_s = np.exp(got), t[-1] - t[0]
+    if decay > MOST_DAMPED * speed or not 2 * np.pi < speed * span_s < 0.8 * np.pi * len(t):  # a period at least
+        return start, np.zeros(3), f - f.mean(axis=0), np.zeros((len(t), 1)), 0.0
+    return got, amplitudes, left, np.linalg.norm(amplitudes) * fall[:, None], float((steady**2).sum() - (left**2).sum())
 
 
 def allan(z: Array, period_s: float) -> tuple[Array, Array, Array]:
@@ -248,10 +250,8 @@ def allan(z: Array, period_s: float) -> tuple[Array, Array, Array]:
     most = max(int(LONGEST * count), 2)
     steps = np.unique(np.round(np.logspace(0, np.log10(most), int(A_DECADE * np.log10(most)) + 2)).astype(int))
     sums = np.concatenate([np.zeros((1, z.shape[1])), np.cumsum(z - z.mean(axis=0), axis=0)])
-    variances = []
-    for m in steps:
-        means = (sums[m:] - sums[:-m]) / m
-        variances.append(0.5 * np.mean((means[m:] - means[:-m]) ** 2, axis=0))
+    means = ((sums[m:] - sums[:-m]) / m for m in steps)
+    variances = [0.5 * np.mean((x[m:] - x[:-m]) ** 2, axis=0) for m, x in zip(steps, means, strict=True)]
     return steps * period_s, np.array(variances), count / steps - 1.0
 
 
