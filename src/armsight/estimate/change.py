@@ -25,7 +25,7 @@ _PARTS = 100
 #: Random orders, as many by pose, and the share of the first that may look as changed; half and double: another rate of
 #: false alarms.
 _ORDERS, _CHANCE = 200, 0.005
-_AT_ONCE = 40  # parts that orders are tested in; half: twice the memory, double: more calls
+_AT_ONCE = 200_000  # numbers that orders are tested with at once; half: more calls, double: twice the memory
 #: Neighbours that are moved together at most, as a share of all; half: errors that they share look as a change.
 _TOGETHER = 1 / 16
 #: Least square of a change in sigmas, per number; half: changes that sigmas hold are named, double: fewer.
@@ -120,7 +120,8 @@ def changed(
         return (v * steps).sum(axis=2), steps
 
     def most(orders: NDArray[np.intp], p: NDArray[np.intp]) -> Array:
-        return np.concatenate([gains(part, p)[0].max(axis=1) for part in np.array_split(orders, _AT_ONCE)])
+        parts = np.array_split(orders, 1 + orders.size * A.shape[1] * len(p) // _AT_ONCE)
+        return np.concatenate([gains(part, p)[0].max(axis=1) for part in parts])
 
     in_time = [gains(np.arange(len(starts))[None], p) for p in own]
     found = np.concatenate([gain for gain, _ in in_time])

@@ -10,13 +10,14 @@ remove, so that hundreds of models cost little more than one.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from armsight.data import Array
+from armsight.data import Array, Record
 from armsight.estimate.linear import Linear
 from armsight.estimate.solve import whitened
 
@@ -31,7 +32,8 @@ _NONE = 1e-200  # added to squares, so that the logarithm of none is a number
 _ROUNDED = 1e-10  # a difference of large numbers below this part of them is rounding
 
 
-class Folds(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Folds(Record):
     """Normal equations of every fold at one linearisation."""
 
     H: Array  #: (F, P, P) each fold's J^T J
@@ -50,6 +52,11 @@ class Folds(NamedTuple):
         H, g = np.array([Jk.T @ Jk for _, Jk in rows]), np.array([Jk.T @ ek for ek, Jk in rows])
         c, numbers = (np.array(values, float) for values in zip(*((ek @ ek, ek.size) for ek, _ in rows), strict=True))
         return Folds(H, g, c, numbers, linear.known, -linear.at)
+
+    @cached_property
+    def others(self) -> tuple[Array, Array]:
+        """(F, P, P), (F, P): the sums over all folds but each."""
+        return self.H.sum(axis=0) - self.H, self.g.sum(axis=0) - self.g
 
     def losses(self, free: Mask) -> Array:
         """Return the mean squared error of every fold (F,) under a fit of ``free`` to the others."""
@@ -77,7 +84,7 @@ class Folds(NamedTuple):
         rows = np.flatnonzero(free)
         others = np.flatnonzero(beyond) if beyond is not None else rows[:0]
         fixed = np.where(free, 0.0, self.home)  # from the linearisation back to nominal
-        H, g = self.H.sum(axis=0) - self.H, self.g.sum(axis=0) - self.g
+        H, g = self.others
         A = H[:, rows[:, None], rows] + np.diag(self.pull[rows])
         scale = 1 / np.sqrt(np.einsum("fii->fi", A))
         C = np.linalg.inv(A * scale[:, :, None] * scale[:, None]) * scale[:, :, None] * scale[:, None]
@@ -94,20 +101,19 @@ class Folds(NamedTuple):
         """
         beyond = np.any(list(groups.values()), axis=0) & ~kept
         delta, _, X = self.fits(kept, beyond)
-        rows, others = np.flatnonzero(kept), np.flatnonzero(beyond)
-        H, g = self.H.sum(axis=0) - self.H, self.g.sum(axis=0) - self.g
-        schur = H[:, others[:, None], others] + np.diag(self.pull[others]) - H[:, others[:, None], rows] @ X
+        rows, others, (H, g) = np.flatnonzero(kept), np.flatnonzero(beyond), self.others
         slope = g[:, others] + (H[:, others] @ delta[..., None])[..., 0]
         tried = np.repeat(delta[..., None], len(groups), axis=2)
         for c, mask in enumerate(groups.values()):
             at = np.flatnonzero(mask[others])
-            A = schur[:, at[:, None], at]
+            own = others[at]
+            A = H[:, own[:, None], own] + np.diag(self.pull[own]) - H[:, own[:, None], rows] @ X[:, :, at]
             scale = 1 / np.sqrt(np.einsum("fii->fi", A))
             z = (
                 np.linalg.solve(A * scale[:, :, None] * scale[:, None], (-slope[:, at] * scale)[..., None])
                 * scale[..., None]
             )
-            tried[:, others[at], c] += z[..., 0]
+            tried[:, own, c] += z[..., 0]
             tried[:, rows, c] -= (X[:, :, at] @ z)[..., 0]
         return dict(zip(groups, self.losses_at(tried), strict=True))
 
@@ -126,7 +132,7 @@ class Folds(NamedTuple):
 
 
 class Removal:
-    """Fits of what is kept to all but each fold, from which groups are removed one after the other.
+    """Fits of what is kept to all but each fold and, last, to all, from which groups are removed one after the other.
 
     The fit without a group G follows from that with it: with C = A^-1, the free numbers move by C_:G C_GG^-1 times what
     brings those of G back to nominal, and C falls by C_:G C_GG^-1 C_G:.
@@ -135,44 +141,48 @@ class Removal:
     def __init__(self, folds: Folds, kept: Mask) -> None:
         self.folds, self.kept = folds, kept.copy()
         self.rows = np.flatnonzero(kept)
-        self.delta, self.C, _ = folds.fits(kept)
+        nothing = np.zeros_like(folds.H[:1]), np.zeros_like(folds.g[:1])  # without it all measurements are fitted
+        H, g = (np.concatenate(both) for both in zip((folds.H, folds.g), nothing, strict=True))
+        self.delta, self.C, _ = replace(folds, H=H, g=g).fits(kept)
 
     def losses(self) -> Array:
         """Return the losses (F,) of what is kept."""
-        return np.asarray(self.folds.losses_at(self.delta[..., None])[0])
+        return np.asarray(self.folds.losses_at(self.delta[:-1, :, None])[0])
 
     def losses_without(self, groups: Sequence[Mask]) -> Array:
         """Return the losses (G, F) without each group."""
-        tried = np.repeat(self.delta[..., None], len(groups), axis=2)
-        for c, mask in enumerate(groups):
-            tried[:, self.rows, c] += self._moved(np.flatnonzero(mask[self.rows]))
+        tried = np.repeat(self.delta[:-1, :, None], len(groups), axis=2)
+        for some, at in self._by_size(groups):
+            pull = self._pull(at, slice(-1))[1]
+            tried[:, self.rows[:, None], some] += np.einsum("fsgk,fgk->fsg", self.C[:-1, :, at], pull)
         return self.folds.losses_at(tried)
 
-    def _moved(self, at: NDArray[np.int64]) -> Array:
-        """Return by how much the free numbers (F, S) move when those ``at`` come back to nominal."""
-        back = (self.folds.home - self.delta)[:, self.rows[at]]
-        return np.asarray((self.C[:, :, at] @ np.linalg.solve(self.C[:, at[:, None], at], back[..., None]))[..., 0])
+    def _by_size(self, groups: Sequence[Mask]) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+        """Yield which groups have one size, and where their numbers (G, k) stand among the free ones."""
+        at = [np.flatnonzero(mask[self.rows]) for mask in groups]
+        for size in sorted({len(each) for each in at}):
+            some = np.array([c for c, each in enumerate(at) if len(each) == size])
+            yield some, np.array([at[c] for c in some])
+
+    def _pull(self, at: NDArray[np.int64], fits: slice) -> tuple[Array, Array]:
+        """Return by how much groups ``at`` (G, k) are off nominal in fits (F, G, k), and what brings them back."""
+        back = (self.folds.home - self.delta[fits])[:, self.rows[at]]
+        C = self.C[fits, at[..., None], at[:, None]]
+        return back, np.asarray(np.linalg.solve(C, back[..., None])[..., 0], np.float64)
 
     def doubtful(self, groups: Sequence[Mask]) -> list[Mask]:
-        """Return the groups so near their nominal values that leaving them there may cost nothing."""
-        folds, rows = self.folds, self.rows
-        A = folds.H.sum(axis=0)[np.ix_(rows, rows)] + np.diag(folds.pull[rows])
-        scale = 1 / np.sqrt(np.diag(A))
-        cov = np.linalg.inv(scale[:, None] * A * scale) * np.outer(scale, scale)
-        fixed = np.where(self.kept, 0.0, folds.home)
-        b = folds.g.sum(axis=0)[rows] + folds.H.sum(axis=0)[rows] @ fixed - (folds.pull * folds.home)[rows]
-        off = -cov @ b - folds.home[rows]
-        found = []
-        for mask in groups:
-            at = np.flatnonzero(mask[rows])
-            if off[at] @ np.linalg.solve(cov[np.ix_(at, at)], off[at]) < SURE**2 * len(at):
-                found.append(mask)
-        return found
+        """Return the groups so near their nominal values, in the fit to all, that leaving them there may cost nothing."""
+        near = np.zeros(len(groups), bool)
+        for some, at in self._by_size(groups):
+            back, pull = self._pull(at, slice(-1, None))
+            near[some] = (back * pull).sum(axis=2)[0] < SURE**2 * at.shape[1]
+        return [mask for mask, doubt in zip(groups, near, strict=True) if doubt]
 
     def remove(self, mask: Mask) -> None:
         """Remove a group."""
         at = np.flatnonzero(mask[self.rows])
-        self.delta[:, self.rows] += self._moved(at)
+        pull = self._pull(at[None], slice(None))[1][:, 0]
+        self.delta[:, self.rows] += (self.C[:, :, at] @ pull[..., None])[..., 0]
         self.delta[:, self.rows[at]] = self.folds.home[self.rows[at]]
         stay = np.flatnonzero(~mask[self.rows])
         fall = np.linalg.solve(self.C[:, at[:, None], at], self.C[:, at[:, None], stay])

@@ -308,7 +308,7 @@ def _begun(
     prior = np.where(curves, 0.0, prior_sigma(model, priors))
     at = fit(model, x, measured, np.arange(len(x)) == 0, prior)  # for the noise of the closed form's residuals
     placement = np.where(_of(model, PLACEMENT), prior, 0.0)
-    return model, at.x, prior, observed(model, at.x, measured, placement, at.noise)
+    return model, at.x, prior, observed(model, at.x, measured, placement, at.noise, why=False)
 
 
 def _identified(
@@ -318,7 +318,7 @@ def _identified(
     rows = np.linspace(0, len(measured) - 1, min(MAX_SELECTION_POSES, len(measured))).astype(np.int64)
     part = measured.rows(rows)
     progress("lengths, angles and zeros")
-    table = observed(model, start.x, part, prior, start.noise).free & _of(model, (*PLACEMENT, *_TABLE))
+    table = observed(model, start.x, part, prior, start.noise, why=False).free & _of(model, (*PLACEMENT, *_TABLE))
     geometric = fit(model, start.x, part, table, prior)
     progress("every error source at once")
     whole, prior, observable, scatter_rad = _everything(model, start, geometric, part, prior)
@@ -350,7 +350,7 @@ def _everything(
     noise, whole, scaled = geometric.noise, geometric, prior
     weighted, scatter_rad = measured, np.zeros(model.arm.joints)
     for _ in range(ROUNDS if measured.cov is not None else 2):
-        seen = observed(model, start.x, weighted, prior, noise)
+        seen = observed(model, start.x, weighted, prior, noise, why=False)
         whole = fit(model, whole.x, weighted, seen.possible, scaled, noise=noise)
         if measured.cov is not None:
             scatter_rad = joint_noise(model, whole, scaled, measured).sigma_rad

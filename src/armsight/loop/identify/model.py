@@ -352,13 +352,9 @@ class Model(Record):
 
     def theta(self, x: Array, q: Array, phi: Array) -> Array:
         """Return the joints' rotations without their offsets (N, n), rad; ``phi`` is :meth:`feature_values`."""
-        out = self.arm.direction * (q @ self.arm.coupling.T)
-        for k, f in enumerate(self.features):
-            if x[self.sources_at + k] != 0.0:
-                off = x[self.sources_at + k] * phi[:, k]
-                for i in np.flatnonzero(self.arm.coupling[:, f.joint]):
-                    out[:, i] += self.arm.coupling[i, f.joint] * self.arm.direction[i] * off
-        return np.asarray(out)
+        of = np.equal.outer([f.joint for f in self.features], np.arange(self.arm.joints))
+        off = (phi * x[self.sources_at :]) @ of.astype(np.float64)
+        return np.asarray(self.arm.direction * ((q + off) @ self.arm.coupling.T))
 
     def _by_source(self, axes: Array, phi: Array) -> Array:
         """Return what the coefficients move (N, 3, F), from what rotations of the joints move, (n, N, 3)."""

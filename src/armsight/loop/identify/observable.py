@@ -45,20 +45,22 @@ class Observed(NamedTuple):
     singular_values: Array
 
 
-def observed(model: Model, x: Array, measured: Measured, prior: Array, noise: tuple[float, float]) -> Observed:
+def observed(
+    model: Model, x: Array, measured: Measured, prior: Array, noise: tuple[float, float], *, why: bool = True
+) -> Observed:
     """Find which parameters are observable from poses.
 
     ``x``: (P,) base and tool estimated, the rest nominal. ``prior``: (P,)
-    prior sigmas; 0 freezes. ``noise``: sigmas of the instrument.
+    prior sigmas; 0 freezes. ``noise``: sigmas of the instrument. ``why``: whether the reasons are needed.
     """
     T = _triangle(model, x, measured, prior, noise)
     d = np.abs(model.table(x)[:, chain.D])  # of two d the larger one is preferred
     rank = [(_PREFERENCE.index(p.kind), -d[p.joint] * (p.kind == "d")) for p in model.parameters]
     preference = np.array(sorted(range(len(rank)), key=rank.__getitem__))
     kept, ties, weak = _gram_schmidt(T, preference, prior)
-    anywhere = _ties_anywhere(model, x, measured, prior, noise, preference)
     reasons = {model.names[k]: "kept at its nominal value: a prior of zero" for k in np.flatnonzero(prior == 0)}
-    reasons |= _tie_texts(model, ties, anywhere)
+    if why:
+        reasons |= _tie_texts(model, ties, _ties_anywhere(model, x, measured, prior, noise, preference))
     for k, sigma in weak.items():
         scale, unit = SHOWN_IN[model.parameters[k].unit]
         best = f"these poses determine it to {scale * sigma:.2g} {unit} at best, worse than its prior"
