@@ -109,7 +109,8 @@ def motion_of(model: BundleModel, screened: Screened, count: int) -> tuple[Expos
     guess = ExposureMotion.guessed(model.points, len(screened.kept))
     still, observations = screened.solution, screened.observations
     before = noise_px(still, observations, heldout.freed(model, still))
-    solution = minimise(replace(model, motion_sigmas=guess.sigmas), still.state, observations, before)
+    moving = replace(model, motion_sigmas=guess.sigmas)
+    solution = minimise(moving, still.state, observations, before, least_decrease=heldout.ROUGHLY)
     motion, taken = guess.updated(solution)
     if noise_px(solution, observations, heldout.freed(model, solution) + taken) > (1 - MOTION_WORTH) * before:
         return None
@@ -536,10 +537,21 @@ class _Selection(Record):
         """
         if self._pairs(screened) <= LEAST_PAIRS:
             return None
+        rows = np.flatnonzero(~np.isin(screened.kept, list(furthest)))
         with contextlib.suppress(CalibrationError):
+            if self._moves(screened, rows):
+                return None
             others = self._screened(self.model, start, known=furthest)
             return others if motion_of(self.model, others, self.observations.shot_count) is None else None
         return None
+
+    def _moves(self, screened: Screened, rows: NDArray[np.intp]) -> bool:
+        """Return whether a motion is significant in some of the shots screened, as they are."""
+        old, seen = screened.solution, screened.observations.shots(rows)
+        state = replace(old.state, Ts_left_body=old.state.Ts_left_body[rows])
+        solution = minimise(self.model, state, seen, old.sigma_px, damping=NEAR, least_decrease=heldout.ROUGHLY)
+        some = replace(screened, observations=seen, kept=screened.kept[rows], solution=solution)
+        return motion_of(self.model, some, self.observations.shot_count) is not None
 
     def _screened(
         self, model: BundleModel, start: BundleState, sigma_px: float = 1.0, known: Mapping[int, str] | None = None

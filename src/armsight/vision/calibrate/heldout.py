@@ -20,7 +20,7 @@ from armsight.geometry.pose import inverse, transform
 from armsight.geometry.rigid import fit_rigid, fit_scale
 from armsight.geometry.rotation import skew
 from armsight.vision.calibrate import MODELS
-from armsight.vision.calibrate.motion import ExposureMotion, change_of, spread_of
+from armsight.vision.calibrate.motion import ExposureMotion, change_of, of_shots, spread_of
 from armsight.vision.calibrate.result import LEAST_SIGMA_PX, Calibration, HeldOutErrors, PairErrors, RejectedPair
 from armsight.vision.calibrate.screen import noise_px
 from armsight.vision.calibrate.weak import weaknesses
@@ -261,7 +261,7 @@ def scaled(rig: StereoRig, heldout: HeldOutErrors) -> StereoRig:
 
 #: Convergence and steps of adjustments that only estimate noise or a held-out error: the long valleys of the rational
 #: model are not followed to their ends.
-ROUGHLY, STEPS = 1e-6, 25
+ROUGHLY, STEPS = 1e-5, 25
 #: Least standard deviation of a body from its drawing, RMS of one mode, m.
 LEAST_TOLERANCE_M = 1e-7
 #: Rounds in which noise and tolerances settle; motion, which competes with them, takes longer.
@@ -334,11 +334,12 @@ def concluded(
     """Put a calibration together from the drawing of a body and the adjustment; the rest as in Calibration."""
     model, solution, heldout = trial.model, trial.solution, trial.heldout
     rig, state = scaled(rig_of(solution), heldout), solution.state
-    change = None if moving else change_of(model, solution, observations, rig, len(pairs))
+    each = of_shots(model, solution, observations)
+    change = None if moving else change_of(model, solution, each, rig, len(pairs))
     if change is not None:  # the rig holds for a state between the two
         rig = replace(rig, cov=rig.cov + change.off.T @ change.off)
     larger = 1.0
-    if change is None and not moving and (added := spread_of(model, solution, observations, len(rig.cov))) is not None:
+    if change is None and not moving and (added := spread_of(model, solution, each, len(rig.cov))) is not None:
         larger = float(np.sqrt(1 + (np.diag(added) / np.maximum(np.diag(rig.cov), 1e-300)).max()))
         rig = replace(rig, cov=rig.cov + added)
     found = model.body(state.shape)[: len(body.points)]

@@ -109,7 +109,7 @@ class CameraChange(Record):
     shift_m: float  #: by how much it displaces the points that the pairs measured, median, m
 
 
-def _of_shots(model: BundleModel, solution: BundleSolution, seen: Observations) -> Array:
+def of_shots(model: BundleModel, solution: BundleSolution, seen: Observations) -> Array:
     """Return (S, Q + 1, Q + 1) what each shot says of the Q shared parameters and, last, their residual, whitened."""
     uv, by_shared, by_own = predict(model, solution.state, seen)
     W = whiteners(seen, solution.sigma_px)
@@ -132,15 +132,15 @@ def _of_shots(model: BundleModel, solution: BundleSolution, seen: Observations) 
 
 
 def _condensed(
-    model: BundleModel, solution: BundleSolution, seen: Observations, free: NDArray[np.bool_] | None = None
+    model: BundleModel, solution: BundleSolution, each: Array, free: NDArray[np.bool_] | None = None
 ) -> tuple[Array, Array]:
     """Return P + 1 whitened residuals of each shot, (S, P + 1), that say all it says of the rig, and their derivative.
 
-    By the P free parameters of the rig, the shape held. The axes of the relative position are :func:`baseline_axes`.
+    By the P free parameters of the rig, the shape held; ``each`` is :func:`of_shots`. The axes of the relative position are
+    :func:`baseline_axes`.
     """
-    left = _of_shots(model, solution, seen)
-    free = np.ones(left.shape[2] - 1 - len(model.modes), bool) if free is None else free
-    left = left[:, (kept := np.append(np.flatnonzero(free), -1))][:, :, kept]
+    free = np.ones(each.shape[2] - 1 - len(model.modes), bool) if free is None else free
+    left = each[:, (kept := np.append(np.flatnonzero(free), -1))][:, :, kept]
     unit = 1 / np.sqrt(np.maximum(np.einsum("sii->i", left), 1e-300))
     values, axes = np.linalg.eigh(unit[:, None] * left * unit)
     rows = np.sqrt(np.maximum(values, 0.0))[..., None] * axes.swapaxes(1, 2) / unit
@@ -162,7 +162,7 @@ def other_size(model: BundleModel, start: BundleSolution, seen: Observations, pa
     error if the later boards may be of another size shows it.
     """
     state, count = start.state, len(model.points)
-    e, J = _condensed(model, start, seen)
+    e, J = _condensed(model, start, of_shots(model, start, seen))
     found = changed(e, J, {SIZE: np.array([J.shape[2] - 6])}, state.Ts_left_body[:pairs, :3, 3], count=pairs)
     if found is None:
         return None
@@ -176,9 +176,12 @@ def other_size(model: BundleModel, start: BundleSolution, seen: Observations, pa
 
 
 def change_of(
-    model: BundleModel, solution: BundleSolution, seen: Observations, rig: StereoRig, pairs: int
+    model: BundleModel, solution: BundleSolution, each: Array, rig: StereoRig, pairs: int
 ) -> CameraChange | None:
-    """Return how the cameras changed among the first ``pairs`` shots; later ones are of one camera alone."""
+    """Return how the cameras changed among the first ``pairs`` shots; later ones are of one camera alone.
+
+    ``each``: what each shot says, :func:`of_shots`.
+    """
     count = rig.left.parameters.size
     left, right, both = np.arange(2), count + np.arange(2), np.array([0, 1, count, count + 1])
     focal = {"the left focal length": left, "the right focal length": right, "both focal lengths": both}
@@ -193,7 +196,7 @@ def change_of(
     sight = middle[:, :2] / middle[:, 2:]
     off_axis = np.linalg.norm(sight - sight[:pairs].mean(axis=0), axis=1)
     poses = np.column_stack([sight, np.log(middle[:, 2]), solution.state.Ts_left_body[:, :2, 2], off_axis])
-    if (found := changed(*_condensed(model, solution, seen, free), ways, poses, count=pairs)) is None:
+    if (found := changed(*_condensed(model, solution, each, free), ways, poses, count=pairs)) is None:
         return None
     off, axes = found.off.copy(), baseline_axes(rig.T_left_right)
     off[:, -6:-3] = off[:, -6:-3] @ axes.T
@@ -210,13 +213,14 @@ def change_of(
     return CameraChange(found.row, what, off, shift_m)
 
 
-def spread_of(model: BundleModel, solution: BundleSolution, seen: Observations, count: int) -> Array | None:
+def spread_of(model: BundleModel, solution: BundleSolution, each: Array, count: int) -> Array | None:
     """Return what is added to the covariance of the rig's ``count`` parameters as corners of a shot are off together.
 
     Each shot may be of a rig of its own, spread as the covariance is, by the variance that makes the squares of the shots'
     gradients as expected (MINQUE; Rao, "Estimation of variance components", 1972). None where noise may have larger ones.
+    ``each``: what each shot says, :func:`of_shots`.
     """
-    each, free = _of_shots(model, solution, seen), free_parameters(model, solution.state)
+    free = free_parameters(model, solution.state)
     A = each[:, :-1, :-1] * free * free[:, None]
     H = A.sum(axis=0) + np.diag(np.append(np.zeros(count), np.full(len(model.modes), model.shape_sigma_m**-2.0)))
     unit = 1 / np.sqrt(np.where(free, np.diag(H), 1.0))

@@ -118,7 +118,7 @@ def screen(
         if lost := int((mine & ~good).sum()):
             which = " of both images" if len(set(observations.camera[mine])) > 1 else ""
             notes.append(f"{names[j]}: {lost} of {mine.sum()} points{which} {_DROPPED}")
-    solution = minimise(_of_shots(model, kept), state, final, sigma, damping=NEAR)
+    solution = minimise(_of_shots(model, kept), state, final, sigma, damping=NEAR, least_decrease=_ROUGHLY)
     return Screened(final, observations.shots(kept), kept, solution, tuple(rejected), tuple(notes))
 
 

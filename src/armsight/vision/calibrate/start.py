@@ -26,7 +26,7 @@ _FITS_PX, _IMITATES_PX = 0.1, 1.0
 _IMITATION_STEPS = 10
 #: Two starts whose costs differ by less than this share lead to one minimum; half: a third is tried now and then, double:
 #: nothing, as other minima cost several times as much.
-_SAME_COST = 1e-3
+_SAME_COST, _ROUGHLY = 1e-3, 1e-5  # the second: a step that lowers the cost by a smaller share is a start's last
 #: Relative poses closer than this, rad or share of the distance, are one hypothesis.
 _SAME_POSE = 0.1
 _MOST_HYPOTHESES = 600
@@ -182,12 +182,17 @@ def start_board(
     focals = [_focal_candidates(points, sizes[side], observations, side, model) for side in (0, 1)]
     plain = BundleModel(points, np.zeros((0, len(points), 3)), 1.0, True)
     best: BundleSolution | None = None
+    begun = list[float]()
     for left, right in zip(*focals, strict=True):
         state = _assemble(points, (pinhole(sizes[0], left, model), pinhole(sizes[1], right, model)), observations)
         if state is None:
             continue
-        solution = _staged(plain, state, observations)
-        if solution is None:
+        if (first := _focused(plain, state, observations)) is None:
+            continue
+        if any(abs(first.cost - other) < _SAME_COST * other for other in begun):  # the same minimum follows
+            break
+        begun.append(first.cost)
+        if (solution := _adjusted(plain, first.state, observations)) is None:
             continue
         again = best is not None and abs(solution.cost - best.cost) < _SAME_COST * best.cost
         if best is None or solution.cost < best.cost:
@@ -227,15 +232,24 @@ def imitated(camera: Camera, model: str, uv: Array) -> Camera | None:
     return found if off < _IMITATES_PX**2 else None  # NaN is no good either
 
 
-def _staged(model: BundleModel, state: BundleState, observations: Observations) -> BundleSolution | None:
-    """Adjust focal lengths first, then everything, each from wide to narrow noise; None where it leads nowhere."""
+def _focused(model: BundleModel, state: BundleState, observations: Observations) -> BundleSolution | None:
+    """Adjust focal lengths and poses under wide noise; None where it leads nowhere."""
     sizes = [camera.parameters.size for camera in state.cameras]
     focal = np.zeros(sum(sizes) + 6, bool)
     focal[[0, 1, sizes[0], sizes[0] + 1]] = True
     focal[-6:] = True
     try:
-        first = minimise(model, state, observations, 5.0, free=focal, max_steps=15, covariance=False)
-        second = minimise(model, first.state, observations, 3.0, max_steps=15, covariance=False)
-        return minimise(model, second.state, observations, 1.0, max_steps=25, covariance=False)
+        return minimise(
+            model, state, observations, 5.0, free=focal, max_steps=15, least_decrease=_ROUGHLY, covariance=False
+        )
+    except (CalibrationError, np.linalg.LinAlgError):
+        return None
+
+
+def _adjusted(model: BundleModel, state: BundleState, observations: Observations) -> BundleSolution | None:
+    """Adjust everything from wide to narrow noise; None where it leads nowhere."""
+    try:
+        first = minimise(model, state, observations, 3.0, max_steps=15, least_decrease=_ROUGHLY, covariance=False)
+        return minimise(model, first.state, observations, 1.0, max_steps=25, least_decrease=_ROUGHLY, covariance=False)
     except (CalibrationError, np.linalg.LinAlgError):
         return None
