@@ -6,7 +6,7 @@ import pytest
 
 from armsight.data import Correspondences, Detections
 from armsight.geometry.rotation import skew
-from armsight.vision.match import GATE_PX, GATE_SIGMAS, epipolar_distances, gate, join, match, renamed
+from armsight.vision.match import GATE_PX, SIGMAS, epipolar_distances, gate, join, match, renamed
 from armsight.vision.rig import StereoRig
 from strategies import CAMERAS, folding_rig, ordinary_rig
 from views import board, body_of, both_pixels, pixels, seen, somewhere
@@ -94,7 +94,7 @@ def test_the_gate_is_wide_enough_for_the_noise(sigma, image):
     base = ordinary_rig()
     rig = StereoRig(base.left, base.right, base.T_left_right, base.cov, sigma)
     shot = seen(rig, board(), somewhere(np.random.default_rng(3)))
-    limit = max(GATE_PX, GATE_SIGMAS * np.sqrt(2 * (sigma**2 + image**2)))
+    limit = max(GATE_PX, SIGMAS * np.sqrt(2 * (sigma**2 + image**2)))
     cov = np.tile(image**2 * np.eye(2), (len(shot.ids), 2, 1, 1))
     rng = np.random.default_rng(4)
     uv = shot.uv + np.hypot(sigma, image) * rng.normal(size=shot.uv.shape)

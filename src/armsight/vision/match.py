@@ -14,9 +14,11 @@ from armsight.data import Array, Body, Correspondences, Detections, Dropped, Ids
 from armsight.kernels import kernel
 from armsight.vision.rig import StereoRig
 
-#: The gate in standard deviations of the epipolar distance, and the least it may be, px. A wrong identity is many
-#: pixels off; a pair that is only noisier than expected stays and is tested against the body in locate.
-GATE_SIGMAS = 6.0
+#: Standard deviations; what is off by more is a mistake and no noise: a pair off its epipolar line, a disc off its pose, a
+#: size of a disc or a body; half: noise is, double: half of the mistakes of a few px pass.
+SIGMAS = 6.0
+#: The least that the epipolar gate may be, px. A wrong identity is many pixels off; a pair that is only noisier than
+#: expected stays and is tested against the body in locate.
 GATE_PX = 2.0
 #: Epipolar distance beyond which a pair does not support an order of a board's names, px.
 FLIP_PX = 20.0
@@ -74,7 +76,7 @@ def gate(rig: StereoRig, body: Body, seen: Correspondences) -> Correspondences:
     uv, cov = seen.uv[rows], seen.cov_uv[rows]
     distance = epipolar_distances(rig, uv[:, 0], uv[:, 1]).max(axis=1)
     variance = (cov[:, :, 0, 0] + cov[:, :, 1, 1]).max(axis=1) / 2 + rig.sigma_px**2
-    limit = np.maximum(GATE_PX, GATE_SIGMAS * np.sqrt(2 * variance))
+    limit = np.maximum(GATE_PX, SIGMAS * np.sqrt(2 * variance))
     bad = ~(distance <= limit)
     if not bad.any():
         return seen

@@ -314,7 +314,7 @@ class Arm(Record):
             raise pose_rejection(T[None])
         q = self._controller_angles(q)
         position, angle, axis = off
-        reached = position < numeric.REACHED and (self.joints < 6 or angle < numeric.REACHED)
+        reached = position < inverse.REACHED and (self.joints < 6 or angle < inverse.REACHED)
         inside = bool(self.within_limits(q))
         if not reached:
             return Solutions(np.empty((0, self.joints + ROW_END)), _out_of_reach(0), partial(self._there, T, q))
@@ -324,10 +324,10 @@ class Arm(Record):
 
     def _left(self, angle: float, axis: float) -> str | None:
         """Return what of an orientation fewer than six joints leave, in words; None where nothing is left."""
-        if angle < numeric.REACHED:
+        if angle < inverse.REACHED:
             return None
         met = (
-            f"the tool's z axis is off by {np.degrees(axis):.3g} deg" if axis > numeric.REACHED else "its z axis is met"
+            f"the tool's z axis is off by {np.degrees(axis):.3g} deg" if axis > inverse.REACHED else "its z axis is met"
         )
         return (
             f"orientation not met: {self.joints} joints bring the tool to the position; {met}, the orientation is off by "
@@ -341,7 +341,7 @@ class Arm(Record):
         if numeric.inverse_batch(self.table, self._limits, Ts, goal, q, off, np.zeros(numeric.SCRATCH)):
             raise pose_rejection(Ts)
         q = self._controller_angles(q)
-        reached = (off[:, 0] < numeric.REACHED) & ((off[:, 1] < numeric.REACHED) | (self.joints < 6))
+        reached = (off[:, 0] < inverse.REACHED) & ((off[:, 1] < inverse.REACHED) | (self.joints < 6))
         state = np.where(self.within_limits(q), 0.0, OUTSIDE)
         rows = np.column_stack([q, off[:, :2], np.zeros((len(Ts), 3)), state]) * reached[:, None]
         return ManySolutions.of(reached.astype(np.int64), rows[:, None])

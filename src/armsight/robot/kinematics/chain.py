@@ -26,7 +26,7 @@ from armsight.robot.kinematics.table import BASE, JOINTS, MODIFIED, MOST_JOINTS,
 Frame = tuple[float, float, float, float, float, float, float, float, float, float, float, float]
 
 #: The validity of joint angles, as the kernels return it.
-GOOD, NOT_FINITE, NOT_RADIANS = 0, 1, 2
+GOOD, NOT_FINITE, NOT_RADIANS = range(3)
 #: No joint rotates further than this, rad; an angle beyond it is most likely in degrees.
 MOST_RADIANS = 20.0
 #: Configurations in a batch, and the size of forward_batch's workspace.
@@ -362,7 +362,6 @@ def _joint(table: Array, i: int, sines: Array, cosines: Array, k: int, F: Frame)
 
 @kernel(fastmath={"contract", "nsz"})
 def _to_batch(F: Frame, out: Array, k: int) -> None:
-    """Write a frame as configuration k of a batch."""
     out[k], out[8 + k], out[16 + k] = F[0], F[1], F[2]
     out[24 + k], out[32 + k], out[40 + k] = F[3], F[4], F[5]
     out[48 + k], out[56 + k], out[64 + k] = F[6], F[7], F[8]

@@ -30,25 +30,22 @@ from armsight.robot.kinematics.table import ACROSS, BEND, FOREARM, KIND
 
 Point = tuple[float, float]
 
-#: Bits of a solution's state, and of what kept the pose out of reach.
-SHOULDER, ELBOW, WRIST = 1, 2, 4
-#: Beside them: what the arm missed may be what rounding did to badly determined angles.
-DOUBT = 16
+#: Bits of a solution's state, and of what kept the pose out of reach. OUTSIDE: a joint is beyond its limits; DOUBT: what
+#: the arm missed may be what rounding did to badly determined angles.
+SHOULDER, ELBOW, WRIST, OUTSIDE, DOUBT = (1 << bit for bit in range(5))
 
 #: Below this distance, m, or sine, a joint is not determined: what it moves stays below 1e-12 m or rad.
 _FREE = 1e-12
 #: A rotation that moves the tool by less than this, m or rad, may bring the arm within reach; the polish undoes it.
-_UNFELT = 1e-10
+_UNFELT = 1e-10  # where rounding moves the planar arm's end by more, m, a miss is in doubt
 #: Reach may be missed by so much, m: rounding, not distance.
 _TOLERANCE_M = 1e-11
 #: What rounding does to a wrist point, m, or an axis: divided by a sine or a distance that is an error of an angle.
 _ROUNDING = 1e-14
-#: If that moves the planar arm's end by more than this, m, a miss is in doubt.
-_DOUBTFUL_M = 1e-10
 #: How many angles are tried for joint 1 where the wrist point lies on axis 1, and how far apart, rad.
 _TRIES, _TRY_RAD = 144, 2.0 * np.pi / 144.0
-#: Two solutions whose half difference has a sine below this are one: rounding alone parts a double one by 2e-8.
-_SAME = 1e-7
+#: Two solutions whose half difference, or the sine of it, is below this are one: rounding alone parts a double one by 2e-8.
+SAME = 1e-7
 
 
 @kernel(nogil=True, fastmath={"contract", "nsz"})
@@ -72,7 +69,6 @@ def _put(y: Array, x: Array, i: int, slot: int, c: float, s: float) -> None:
 
 @kernel(nogil=True, fastmath={"contract", "nsz"})
 def _tag(tags: Array, slot: int, front: float, up: float, wrist: float, state: int) -> None:
-    """Write the configuration and state of a slot."""
     tags[slot], tags[8 + slot] = front, 1.0 if up >= 0.0 else -1.0
     tags[16 + slot], tags[24 + slot] = 1.0 if wrist >= 0.0 else -1.0, state
 
@@ -125,7 +121,7 @@ def _spherical(
     reached, c, s = _bend(table, tx, ty, tolerance)
     if not reached:
         return slot, ELBOW
-    ways = 1 if s < _SAME else 2
+    ways = 1 if s < SAME else 2
     state |= ELBOW if ways == 1 else 0
     ca, sa, sa4, sa5 = table[14], table[15], table[21], table[27]
     for way in range(ways):
@@ -213,9 +209,9 @@ def _parallel(
                 tx, ty = wx - a4 * cs - d5 * sa4 * ss, wy - a4 * ss + d5 * sa4 * cs
             reached, ce, se = _bend(table, tx, ty, loose)
             if not reached:
-                missed |= ELBOW | (DOUBT if loose > _DOUBTFUL_M else 0)
+                missed |= ELBOW | (DOUBT if loose > _UNFELT else 0)
                 continue
-        ways = 1 if se < _SAME else 2
+        ways = 1 if se < SAME else 2
         s5 = sa5 * (cs * ax + ss * ay)
         for way in range(ways):
             se = -se if way else se
@@ -285,7 +281,7 @@ def closed_form(table: Array, M: Frame, near: Array, clamp: bool, y: Array, x: A
         return 0, SHOULDER
     e = math.sqrt(max((r - abs(offset)) * (r + abs(offset)), 0.0))
     free = r < _FREE
-    single = free or e < _SAME * r
+    single = free or e < SAME * r
     tolerance = (
         np.inf if clamp else _TOLERANCE_M + (abs(table[18]) + abs(table[25])) * _ROUNDING / max(e, 1e-6 * r, _FREE)
     )

@@ -34,7 +34,7 @@ from armsight.robot.kinematics.chain import (
     thetas,
     tool_six,
 )
-from armsight.robot.kinematics.closed import DOUBT, SHOULDER, WRIST, closed_form
+from armsight.robot.kinematics.closed import DOUBT, OUTSIDE, SAME, SHOULDER, WRIST, closed_form
 from armsight.robot.kinematics.table import KIND, UNBASE, UNTOOL
 
 #: The validity of a pose, beside 0.
@@ -46,7 +46,7 @@ WORK = 20
 #: An error of this squared length is as good as none.
 _NONE = 1e-30
 #: A step that takes off less than this share of the error ends the descent; so does this much damping.
-_SLOW, _STIFF = 1e-9, 1e6
+_SLOW, STIFF = 1e-9, 1e6
 
 
 @kernel(nogil=True, fastmath={"contract", "nsz"})
@@ -197,7 +197,7 @@ def descend(table: Array, G: Frame, q: Array, low: Array, high: Array, most: int
                 break
         else:
             damping = max(10.0 * damping, 1e-12)
-            if damping > _STIFF:
+            if damping > STIFF:
                 break
     return cost
 
@@ -206,15 +206,12 @@ def descend(table: Array, G: Frame, q: Array, low: Array, high: Array, most: int
 MOST = 16
 #: Columns of a row: six joint angles, position error, orientation error, shoulder, elbow, wrist (+-1, or 0 where the arm
 #: has no structure), state, and the key by which rows are ordered.
-POSITION, ANGLE, CONFIGURATION, STATE, KEY, WIDTH = 6, 7, 8, 11, 12, 13
-#: Bit of a row's state beside those of ``closed``: a joint is beyond its limits.
-OUTSIDE = 8
+POSITION, ANGLE, CONFIGURATION = range(6, 9)
+STATE, KEY, WIDTH = range(CONFIGURATION + 3, CONFIGURATION + 6)
 
-#: Two solutions that differ less than this in every joint, rad, are one.
-_SAME_RAD = 1e-7
 _REVOLUTION = 2.0 * np.pi
-#: Added to the key of a row outside the limits: more than any distance.
-_LAST = 1e9
+#: More than any angle, rad, and any distance: a joint without bounds has it; a row outside the limits stands behind it.
+_FAR = 1e9
 
 
 @kernel(nogil=True, fastmath={"contract", "nsz"})
@@ -243,7 +240,7 @@ def known(rows: Array, count: int) -> bool:
         same = True
         for i in range(6):
             apart = abs(wrap(rows[k, i] - rows[count, i]))
-            if apart > _SAME_RAD:
+            if apart > SAME:
                 same = False
                 break
         if same:
@@ -261,7 +258,7 @@ def bring_within(limits: Array, near: Array, ordered: bool, row: Array) -> None:
         distance += (row[i] - near[i]) ** 2
     if outside:
         row[STATE] += OUTSIDE
-    row[KEY] = (distance if ordered else 0.0) + (_LAST if outside else 0.0)
+    row[KEY] = (distance if ordered else 0.0) + (_FAR if outside else 0.0)
 
 
 @kernel(nogil=True, fastmath={"contract", "nsz"})
@@ -279,12 +276,10 @@ def sort(rows: Array, count: int) -> None:
 SCRATCH = 4 * 48 + 96 + 32 + 16 + 6 * WORK
 _BATCH = SCRATCH - 6 * WORK
 #: A solution is polished where its pose is off by more than this, m or rad, and dropped where the polish leaves more.
-_POLISHED, _WRONG = 1e-12, 3e-10
+_POLISHED, REACHED = 1e-12, 3e-10
 #: How many configurations damped least squares starts from: for an arm without structure, and for the nearest pose beside
 #: the closed form's; how many steps it takes at most, in a polish and from afar.
 _STARTS, _NEAREST_STARTS, _STEPS, _LONG_STEPS = 64, 8, 20, 200
-#: Bounds of a joint that has none, rad.
-_FAR = 1e9
 
 
 @kernel(nogil=True, fastmath={"contract", "nsz"})
@@ -299,7 +294,7 @@ def _polish(table: Array, F: Frame, row: Array, steps: int, work: Array) -> bool
     pose_error(tool_six(table, row), F, e)
     row[POSITION] = math.sqrt(e[0] * e[0] + e[1] * e[1] + e[2] * e[2])
     row[ANGLE] = math.sqrt(e[3] * e[3] + e[4] * e[4] + e[5] * e[5])
-    return bool(max(row[POSITION], row[ANGLE]) < _WRONG)
+    return bool(max(row[POSITION], row[ANGLE]) < REACHED)
 
 
 @kernel(nogil=True, fastmath={"contract", "nsz"})

@@ -20,26 +20,24 @@ import numpy as np
 from armsight.data import Array
 from armsight.kernels import kernel
 from armsight.robot.kinematics.chain import Frame, jacobian_base, tool_frame
-from armsight.robot.kinematics.inverse import pose_error, rigid, solve
+from armsight.robot.kinematics.inverse import STIFF, pose_error, rigid, solve
 
-#: An error below this, m or rad, is none.
-REACHED = 3e-10
 #: Size of a call's workspace: rows of seven numbers.
 _ROWS = 34
 SCRATCH = 7 * _ROWS
 #: A descent ends with an error of this squared length, or where a step takes off less than this share of it.
 _NONE, _SLOW = 1e-26, 1e-4
-#: Steps of a descent at most, starts, and the least and greatest damping; no joint moves further in a step, rad.
-_STEPS, _STARTS, _STIFF, _FURTHEST = 40, 200, 1e6, 1.0
+#: Steps of a descent at most, and starts; no joint moves further in a step, rad.
+_STEPS, _STARTS, _FURTHEST = 40, 200, 1.0
 #: Weights of the direction of the tool's z axis and of the rotation about it, for fewer than six joints: m for 1 rad.
 _AXIS, _ROLL = 0.3, 0.1
 #: Fractional parts of multiples of its powers spread evenly in seven dimensions: the root of x^8 = x + 1 (Roberts, 2018).
 _SPREAD = 1.0969815577985598
-#: Steps along the free motion, the furthest of them, rad, the share of a joint's range from its middle from which on it is
-#: pushed back, and how strongly.
+#: Steps along the free motion, the furthest of them and of those of the levels, rad, the share of a joint's range from its
+#: middle from which on it is pushed back, and how strongly.
 _SLIDES, _SLIDE_RAD, _EDGE, _PUSH = 8, 0.3, 0.85, 100.0
-#: Steps of the levels of priority, the furthest of them, rad, the least that is taken, and the damping of the position.
-_LEVEL_STEPS, _LEVEL_RAD, _STILL, _FIRM = 60, 0.3, 1e-13, 1e-14
+#: Steps of the levels of priority, the least that is taken, rad, and the damping of the position.
+_LEVEL_STEPS, _STILL, _FIRM = 60, 1e-13, 1e-14
 #: Motions that change a direction less than this, squared, rad per rad, are not used for it: to gain a hundredth of a
 #: radian the wrist would rotate by half a revolution.
 _WEAK = 1e-2
@@ -116,7 +114,7 @@ def _descend(table: Array, G: Frame, q: Array, low: Array, high: Array, work: Ar
     cost = _weigh(F, n, J, e)
     damping = 1e-3 * min(1.0, cost)
     for _ in range(_STEPS):
-        if cost < _NONE or damping > _STIFF:
+        if cost < _NONE or damping > STIFF:
             break
         after, size = np.inf, 0.0
         if _step(J, e, q, low, high, damping + 1e-15, A, g, step):
@@ -354,7 +352,7 @@ def _by_priority(table: Array, G: Frame, q: Array, low: Array, high: Array, work
         for i in range(n):
             size = max(size, abs(step[i]))
         for i in range(n):
-            q[i] = min(high[i], max(low[i], q[i] + step[i] * _LEVEL_RAD / max(_LEVEL_RAD, size)))
+            q[i] = min(high[i], max(low[i], q[i] + step[i] * _SLIDE_RAD / max(_SLIDE_RAD, size)))
         if size < _STILL:
             return
 

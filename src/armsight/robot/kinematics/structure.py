@@ -18,7 +18,7 @@ from armsight.data import Array
 from armsight.geometry.pose import inverse
 from armsight.robot.kinematics.table import ACROSS, BEND, FOREARM, KIND, TOOL, UNTOOL, link
 
-NEITHER, PARALLEL, SPHERICAL = 0, 1, 2
+NEITHER, PARALLEL, SPHERICAL = range(3)
 
 #: How far a table may be from a structure for that to give starting points: angle, rad, and length, m.
 _NEAR_RAD, _NEAR_M = np.deg2rad(3.0), 0.005

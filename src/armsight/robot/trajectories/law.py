@@ -23,7 +23,7 @@ import numpy as np
 
 from armsight.data import Array
 from armsight.robot.trajectories.limits import ROUNDING, time_scales, worst
-from armsight.robot.trajectories.lookahead import Walk, columns
+from armsight.robot.trajectories.lookahead import HALVINGS, Walk, columns
 from armsight.robot.trajectories.profile import Profile, plan_profile
 from armsight.robot.trajectories.trajectory import Joints, check_times, clamped
 
@@ -39,7 +39,6 @@ INSTANTS = 200  # instants at which each of these proportions is evaluated
 CHAIN_ROUNDS = 40  # rounds in which the parts of a chain are slowed down
 GENTLER = 0.9  # factor by which a bend's speed is reduced when the straight part beside it is too short
 TOUCHING = 1e-6  # bends nearer to each other than this share of the way are passed as one
-HALVINGS = 40  # halvings of a duration that find when a share is reached
 
 _REST = Joints(np.zeros(1), np.zeros(1), np.zeros(1))  # at the begin of the way
 

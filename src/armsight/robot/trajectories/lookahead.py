@@ -31,8 +31,8 @@ STEP_M, STEPS = 1e-3, (100, 5000)
 FAR_RAD = 0.2
 #: In how many steps a bend is walked at least.
 BEND_STEPS = 50
-#: Halvings of a step that find where a reason begins: to 1e-12 of the way.
-HALVINGS = 30
+#: Halvings of a step that find where a reason begins, and of a duration that find when a share is reached: to 1e-12.
+HALVINGS = 40
 #: Newton steps from a point of the walk to one beside it, and what they may leave, m and rad.
 NEWTON, REFINED = 3, 1e-10
 

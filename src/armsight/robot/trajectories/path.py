@@ -12,14 +12,12 @@ import numpy as np
 
 from armsight.data import Array
 from armsight.errors import InputError
-from armsight.geometry.check import checked
+from armsight.geometry.check import RIGID, checked, off_rotation
 from armsight.geometry.rotation import log_so3
 
 #: A rotation of one radian counts as this length, m, where the length of a way with rotation and translation is measured:
 #: about what a tool's tip sweeps.
 ROTATION_M = 0.25
-#: How far from orthonormal a pose handed in may be.
-POSE_TOLERANCE = 1e-6
 
 
 class PathPoints(NamedTuple):
@@ -41,11 +39,7 @@ def checked_pose(T: object, name: str) -> Array:
     """Return a pose (4, 4) that has been found to be one; or InputError."""
     pose = checked(T, (4, 4), name)  # type: ignore[arg-type]
     R = pose[:3, :3]
-    if (
-        np.abs(R @ R.T - np.eye(3)).max() > POSE_TOLERANCE
-        or np.linalg.det(R) < 0
-        or np.abs(pose[3] - [0, 0, 0, 1]).max() > POSE_TOLERANCE
-    ):
+    if off_rotation(R) > RIGID or np.linalg.det(R) < 0 or np.abs(pose[3] - [0, 0, 0, 1]).max() > RIGID:
         raise InputError(f"{name} is no pose: its 3x3 must be a rotation, its last row 0 0 0 1")
     return pose
 

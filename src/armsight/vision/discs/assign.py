@@ -13,16 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import SIDES, Array, Correspondences, Discs, Dropped, Ids, Missed, Record
-from armsight.estimate.chance import chi_square_limit
+from armsight.estimate.chance import MISTAKE, chi_square_limit
 from armsight.geometry.pose import exp_se3
 from armsight.vision.discs.bias import Expected, expect, visible
 from armsight.vision.discs.pairing import DiscView
 from armsight.vision.markers.discs import DiscTarget
 from armsight.vision.rig import StereoRig
 
-#: A detection beyond this quantile of the chi-square distribution of its distance is not of this disc.
-GATE_QUANTILE = 1.0 - 1e-5
-_GATE_ONE, _GATE_BOTH = (chi_square_limit(n, 1 - GATE_QUANTILE) for n in (2, 4))
+#: Squared distance, in covariances, of a detection that is not of this disc, of one camera and of both.
+_GATE_ONE, _GATE_BOTH = (chi_square_limit(n, MISTAKE) for n in (2, 4))
 _NONE = np.zeros(0, np.int64)
 #: Rows of the left and of the right camera's discs that may be one disc of the body.
 Claim = tuple[Ids, Ids]

@@ -18,11 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array, Correspondences, Ids, Record
-from armsight.estimate.chance import chi_square_limit
+from armsight.estimate.chance import MISTAKE, chi_square_limit
 from armsight.geometry.pose import exp_se3, transform
-from armsight.vision.discs.assign import GATE_QUANTILE, correspondences, settle
+from armsight.vision.discs.assign import correspondences, settle
 from armsight.vision.discs.bias import LEAST_FACING, Expected, expect, visible
-from armsight.vision.discs.pairing import DEPTHS_M, SIZE_SIGMAS, SIZE_TOLERANCE, DiscView, Pairs
+from armsight.vision.discs.pairing import DEPTHS_M, SIZE_TOLERANCE, DiscView, Pairs
+from armsight.vision.match import SIGMAS
 from armsight.vision.triangulate import pixels_by_rig
 
 #: A disc in view is found with this probability.
@@ -103,7 +104,7 @@ def hypothesis(view: DiscView, pairs: Pairs, T_left_body: Array, rows: Ids) -> H
 @lru_cache(maxsize=256)
 def _limit(freedom: int) -> float:
     """Chi-square above which a fit is rejected."""
-    return chi_square_limit(freedom, 1 - GATE_QUANTILE)
+    return chi_square_limit(freedom, MISTAKE)
 
 
 def _fit(view: DiscView, T: Array, rows: Ids) -> _Fit | None:
@@ -143,7 +144,7 @@ def _size_chi2(view: DiscView, expected: Expected, congruent: Congruent, rows: I
         row, long = rows[m, s], expected.radius_px[m, s]
         if not congruent[s][m, row].all():
             return None
-        sigma2 = (SIZE_SHARE * long) ** 2 + (view.tolerance_px[s][row] / SIZE_SIGMAS) ** 2
+        sigma2 = (SIZE_SHARE * long) ** 2 + (view.tolerance_px[s][row] / SIGMAS) ** 2
         total += float(((view.radius_px[s][row] - long) ** 2 / sigma2).sum())
     return total
 

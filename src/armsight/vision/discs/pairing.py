@@ -27,13 +27,12 @@ from armsight.kernels import kernel, kernel_types
 from armsight.vision.camera import Camera
 from armsight.vision.discs.bias import Expected
 from armsight.vision.markers.discs import DiscTarget
-from armsight.vision.match import GATE_PX, epipolar_distances
+from armsight.vision.match import GATE_PX, SIGMAS, epipolar_distances
 from armsight.vision.rig import StereoRig
 from armsight.vision.triangulate import midpoints, optimal_points, pixels_by_rig
 
-#: An ellipse may be this much longer or shorter than the disc would look, beyond so many standard deviations of its
-#: rim.
-SIZE_TOLERANCE, SIZE_SIGMAS = 0.15, 6.0
+#: An ellipse may be this much longer or shorter than the disc would look, beyond SIGMAS standard deviations of its rim.
+SIZE_TOLERANCE = 0.15
 #: The same along any of its axes, where the orientation of the disc is known.
 SHAPE_TOLERANCE = 0.25
 #: Errors that neither noise nor calibration explain: exposures that are not quite simultaneous, ink that ran, px; and a
@@ -70,7 +69,7 @@ class DiscView(Record):
     def of(rig: StereoRig, target: DiscTarget, left: Discs, right: Discs) -> DiscView:
         """Gather one shot."""
         more = (rig.sigma_px**2 + UNMODELLED_PX**2) * np.eye(2)
-        tolerance = (SIZE_SIGMAS * np.sqrt(np.trace(seen.cov_uv, axis1=1, axis2=2) / 2) for seen in (left, right))
+        tolerance = (SIGMAS * np.sqrt(np.trace(seen.cov_uv, axis1=1, axis2=2) / 2) for seen in (left, right))
         return DiscView(
             rig,
             target,

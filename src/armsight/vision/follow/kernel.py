@@ -23,6 +23,7 @@ from armsight.vision.discs.bias import disc_image
 from armsight.vision.markers.disc.common import FIELDS, SHARED, common, correct
 from armsight.vision.markers.disc.fit import PARAMETERS, FitBuffers, factor, fit, shape_of, solve
 from armsight.vision.markers.disc.search import REACH, Room, outline
+from armsight.vision.match import SIGMAS
 from armsight.vision.pose.posefit import moved
 
 #: Code of a disc that was seen.
@@ -30,8 +31,6 @@ SEEN = 0
 _STEPS = 8
 #: A step that changes the cost by less than this share is the last.
 _REACHED = 1e-5
-#: Where a detection is off the pose by more standard deviations than this, the pose is rejected.
-_OFF_SIGMAS = 6.0
 #: A disc whose rows explain so many times the mean square of the others' is left out: half of it by chance once in 1,000
 #: shots, double of it once in 10 million.
 _STRANGE = 32.0
@@ -330,9 +329,9 @@ def plausible(scene: DiscScene, found: DiscMeasurement, twist: Array) -> bool:
     C, J_rig = scene.cov_rig, found.J_rig
     for row in range(len(found.whitened)):
         r = found.whitened[row] * found.whitened[row]
-        if r > _OFF_SIGMAS * _OFF_SIGMAS:
+        if r > SIGMAS * SIGMAS:
             apart = scene.apart_s * dot(found.J[row], twist)
-            if r > _OFF_SIGMAS * _OFF_SIGMAS * (1.0 + apart * apart + dot(J_rig[row], applied(C, J_rig[row]))):
+            if r > SIGMAS * SIGMAS * (1.0 + apart * apart + dot(J_rig[row], applied(C, J_rig[row]))):
                 return False
     return True
 
@@ -357,7 +356,7 @@ def strangest(found: DiscMeasurement) -> tuple[int, float]:
 
 #: The outcome for one disc in one image, beside SEEN and the codes of ``disc.fit.REASONS``; ASTRAY: it was seen, but not
 #: where the body's other discs say.
-FACING_AWAY, OUTSIDE, NOT_THERE, OTHER_SIZE, ASTRAY = 20, 21, 22, 23, 24
+FACING_AWAY, OUTSIDE, NOT_THERE, OTHER_SIZE, ASTRAY = range(20, 25)
 #: Cosine between a disc's normal and its direction to the camera below which it is not searched: 78 degrees.
 _FACING = 0.2
 #: How much larger or smaller than predicted a disc may look.

@@ -19,8 +19,12 @@ from armsight.data import Array, Record
 from armsight.kernels import kernel
 from armsight.vision.markers.disc.common import FIELDS, SHARED, common, correct
 from armsight.vision.markers.disc.fit import (
+    CUT,
+    HILLY,
     MOST_DISCS,
+    NO_RIM,
     NOT_ELLIPSE,
+    NOT_UNIFORM,
     PARAMETERS,
     REASONS,
     SURROUND,
@@ -195,7 +199,7 @@ def without_holes(image: Grey, theta: Array) -> Grey:
 
 #: Reasons of the fit that leave a usable centre: what surrounds a board's disc is known, and sharpening or a wide lens
 #: bends every rim a little.
-HARMLESS = (5, 8, 10)
+HARMLESS = (NOT_ELLIPSE, HILLY, NOT_UNIFORM)
 #: If more than this share of the fits have such a reason, the image is like that.
 _ODD_SHARE = 0.3
 
@@ -211,7 +215,7 @@ def _fit_each(
         if codes[i] in HARMLESS:
             n, _ = gather(image, theta[i], work)
             if n < 4 * UNKNOWNS:
-                codes[i] = 1
+                codes[i] = CUT
                 continue
             for a in range(UNKNOWNS):
                 work.at[a] = theta[i, a]
@@ -219,7 +223,7 @@ def _fit_each(
             square = linearise(n, SURROUND, 0.0, work)
             normal_equations(n, work)
             if not factor(work.H, work.L, work.scale):
-                codes[i] = 2
+                codes[i] = NO_RIM
                 continue
             of_centre(work, cov[i])
             for a in range(2):

@@ -23,8 +23,8 @@ from armsight.vision.markers.disc.common import FIELDS, SHARED
 
 #: Most rejected candidates of an image that are reported.
 MOST_REPORTED = 100
-#: Most candidates examined in an image; sort key of one that has no closed rim.
-_MOST_CANDIDATES, _NEVER = fit.MOST_DISCS, 99
+#: Most candidates examined in an image; rank of one that has no closed rim.
+_MOST_CANDIDATES, _NEVER = fit.MOST_DISCS, len(fit.LOOK_ALIKES)
 #: An outline in a smaller copy this large, as a share of the longest half chord in the image, is looked at.
 _LARGE = 0.8
 #: Points count as coplanar where their third singular value is below this share of the first.

@@ -21,10 +21,11 @@ from numpy.typing import NDArray
 
 from armsight.data import SIDES, Array, Body, Dropped, Missed, Points, PoseEstimate
 from armsight.errors import some
-from armsight.estimate.chance import chi_square_limit
+from armsight.estimate.chance import MISTAKE, chi_square_limit
 from armsight.geometry.pose import inverse, pose, transform
 from armsight.geometry.rigid import collinear, fit_rigid, fit_scale
 from armsight.geometry.rotation import skew
+from armsight.vision.match import SIGMAS
 from armsight.vision.pose.pnp import consensus_poses
 from armsight.vision.pose.posefit import PixelObservations, PoseFit, fit_pose, whitened
 from armsight.vision.rig import StereoRig
@@ -33,7 +34,7 @@ from armsight.vision.rig import StereoRig
 #: A bent or badly printed body deviates by a few hundredths.
 _ALIKE = 0.2
 #: A body whose points are too far apart or too close together by this share, and by so many sigmas, is another body.
-_SIZE_TOLERANCE, _SIZE_SIGMAS = 0.02, 6.0
+_SIZE_TOLERANCE = 0.02
 #: Residuals beyond this quantile of their chi-square distribution are a misfit, not chance.
 _MISFIT_QUANTILE = 0.999
 
@@ -89,7 +90,7 @@ def _wrong_size(rig: StereoRig, body: Body, points: Points, T_left_body: Array) 
     scale, sigma = _scale(rig, body.points[points.ids], points, T_left_body)
     if wrong := _wrong_markers(rig, body, points, T_left_body, scale):
         return f"markers of {body.name} have another size than its file says: {some(wrong)}; correct the file"
-    if abs(scale - 1) <= max(_SIZE_TOLERANCE, _SIZE_SIGMAS * sigma):
+    if abs(scale - 1) <= max(_SIZE_TOLERANCE, SIGMAS * sigma):
         return None
     off = f"its points lie {scale:.3f} times as far apart as those of {body.name}"
     moved = (
@@ -111,7 +112,7 @@ def _wrong_markers(rig: StereoRig, body: Body, points: Points, T_left_body: Arra
         rows = np.array([each == name for each in markers])
         arrays = (points.ids[rows], points.p_left[rows], points.cov[rows], points.calibration[rows])
         scale, sigma = _scale(rig, body.points[points.ids[rows]], Points(*arrays, points.seen), T_left_body)
-        least = max(_SIZE_TOLERANCE, _SIZE_SIGMAS * sigma)
+        least = max(_SIZE_TOLERANCE, SIGMAS * sigma)
         if min(abs(scale - 1), abs(scale - whole)) > least:
             first, second, *_ = (k for k, each in enumerate(body.point_names) if each.rpartition(".")[0] == name)
             apart = 1e3 * float(np.linalg.norm(body.points[second] - body.points[first]))
@@ -137,10 +138,8 @@ def misfit_limit(freedom: int) -> float:
     return chi_square_limit(freedom, 1 - _MISFIT_QUANTILE) if freedom > 0 else np.inf
 
 
-#: A detection whose whitened squared distance from a robust fit is beyond this quantile of the chi-square distribution
-#: is an outlier.
-OUTLIER_QUANTILE = 1.0 - 1e-5
-_LIMIT, _MEDIAN = chi_square_limit(2, 1 - OUTLIER_QUANTILE), chi_square_limit(2, 0.5)
+#: Whitened squared distance from a robust fit beyond which a detection is an outlier; that of half of them.
+_LIMIT, _MEDIAN = chi_square_limit(2, MISTAKE), chi_square_limit(2, 0.5)
 #: A shot in which less than this share of the detections agrees with one pose is missed.
 _AGREEING = 0.5
 #: With this many matched points the rigid fit alone is a safe start; with fewer, its mirror image is tried too, and where

@@ -33,6 +33,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array
+from armsight.estimate.chance import chi_square_limit
 from armsight.geometry.matrix import solved_vector
 from armsight.kernels import kernel
 from armsight.vision.markers.disc.fit import (
@@ -56,7 +57,7 @@ _LEAST_DISCS = 3
 #: Contrasts of discs whose rims have the same noise, one over the other: what processing makes of a rim grows with it.
 _ALIKE = 1.6
 #: A power of six degrees of freedom that chance exceeds in 0.3 %, over its mean; and the most that one disc counts.
-_RIM_CHANCE = 3.3
+_RIM_CHANCE = chi_square_limit(2 * HARMONICS, 0.003) / (2 * HARMONICS)
 #: By how much the first harmonic of the noise exceeds the later ones, as a share of what is not white: what lies along rows
 #: and columns of pixels moves a long piece of the rim at once. Found with the simulated cameras.
 _FIRST = 0.4
@@ -66,18 +67,19 @@ _WHITE = 4.0
 _VIGNETTING = 0.3
 #: Chi-square of two degrees from which a disc or its surround may have a gradient in white noise: chance exceeds it in 1%
 #: and 10%; factor of the noise from which it is not white.
-_SLOPE_INSIDE, _SLOPE_OUTSIDE, _PROCESSED = 9.2, 4.6, 1.5
+_SLOPE_INSIDE, _SLOPE_OUTSIDE, _PROCESSED = chi_square_limit(2, 0.01), chi_square_limit(2, 0.1), 1.5
 #: The same in noise that is not white, and of a skewed edge: chance exceeds it in 0.1%; one that half of them exceed.
-_SLOPE, _SKEW, _HALF = 13.8, 13.8, 1.386
+_SLOPE, _HALF = chi_square_limit(2, 0.001), chi_square_limit(2, 0.5)
 #: The same of three degrees; mean weight of a spatial median in a plane times its variance; rounds until it has converged.
-_FIELD, _MEDIAN, _ROUNDS = 16.3, 0.8, 12
+_FIELD, _MEDIAN, _ROUNDS = chi_square_limit(3, 0.001), 0.8, 12
 #: Degrees of freedom of Student's t of slopes that are not vignetting's.
 _TAIL = 4.0
 #: Coma as it is to be expected: standard deviation of the shift in the corners, px.
 _COMA = 0.2
 #: What the discs of an image have in common, and where in it the shifts are that may have moved all of them: a field
 #: c + k x of skewed edges, and one of vignetting. See :func:`common`.
-SHARED, LEVEL, FIELDS, VIGNETTING = 10, 3, 4, 7
+LEVEL, FIELDS = range(3, 5)
+VIGNETTING, SHARED = range(FIELDS + 3, FIELDS + 9, 3)
 #: How likely each kind of gradient is where there is one (LIGHT, SURROUND, GLARE).
 _KINDS = (0.6, 0.3, 0.1)
 
@@ -257,7 +259,7 @@ def correct(
         cov[0, 0] += off
         cov[1, 1] += off
     skew = disc[SKEWED : SKEWED + 2] - shared[FIELDS : FIELDS + 2] - shared[FIELDS + 2] * theta[:2]
-    square, chance = skew[0] * skew[0] + skew[1] * skew[1], _SKEW * factor * _skew_variance(disc)
+    square, chance = skew[0] * skew[0] + skew[1] * skew[1], _SLOPE * factor * _skew_variance(disc)
     if square > chance:
         for i in range(2):
             for j in range(2):

@@ -39,12 +39,13 @@ MOST_DISCS = 16384
 #: Unknowns: c (2), M (3), s, C, B, g (2).
 UNKNOWNS = 10
 #: What a fit shows of noise and light, and where its parameters are in it, what a skewed edge and a level surround do.
-SHOWN, PARAMETERS, SKEWED, LEVELLED = 33, 14, 24, 27
+PARAMETERS = 14
+SKEWED, LEVELLED, SHOWN = (PARAMETERS + UNKNOWNS + more for more in (0, 3, 9))
 #: Floats in a cache line.
 _LINE = 16
 
 #: Kinds of gradient; GLARE is light that is added to disc and surround alike.
-LIGHT, SURROUND, GLARE = 0, 1, 2
+LIGHT, SURROUND, GLARE = range(3)
 
 F = np.float32
 _E0, _E1, _E2, _E3, _E4, _E5 = (F(x) for x in (1.0, -1 / 16, 1 / 512, -1 / 24576, 1 / 1572864, -1 / 125829120))
@@ -692,22 +693,22 @@ _BLUR_LEAST_PX = 0.2
 _WEIGH_PX = 0.3
 
 #: Why a candidate is not a disc: code -> text. 0 is a disc.
+CUT, NO_RIM, BLURRED, NARROW, NOT_ELLIPSE, FAINT, SMALL, HILLY, OPEN, NOT_UNIFORM, FOUND_TWICE = range(1, 12)
 REASONS = {
-    1: "cut by the image's border",
-    2: "no ellipse fits its rim",
-    3: "its rim is not sharp enough for its size",
-    4: "too narrow for a disc seen at less than 75 degrees",
-    5: "its rim is not that of an ellipse",
-    6: "too faint against the noise",
-    7: "smaller than 4 px across",
-    8: "its inside is not uniform: motion blur, or not a disc",
-    9: "open on one side",
-    10: "its surround is not uniform: text, a ring, a square of a board",
-    11: "a duplicate of another disc",
+    CUT: "cut by the image's border",
+    NO_RIM: "no ellipse fits its rim",
+    BLURRED: "its rim is not sharp enough for its size",
+    NARROW: "too narrow for a disc seen at less than 75 degrees",
+    NOT_ELLIPSE: "its rim is not that of an ellipse",
+    FAINT: "too faint against the noise",
+    SMALL: "smaller than 4 px across",
+    HILLY: "its inside is not uniform: motion blur, or not a disc",
+    OPEN: "open on one side",
+    NOT_UNIFORM: "its surround is not uniform: text, a ring, a square of a board",
+    FOUND_TWICE: "a duplicate of another disc",
 }
-NOT_ELLIPSE, FAINT, HILLY, NOT_UNIFORM, FOUND_TWICE = 5, 6, 8, 10, 11
 #: Reasons of candidates that have a closed rim, those that look most like a disc first.
-LOOK_ALIKES = (5, 8, 1, 10, 3, 4, 6)
+LOOK_ALIKES = (NOT_ELLIPSE, HILLY, CUT, NOT_UNIFORM, BLURRED, NARROW, FAINT)
 _MOST_BLUR = 0.8  # of the smaller half axis
 #: Smaller half axis over the larger one, at least.
 LEAST_RATIO = 0.22
@@ -812,16 +813,16 @@ def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, 
     sectors = work.sectors
     n, sample = gather(image, theta, work)
     if n < 0:
-        return 1
+        return CUT
     if n < 4 * UNKNOWNS:
-        return 7
+        return SMALL
     x0, y0 = np.rint(theta[0]), np.rint(theta[1])
     shift, square = _step(sample, theta, x0, y0, SURROUND, 0.0, work)
     if shift < 0.0 or _LEAST_SNR * square > sample * theta[6] * theta[6]:
-        return 2
+        return NO_RIM
     square, texture = minimise(n, theta, x0, y0, SURROUND, noise_sigma, True, 0.0, work)
     if square < 0.0:
-        return 2
+        return NO_RIM
     # Clipped pixels have no noise and do not count for it.
     variance = square / max(n - clipped(n, work) - UNKNOWNS, UNKNOWNS)
     det = theta[2] * theta[4] - theta[3] * theta[3]
@@ -829,9 +830,9 @@ def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, 
     root = np.sqrt(max(half * half - det, 0.0))
     minor, major = 1.0 / np.sqrt(half + root), 1.0 / np.sqrt(max(half - root, 1e-12))
     if theta[5] > _MOST_BLUR * minor:
-        return 3
+        return BLURRED
     if minor < LEAST_RATIO * major:
-        return 4
+        return NARROW
     if not abs(theta[6]) > _LEAST_SNR * np.sqrt(variance):
         return FAINT
     excess = np.sqrt(max(variance - noise_sigma * noise_sigma, 0.0)) / abs(theta[6])
@@ -841,7 +842,7 @@ def fit(image: NDArray[np.uint8], noise_sigma: float, theta: Array, cov: Array, 
     off, chance, count = off_ellipse(variance, work)
     allowed = _RIM_PX + _RIM_SHARE * np.sqrt(major * minor) + _RIM_TEXTURE * theta[5] * excess
     if off > count * allowed * allowed + RIM_CHANCE * np.sqrt(chance):
-        return 5
+        return NOT_ELLIPSE
     spread(n, work, sectors[0])
     v_in = sectors[0, 0] * (1.0 + max(-texture, 0.0))
     if sectors[0, 2] > 10.0 and np.sqrt(max(v_in - noise_sigma * noise_sigma, 0.0)) > UNEVEN * abs(theta[6]):

@@ -17,13 +17,17 @@ from armsight.data import Array
 from armsight.kernels import kernel
 from armsight.vision.markers.disc.common import common, correct
 from armsight.vision.markers.disc.fit import (
+    CUT,
     FAINT,
     FOUND_TWICE,
     HILLY,
     LEAST_RATIO,
+    NO_RIM,
     NOT_ELLIPSE,
     NOT_UNIFORM,
+    OPEN,
     PARAMETERS,
+    SMALL,
     UNEVEN,
     FitBuffers,
     factor,
@@ -305,9 +309,9 @@ def outline(
     x, y = _uphill(image, x, y, sign)
     x, y, half, across, down, shortest = _chords(image, x, y, low, sign, reach)
     if across < 0:
-        return 9
+        return OPEN
     if min(across, down) < 2 or across + down < 6:
-        return 7
+        return SMALL
     theta[6] = _box(image, x, y, half, across, down, sign)
     if theta[6] != 0.0:
         theta[0], theta[1], theta[2], theta[3], theta[4] = x, y, 4.0 / across**2, 0.0, 4.0 / down**2
@@ -321,13 +325,13 @@ def outline(
         k = _STRIDE * ray % _RAYS
         radii[k] = _ray(image, x, y, k, start, reach, half, sign)
         if radii[k] < 0.0:
-            return 9 if radii[k] > -1.5 else 1
+            return OPEN if radii[k] > -1.5 else CUT
         within += radii[k] * radii[k] / _RAYS
     without, code, contrast = -1, 0, 2.0 * abs(int(image[y, x]) - half)
     for _ in range(2):
         cu, cv, size = _ellipse(radii, room, without)
         if not (size > 0.0 and cu * cu + cv * cv < within):
-            return 2
+            return NO_RIM
         minor = np.sqrt(size / (0.5 * (p[0] + p[2]) + np.sqrt(0.25 * (p[0] - p[2]) ** 2 + p[1] * p[1])))
         off, without = _off(radii, p, without)
         most = (_ROUND_PX + _ROUND * minor) * (1.0 if contrast > _CLEAR * least else _UNCLEAR)
