@@ -147,6 +147,17 @@ def test_covariances_are_those_of_the_matrices():
         assert np.abs(own - expected).max() < 1e-13 * np.abs(expected).max()
 
 
+def test_motion_to_and_fro_adds_at_once_what_it_adds_in_many_steps():
+    model, joints = ErrorModel(ARM, Prior(), 2e-4), Smoothed(*(np.ones(shape) for shape in ONE))
+    rows, variance, parts = slice(model.layout.rest, model.layout.reading), np.zeros(SIZE), 50
+    moved = np.full(1, 2.0), np.full((1, 6), 0.2), np.full((1, 2, 6), 6.0)
+    at_once = model.carried(*moved, joints.variance, joints)
+    for _ in range(parts):
+        step = model.carried(*(each / parts for each in moved), joints.variance, joints)
+        variance = step.kept[0] ** 2 * variance + step.added[0]
+    np.testing.assert_allclose(at_once.added[0, rows], variance[rows], rtol=1e-9)
+
+
 @pytest.mark.parametrize("learns_delay", [True, False])
 def test_a_measurement_changes_state_and_covariance_as_the_textbook_has_it(learns_delay):
     """Joseph's form of the update (Bucy and Joseph, 1968), which holds for every gain."""

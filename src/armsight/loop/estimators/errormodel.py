@@ -297,6 +297,12 @@ def _decayed(x: float) -> float:
     return math.exp(-x) if x < 46.0 else 0.0
 
 
+@kernel
+def _lasting(time: float, way: float) -> float:
+    """Return the share that is left of what comes evenly along a way, over half its length of forgetting; all at first."""
+    return (1.0 - _decayed(way)) / way if way > 1e-6 and time < math.inf else 1.0
+
+
 @kernel(
     "f8[::1], f8[:, ::1], f8[:, :, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], f8, f8[:, ::1], "
     "f8[:, ::1]"
@@ -316,9 +322,10 @@ def _forget(
             way, k = max(travel[n, i], 0.0), pose_at - 2 * joints + i
             whole += way
             kept[n, k] = _decayed(way / rest_travel)
-            # A whole change of side moves it from -1 to 1.
+            # A whole change of side moves it from -1 to 1; what that makes of the joint is forgotten as the rest is.
             flipped = flip**2 * max(flips[n, 0, i], 0.0) + flip_float**2 * max(flips[n, 1, i], 0.0)
-            added[n, k] = sigmas[k] ** 2 * (1.0 - kept[n, k] ** 2) + crept + 0.5 * learning**2 * flipped
+            fresh = (crept + 0.5 * learning**2 * flipped) * _lasting(time[n], 2.0 * way / rest_travel)
+            added[n, k] = sigmas[k] ** 2 * (1.0 - kept[n, k] ** 2) + fresh
             # Of two means of the same readings the one of more has the share of the other's noise that it has of readings.
             share, k = min(variance[n, i] / before[i], 1.0), pose_at - joints + i
             kept[n, k] = share * _decayed(abs(time[n]) / lasts[n, i])
