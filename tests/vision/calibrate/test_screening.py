@@ -91,11 +91,12 @@ def test_only_what_is_wrong_is_thrown_out():
     assert [r.pair for r in dirty.rejected] == ["p06"]
     assert dirty.notes == ("p02: 1 of 108 points of both images dropped as gross errors",)
     assert 6 not in dirty.kept
-    many = [f"p0{k}: {k + 1} of 108 points dropped as gross errors" for k in range(4)]
-    assert merged_notes(["p09: corrected", *many[:3]]) == ["p09: corrected", *many[:3]]
+    many = [f"p0{k}: {k + 1} of 108 points dropped as gross errors" for k in range(6)]
+    assert merged_notes(["p09: corrected", *many[:5]]) == ["p09: corrected", *many[:5]]
     merged = merged_notes(["p09: corrected", *many])
     assert merged[0] == "p09: corrected"
-    assert merged[1].startswith("10 points in 4 pairs dropped as gross errors; most in p03 (4), p02 (3), p01 (2)")
+    most = "p05 (6), p04 (5), p03 (4), p02 (3), p01 (2)"
+    assert merged[1].startswith(f"21 points in 6 pairs dropped as gross errors; most in {most};")
     assert dirty.observations.shot_count == len(pairs) - 1
     assert len(dirty.observations.shot) == len(observations.shot) - 108 - 1
 
