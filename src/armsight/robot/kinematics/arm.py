@@ -23,8 +23,8 @@ from armsight.errors import InputError
 from armsight.geometry.check import checked
 from armsight.geometry.rotation import log_so3
 from armsight.robot.kinematics import chain, inverse, numeric
-from armsight.robot.kinematics.closed import ELBOW, SHOULDER, WRIST
-from armsight.robot.kinematics.inverse import KEY, MOST, OUTSIDE, STATE, WIDTH
+from armsight.robot.kinematics.closed import ELBOW, OUTSIDE, SHOULDER, WRIST
+from armsight.robot.kinematics.inverse import KEY, MOST, STATE, WIDTH
 from armsight.robot.kinematics.solutions import ROW_END, ManySolutions, Nearest, Solutions, many_solutions
 from armsight.robot.kinematics.structure import NEITHER, PARALLEL, recognised
 from armsight.robot.kinematics.table import FEWEST_JOINTS, KIND, MOST_JOINTS, link, packed, rows_of

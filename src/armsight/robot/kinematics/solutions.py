@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armsight.data import Array, Ids, Record
-from armsight.robot.kinematics.inverse import ANGLE, CONFIGURATION, OUTSIDE, POSITION, STATE, WIDTH
+from armsight.robot.kinematics.closed import OUTSIDE
+from armsight.robot.kinematics.inverse import ANGLE, CONFIGURATION, POSITION, STATE, WIDTH
 
 #: Columns of a row after its joint angles, and where they stand counted from its end.
 ROW_END = WIDTH - POSITION

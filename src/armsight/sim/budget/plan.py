@@ -481,7 +481,8 @@ class RigPlan:
              f"the field of view is {seen[k]:.2g} m {('wide', 'high')[k]} at {near:.2g} m, volume and body are "
              f"{needed[k]:.2g} m: a distance of {up(needed[k] / seen[k] * near + size[2] / 2)} m, or focal_widths = "
              f"{seen[k] / needed[k] * self.focal_px / width:.2g}"
-             + f", or a volume {1e-2 * int(1e2 * (seen[k] - body)):.2g} m {('wide', 'high')[k]}" * int(seen[k] > body + 0.01)),
+             + int(seen[k] > body + 0.01)
+             * f", or a volume {1e-2 * int(1e2 * (seen[k] - body)):.2g} m {('wide', 'high')[k]}"),
             (px < _LEAST_PX[kind],
              f"a {kind} is {px:.1f} px at {far:.2g} m, at least {_LEAST_PX[kind]:g} are needed: markers {larger} times as "
              f"large{scaled}"),
