@@ -75,11 +75,12 @@ class Innovation(Record):
     #: returns (6,) as z, from the pose predicted by a state that stays, and its derivative (6, K), where they are asked
     #: for; None where none is kept (:meth:`KalmanEstimator.keep_reference`).
     reference: Callable[[], tuple[Array, Array]] | None = None
-    #: (K,) variances that the arm's motion added since the measurement before; None where nobody needs them. After a change
-    #: of side the filter counts a joint as more uncertain.
+    #: (K,) variances that were added to the state since the measurement before; None where nobody needs them
     added: Array | None = None
     #: (6, 6) covariance of z without the state's and without what all measurements share; None likewise
     noise: Array | None = None
+    #: (K,) what the arm's motion alone added; the filter, which learns, counts more. None where no reference is kept
+    wandered: Array | None = None
 
 
 @dataclass(frozen=True)

@@ -504,19 +504,18 @@ class KalmanEstimator:
         felt = self._felt(before, t_s, report=report is not None)
         steps = () if felt is before else felt.steps
         before, joints = self._anew(felt, times)
-        learns = self._model.moved(before, joints, times, learning=LEARNING)
-        step = self._model.moved(before, joints, times)
+        step = self._model.moved(before, joints, times, learning=LEARNING)
         given, beside = pose_measurement, before.beside
         if self._unit is not None:
             pose_measurement = replace(given, cov_noise=ALIKE * given.cov_noise)
-        at, chi = self._model.predicted(before, learns, joints, pose_measurement, jitter_s)
+        at, chi = self._model.predicted(before, step, joints, pose_measurement, jitter_s)
         outcome = self._gate(at, chi)
         if report is not None and self._mistimed(at, chi, outcome):
             outcome = Outcome.OUTLIER
         if outcome is Outcome.OUTLIER:
             if report is not None:
                 none = np.zeros((self._at.size, 6))
-                report(self._said(t_s, joints, pose_measurement, at, step, none, outcome))
+                report(self._said(times, before, joints, pose_measurement, at, step, none, outcome))
             return None, outcome
         if outcome is Outcome.REOPENED:
             at.P[np.diag_indices(self._at.size)] += self._opened
@@ -543,7 +542,7 @@ class KalmanEstimator:
             if self.clock is not None:
                 between = (state.steps for state in self._states if self._doubt.t_s < state.t_s <= known)
                 self._doubt.step(t_s, (*chain.from_iterable(between), *steps), at, len(x))
-            change = report(self._said(t_s, joints, pose_measurement, at, step, K, outcome))
+            change = report(self._said(times, before, joints, pose_measurement, at, step, K, outcome))
             if change is not None:
                 x = x + change
             if change is not None and self.clock is not None and self._unit is None:
@@ -698,7 +697,8 @@ class KalmanEstimator:
 
     def _said(
         self,
-        t_s: float,
+        times: Array,
+        before: ErrorState,
         joints: Smoothed,
         pose_measurement: PoseMeasurement,
         at: Predicted,
@@ -706,12 +706,13 @@ class KalmanEstimator:
         gain: Array,
         outcome: Outcome,
     ) -> Innovation:
-        """Return what became of a measurement: the state at it, the propagation to it, the gain, the outcome."""
-        reference = None
+        """Return what became of a measurement at a time (1,): states before and at it, the propagation, gain, outcome."""
+        reference, wandered = None, None
         if self._reference is not None and self.on_innovation is not None:
+            wandered = self._model.moved(before, joints, times).added[0]
             reference = partial(self._model.innovation, self._reference, joints, pose_measurement, self._delay.jitter_s)
-        seen = t_s, pose_measurement.T_base_tool, at.z, at.S, at.H
-        return Innovation(*seen, step.kept[0], gain, outcome, None, reference, step.added[0], at.R)
+        seen = float(times[0]), pose_measurement.T_base_tool, at.z, at.S, at.H
+        return Innovation(*seen, step.kept[0], gain, outcome, None, reference, step.added[0], at.R, wandered)
 
     def _mistimed(self, at: Predicted, chi: float, outcome: Outcome) -> bool:
         """Return whether outliers in a row are all of one offset of the clock; then that jumped, and is corrected.

@@ -277,39 +277,58 @@ class Unrest:
         return np.asarray((axes * np.where(chances * len(values) < chance, values - 1.0, 0.0)) @ axes.T)
 
 
-class ShakeWatch:
-    """Watches whether rig and arm shake against each other while the arm stands, by the model as it was learned.
+def _outgrown(wander: Array, noise: Array) -> bool:
+    """Return whether an arm may have wandered, covariance (6, 6), by more than a shot's noise (6, 6)."""
+    return bool(np.trace(np.linalg.solve(noise, wander)) > len(noise) * _WANDERED**2)
 
-    The estimator would follow what shakes: an arm in motion wanders as much.
+
+class ShakeWatch:
+    """Watches whether rig and arm shake against each other.
+
+    While the arm stands, by poses against the model as it was learned: the estimator would follow what shakes. In motion,
+    where the arm wanders as much, by what the estimator leaves.
     """
 
     def __init__(self) -> None:
-        self._unrest, self._window = Unrest(6, terms=1), list[tuple[float, Array, Array]]()
-        self._wandered: Array | float = 0.0  # variances (K,) of the arm's error since the window began
+        self._standing, self._moving = Unrest(6, terms=1), Unrest(6)
+        self._windows: tuple[list[tuple[float, Array, Array]], ...] = ([], [])
+        self._wandered: Array | float = 0.0  # variances (K,) of the arm's error since the standing window began
         self.change: Change | None = None
 
     def take(self, innovation: Innovation) -> None:
         """Take what the estimator did with a measurement, in order of time."""
-        noise, added, reference = innovation.noise, innovation.added, innovation.reference
-        if innovation.outcome is not Outcome.USED or noise is None or added is None or reference is None:
+        noise, added, more = innovation.noise, innovation.added, innovation.wandered
+        if innovation.outcome is not Outcome.USED or noise is None or added is None:
             return
-        e, H = reference()
-        wandered = self._wandered * innovation.kept**2 + added
+        R = np.kron(np.eye(2), innovation.T_base_tool[:3, :3])
+        standing, moving = self._windows
+        if self._late(moving, innovation):
+            self._decide(self._moving, moving, innovation)
+        left = noise + (innovation.by_state * added) @ innovation.by_state.T
+        moving.append((innovation.t_s, R @ innovation.z, R @ left @ R.T))
+        if innovation.reference is None or more is None:
+            return
+        e, H = innovation.reference()
+        wandered = self._wandered * innovation.kept**2 + more
         wander = (H * wandered) @ H.T
-        late = self._window and not 0.0 <= innovation.t_s - self._window[0][0] < _WINDOW_S
-        if late or (self._window and np.trace(np.linalg.solve(noise, wander)) > len(e) * _WANDERED**2):
-            self._decide(innovation)
+        if self._late(standing, innovation) or (standing and _outgrown(wander, noise)):
+            self._decide(self._standing, standing, innovation)
             wandered, wander = 0.0 * wandered, 0.0 * wander
         self._wandered = wandered
-        R = np.kron(np.eye(2), innovation.T_base_tool[:3, :3])
         # About its mean a random walk varies by a third of what it does about its begin.
-        self._window.append((innovation.t_s, R @ e, R @ (noise + wander / 3.0) @ R.T))
+        standing.append((innovation.t_s, R @ e, R @ (noise + wander / 3.0) @ R.T))
 
-    def _decide(self, newest: Innovation) -> None:
-        """Compare a window with its noise."""
-        (t_s, z, noise), self._window = map(np.array, zip(*self._window, strict=True)), []
-        self._unrest.take(t_s, z, noise)
-        cov, R = self._unrest.cov, np.kron(np.eye(2), newest.T_base_tool[:3, :3])
+    @staticmethod
+    def _late(window: list[tuple[float, Array, Array]], innovation: Innovation) -> bool:
+        return bool(window) and not 0.0 <= innovation.t_s - window[0][0] < _WINDOW_S
+
+    def _decide(self, unrest: Unrest, window: list[tuple[float, Array, Array]], newest: Innovation) -> None:
+        """Compare a window with its noise, and empty it."""
+        t_s, z, noise = map(np.array, zip(*window, strict=True))
+        window.clear()
+        unrest.take(t_s, z, noise)
+        cov = max(self._standing.cov, self._moving.cov, key=np.trace)
+        R = np.kron(np.eye(2), newest.T_base_tool[:3, :3])
         self.change = None
         if cov.any():
             now, effect = R.T @ cov @ R, np.eye(6)
