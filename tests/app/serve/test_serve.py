@@ -98,6 +98,22 @@ def test_a_driver_that_falls_silent_is_started_again(serving):
     assert [each["why"] for each in events if each["event"] == "lost"] == ["no shot for 2 s"]
 
 
+def test_a_child_that_was_killed_while_it_waited_is_no_loss(serving, tmp_path):
+    (tmp_path / "plan").write_text("1 ends")
+    served = Service(ServeConfig((), tmp_path, http=""), (events := []).append)
+    served._prepare()
+    served._next.kill()
+    served._next.wait()
+    assert served.run() == 0
+    assert [each["event"] for each in events] == ["measuring", "ended"]
+
+
+def test_on_stderr_a_reason_is_said_once(serving, tmp_path, capsys):
+    (tmp_path / "plan").write_text("1 camera gone\n1 ends")
+    assert Service(ServeConfig((), tmp_path, http=""), lambda event: None).run() == 0
+    assert capsys.readouterr().err.count("camera gone") == 1
+
+
 def test_an_interrupt_ends_the_child(serving):
     threading.Timer(0.6, signal.raise_signal, (signal.SIGINT,)).start()
     before = time.monotonic()

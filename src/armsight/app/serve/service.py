@@ -35,8 +35,6 @@ _END_S = 10.0
 _LOOK_S = 0.2
 #: s; the first pause before the next try, doubled up to the file's retry_s; half: an attempt more, double: one less.
 _PAUSE_S = 0.5
-
-
 #: Lines of the child that are remembered; half, double: so much memory.
 _LINES = 1000
 #: What is started, before it is needed; a line of its input has the command and its options.
@@ -148,14 +146,14 @@ class Service:
         self._tries, self._last_line, self._lines = self._tries + 1, "", set()
         listener: threading.Thread | None = None
         try:
+            if self._next is not None and self._next.poll() is not None:  # killed while it waited
+                self._next.communicate()
+                self._next = None
             self._prepare()
             self._child, self._next = self._next, None
             assert self._child is not None
             assert self._child.stdin is not None
-            with (
-                suppress(BrokenPipeError),
-                self._child.stdin as line,
-            ):  # one that was killed meanwhile: its code says so
+            with suppress(BrokenPipeError), self._child.stdin as line:  # killed meanwhile: its code says so
                 line.write(json.dumps(arguments).encode() + b"\n")
             listener = threading.Thread(target=self._listen, args=(self._child,), daemon=True)
             listener.start()
@@ -262,8 +260,11 @@ class Service:
                 self._hear(data.decode(errors="replace").rstrip())
 
     def _hear(self, line: str) -> None:
-        self._last_line = line.removeprefix("armsight: error: ") or self._last_line
-        if _PROGRESS.match(line):
+        reason = line.removeprefix("armsight: error: ")
+        self._last_line = reason or self._last_line
+        if _PROGRESS.match(line) or (
+            reason != line and not self._config.log
+        ):  # the end or the loss is said on stderr, too
             return
         if self._lost_since is None or line not in self._said:
             self._log.info("measure: %s", line)
