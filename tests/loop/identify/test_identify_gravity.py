@@ -7,7 +7,8 @@ import pytest
 from worn_arm import poses, worn
 
 from armsight.errors import InputError
-from armsight.loop.identify.gravity import gravity_shows, parallel
+from armsight.loop.estimators.armerror import Prior
+from armsight.loop.identify.gravity import ArmRests, gravity_shows, parallel
 from armsight.loop.references.inertial import ACCELEROMETER, GYRO, Inertial
 from armsight.loop.references.reference import Reading, ToolMotion
 from armsight.robot.models import MODELS
@@ -49,6 +50,37 @@ def test_tilt_and_the_zeros_that_gravity_shows_are_found_and_the_others_are_open
         assert max(np.degrees(shown[k].sigma) for k in closed) < 0.06  # a link bent about a joint's axis is a zero, too
     assert np.sqrt(np.mean(np.square(off))) < 0.08  # two sigma of what is claimed
     assert np.sqrt(np.mean(np.square(zeros_off))) < 0.06
+
+
+@pytest.mark.parametrize("scatter_rad", [1e-3, 5e-3])
+def test_the_scatter_of_rests_is_found(scatter_rad):
+    found = []
+    for seed in range(720, 724):
+        rng, arm = np.random.default_rng(seed), MODELS["six_r"]
+        said = replace(Inertial.of("imu"), cov=np.diag(LEFT**2))
+        q = poses(arm, 60, rng, 1.5)[0]
+        at = arm.forward(q + rng.normal(0.0, scatter_rad, q.shape))
+        z = [said.expected(ToolMotion(T), ACCELEROMETER).z + rng.normal(0.0, 0.004, 3) for T in at]
+        readings = [Reading(float(k), ACCELEROMETER, each, 0.004**2 * np.eye(3)) for k, each in enumerate(z)]
+        given = ArmRests(arm, Prior(), q).scatter.max()
+        found.append(gravity_shows(arm, said, q, readings)[1].noise["carrier"] * given)
+    assert np.mean(found) == pytest.approx(scatter_rad, rel=0.15)
+
+
+@pytest.mark.parametrize("name", ["six_r", "iiwa", "franka"])
+def test_zeros_hold_a_bent_link_whatever_its_twist(name):
+    """Zeros that cancel a bend in every pose, found by the poses alone, are its negative."""
+    arm, rng = MODELS[name], np.random.default_rng(5)
+    twists = np.resize(np.radians([-90, 60, 70, 100, -60, -75, 90]), arm.joints)
+    arm = replace(arm, alpha=twists, direction=np.resize([1.0, -1.0, -1.0, 1.0], arm.joints))
+    rests = ArmRests(arm, Prior(), rng.uniform(-1.0, 1.0, (12, arm.joints)))
+    rotation = np.concatenate([rests.at(float(k))[1][3:] for k in range(12)])
+    zeros = np.flatnonzero(rests.scatter)
+    for bent in zeros[1:] - 1:
+        step = np.zeros(len(rests.sigma))
+        step[bent], step[zeros] = 1.0, np.linalg.lstsq(rotation[:, zeros], -rotation[:, bent])[0]
+        np.testing.assert_allclose(rotation @ step, 0.0, atol=1e-9)
+        np.testing.assert_allclose(rests.moved(step).zeros(np.eye(len(step)))[0], 0.0, atol=1e-9)
 
 
 def test_joints_with_parallel_axes_are_one_set():
