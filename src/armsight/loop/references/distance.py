@@ -160,10 +160,10 @@ class RangeNoise(NamedTuple):
 
     range_m: float = 0.1  #: white noise of a range, m
     bias_m: float = 0.1  #: of a bias of each anchor, m
-    common_m: float = 0.1  #: of one that all share, m
     fade_s: float = 20.0  #: in which a bias fades, s
     acceleration: float = 0.7  #: density of the body's acceleration, m/s2 per root of Hz
     upright: float = 0.1  #: acceleration along z over that in the plane; 1 for what flies
+    common_m: float = 0.1  #: of a bias that all share, m
 
 
 class RangePath(NamedTuple):
