@@ -398,21 +398,19 @@ def _one_joint(arm: Arm, q: Array, off: Callable[[Array], float]) -> Iterator[tu
                 yield q + sign * q[:, other, None] * one, coupled
         if not 0 < joint < arm.joints - 1:
             continue  # base and tool hold zeros of the first and the last
-        ways = (1, ""), (-1, "counts the other way, and ")
-        for counted, way, change in (
-            (q * (1 + (sign - 1) * one), way, f"change the sign of {column}, and then ") for sign, way in ways
+        for sign, way, do in (
+            (1, "", ""),
+            (-1, "counts the other way, and ", f"change the sign of {column}, and then "),
         ):
 
-            def worse(zero_deg: float, q: Array = counted, one: Array = one) -> float:
-                return off(q + np.radians(zero_deg) * one)
+            def read_at(zero_deg: float, q: Array = q * (1 + (sign - 1) * one), one: Array = one) -> Array:
+                return np.asarray(q + np.radians(zero_deg) * one)
 
-            near = min(range(-180, 180, ZERO_DEG), key=worse)
+            near = min(range(-180, 180, ZERO_DEG), key=lambda zero_deg: off(read_at(zero_deg)))
             ends = near - ZERO_DEG, near + ZERO_DEG
-            zero = round(float(minimize_scalar(worse, bounds=ends, method="bounded").x), 1)
-            text = (
-                f"{said} {way}has another zero than {arm.name}'s: {change if way else ''}add {zero:g} deg to {column}"
-            )
-            yield counted + np.radians(zero) * one, text
+            best = minimize_scalar(lambda zero_deg: off(read_at(zero_deg)), bounds=ends, method="bounded")
+            zero = round(float(best.x), 1)
+            yield read_at(zero), f"{said} {way}has another zero than {arm.name}'s: {do}add {zero:g} deg to {column}"
 
 
 def _orders(p: Poses, arm: Arm, q: Array) -> list[Rows]:
@@ -605,7 +603,7 @@ def check_plausible(arm: Arm, measured: Measured) -> None:
                 f"{change.before / change.left:.1f} times as well: {change_text(model, change)}; use one of both parts"
             )
         return
-    for q_read, p_read, said in _readings_of(arm, measured, rows):
+    for q_read, p_read, said in _readings_of(measured, rows):
         off = points_off(arm, q_read, p_read)
         if off.sized and off.right < min(at.right / BETTER, max(BAD_SHARE * _span(p_read), BAD_M)):
             raise InputError(
@@ -662,8 +660,8 @@ def points_off(arm: Arm, q: Array, p_rig: Array) -> Off:
     return Off(offs[0], offs[1], 1 / scale)
 
 
-def _readings_of(arm: Arm, measured: Measured, rows: Rows) -> Iterator[tuple[Array, Array, str]]:
-    """Yield joints and points by other readings, and what each means: rows shifted, poses inverse, units, a joint."""
+def _readings_of(measured: Measured, rows: Rows) -> Iterator[tuple[Array, Array, str]]:
+    """Yield joints and points by other readings, and what each means: rows shifted, poses inverse, other units."""
     n, q = len(measured), measured.q[rows]
     for shift in (1, -1, 2, -2, 3, -3):
         if n - abs(shift) >= FEWEST:
@@ -687,20 +685,22 @@ def _readings_of(arm: Arm, measured: Measured, rows: Rows) -> Iterator[tuple[Arr
         if np.abs(read).max() < chain.MOST_RADIANS:
             yield read, measured.p_rig[rows], f"the motions fit if the joint angles are in {unit} (OFF)"
 
-    def off(read: Array) -> float:
-        return points_off(arm, read, measured.p_rig[rows]).right
-
-    read, said = min(_one_joint(arm, q, off), key=lambda one: off(one[0]))
-    yield read, measured.p_rig[rows], f"{said} (OFF)"
-
 
 def _proposal(arm: Arm, q: Array, p: Array, off: float) -> str:
-    """Return the frame, the order and the signs that make the data fit, or that none does."""
+    """Return the frame, the order and the signs that make the data fit, or the reading of one joint, or that none does."""
     unit = min((1.0, 1e-3, 1e3), key=lambda u: abs(np.log(_span(p) / _span(arm.forward(q)[:, None, :3, 3]) / u)))
     p = p / unit
     # Not the larger of the two, as for data as they are given: of thousands of ways some fit roughly by chance.
-    alike = _search(arm, q, p, min(off / BETTER, BAD_M, BAD_SHARE * _span(p)))
+    limit = min(off / BETTER, BAD_M, BAD_SHARE * _span(p))
+    alike = _search(arm, q, p, limit)
     if not alike:
+
+        def right(q: Array) -> float:
+            return points_off(arm, q, p).right
+
+        least, said = min((right(read), said) for read, said in _one_joint(arm, q, right))
+        if least < limit:
+            return f"{said} (off by {1e3 * off:.0f} mm as they are, {1e3 * least:.1f} mm so)"
         return (
             f"these data are not of this arm: with base and tool fitted it is off by {1e3 * off:.0f} mm; no unit, frame, "
             "order or sign of the joints corrects it. Is it the right model, with the table's right convention?"
