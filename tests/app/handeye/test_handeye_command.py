@@ -153,7 +153,7 @@ def test_where_the_arms_geometry_is_off_the_error_is_of_the_transforms_that_are_
     }
     run = calibrate(Options(**(nothing | given)), lambda line: None)
     document, said = handeye_report(run).json(), handeye_report(run).text()
-    assert "robot's geometry off" in document["noise"]["structure"]
+    assert document["noise"]["structure"] == "robot's geometry off"
     poses = np.array([pose["held_out_m"] for pose in document["poses"] if pose["used"]])
     assert document["held_out_rms_m"] == pytest.approx(np.sqrt((poses**2).mean()))
     held_out, nominal = (f"{1e3 * document[f'held_out_{of}rms_m']:.2f} mm" for of in ("", "nominal_"))

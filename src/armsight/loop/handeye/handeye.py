@@ -19,7 +19,7 @@ The rows are put into an order of their own first (by time, else by content), so
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -96,7 +96,6 @@ SURELY, SETTLED = 5.0, 0.1
 #: Times a position's error that the flange must spread for a scale. half: noise counts, double: a few cm are rejected.
 STILL = 3.0
 _TIMED = {name for pair in OVER_TIME for name in pair}  # sources that change over time
-_CHOSEN = _TIMED | {*EYE}  # sources that are taken up where the residuals speak for them
 ROUNDS = 6  # rounds of least squares and of leaving out
 
 
@@ -194,16 +193,12 @@ class HandEye(Record):
 
     def mistaken_eye(self) -> list[str]:
         """Return a remark for each source by which what is seen is surely too near or too far."""
-        of = {
+        said = {
             "size": "the target's size and the robot's lengths do not agree{}: measure the target, or --scale",
             "focal": "depths that the camera saw are off{}, lateral distances are not: is its focal length right?",
         }
-        sure = {
-            name: f" by {abs(x):.2%} ± {sigma:.2%}"
-            for name, (x, sigma) in self.eye_off.items()
-            if abs(x) > SURELY * sigma
-        }
-        return [of[name].format(by) for name, by in sure.items()]
+        off = {name: f" by {abs(x):.2%} ± {sigma:.2%}" for name, (x, sigma) in _sure(self.eye_off).items()}
+        return [said[name].format(by) for name, by in off.items()]
 
     def changed_at(self, names: Sequence[str] = ()) -> str:
         """Return a remark where something was displaced between two poses, by name or number; empty where not."""
@@ -338,11 +333,10 @@ class _Problem(Record):
         A[:, :3, 3] *= guess.per_m
         return replace(p, A=A)
 
-    def linear(self, guess: _Guess, arm: bool = False, chosen: bool = False) -> Linear:
-        """Return the residuals at a guess, with the sources of their error.
+    def linear(self, guess: _Guess, names: Collection[str] = ()) -> Linear:
+        """Return the residuals at a guess, with the sources of their error: the independent ones, and the shared ``names``.
 
-        Vision's shared errors are unknowns where the guess has them; ``arm``, ``chosen``: with what the arm, or eye and
-        time, change.
+        Vision's shared errors are unknowns where the guess has them.
         """
         poses = self.scaled(guess)
         e, J, carry = residuals(poses, guess.Z, guess.X)
@@ -363,13 +357,12 @@ class _Problem(Record):
         if self.covered:
             own["image"] = np.asarray(np.linalg.cholesky(given + 1e-18 * np.eye(6)))
             given = np.zeros_like(given)
-        shared: dict[str, Array] = {}
-        if arm:
-            shared = {name: maps[name] for name in LINKS if name in maps} | over_poses(self.poses.A, maps)
-        if chosen:
-            shared |= {name: maps[name] for name in EYE[self.free[0] :]}
-        if chosen and self.t_s is not None:
+        shared = {name: maps[name] for name in (*LINKS, *EYE[self.free[0] :]) if name in maps}
+        if not {*DRIFT}.isdisjoint(names):
+            shared |= over_poses(self.poses.A, maps)
+        if not _TIMED.isdisjoint(names) and self.t_s is not None:
             shared |= over_time(self.t_s, poses, maps, self.free[0])
+        shared = {name: F for name, F in shared.items() if name in names}
         return Linear(e, J, given, own, shared, known, at)
 
     @property
@@ -680,13 +673,12 @@ def require_known(found: HandEye, Ts_rig_body: Array, most_m: float, most_rad: f
             )
 
 
-def _taken_up(problem: _Problem, guess: _Guess, quick: bool) -> dict[str, float]:
+def _taken_up(problem: _Problem, guess: _Guess, pairs: Sequence[tuple[str, ...]]) -> dict[str, float]:
     """Return the sources of an arm that is as its model says, with their most probable variances.
 
-    Of those of eye and time whose scores speak, it is each time the one that makes the residuals most probable.
+    Of those of ``pairs`` whose scores speak, it is each time the one that makes the residuals most probable.
     """
-    linear = problem.linear(guess, chosen=not quick and len(problem.poses.A) >= MIN_SHARED)
-    pairs: list[tuple[str, ...]] = [*OVER_TIME, *((name,) for name in EYE)]
+    linear = problem.linear(guess, [name for pair in pairs for name in pair])
     means, pairs = problem.means(linear, guess), [pair for pair in pairs if pair[0] in linear.shared]
 
     start: dict[str, float] = {}
@@ -712,18 +704,16 @@ def _taken_up(problem: _Problem, guess: _Guess, quick: bool) -> dict[str, float]
 
 
 def _settled(
-    whole: _Problem, guess: _Guess, used: NDArray[np.bool_], quick: bool
+    whole: _Problem, guess: _Guess, used: NDArray[np.bool_], pairs: Sequence[tuple[str, ...]]
 ) -> tuple[_Guess, NDArray[np.bool_], dict[str, float], int]:
     """Alternate variances, transforms and blunders until they stay."""
     few = whole.rows(evenly(np.flatnonzero(used), MAX_VARIANCE if whole.t_s is None else MAX_WALK))
-    variances = _taken_up(few, guess, quick)
+    variances = _taken_up(few, guess, pairs)
     most = MAX_WALK if any("walk" in name for name in variances) else MAX_FIT
     for _ in range(ROUNDS):
         rows = evenly(np.flatnonzero(used), most)
         few, part = whole.rows(evenly(rows, min(most, MAX_VARIANCE))), whole.rows(rows)
-        estimated, linear = (
-            p.linear(guess, chosen=not _CHOSEN.isdisjoint(variances)).of(variances) for p in (few, part)
-        )
+        estimated, linear = (p.linear(guess, variances).of(variances) for p in (few, part))
         found = most_probable(estimated, few.means(estimated, guess), variances)
         variances = dict(zip(linear.sources, found.tolist(), strict=True))
         solved = solve(linear, found)
@@ -741,24 +731,49 @@ def _settled(
     return guess, used, variances, most
 
 
+def _sure(off: dict[str, tuple[float, float]]) -> dict[str, tuple[float, float]]:
+    """Return the errors that are surely not 0, of errors with their sigmas."""
+    return {name: (x, sigma) for name, (x, sigma) in off.items() if abs(x) > SURELY * sigma}
+
+
+def _models(
+    whole: _Problem, guess: _Guess, used: NDArray[np.bool_], quick: bool, progress: Callable[[str], None]
+) -> tuple[_Guess, NDArray[np.bool_], NDArray[np.int64], _Model, _Model, float]:
+    """Settle; return that, an arm that is as its model says, one that is not, and the probability of the latter.
+
+    Of an arm that is not, what the eye seems to have may be, too: there only what is sure is left to the eye.
+    """
+    eye: Collection[str] = EYE
+    while True:
+        progress("hand-eye: sources of the error")
+        pairs = () if quick or used.sum() < MIN_SHARED else (*OVER_TIME, *((name,) for name in eye))
+        guess, used, variances, most = _settled(whole, guess, used, pairs)
+        rows = evenly(np.flatnonzero(used), most)
+        progress("hand-eye: an arm as its model")
+        nominal = _Model.of(whole, guess, rows, variances, quick)
+        if quick:
+            return guess, used, rows, nominal, nominal, 0.0
+        progress("hand-eye: an arm that is not")
+        arms = (DRIFT,) if whole.links is None else (LINKS, (*LINKS, *DRIFT))
+        begins = (variances | dict.fromkeys(arm, 0.0) for arm in arms)
+        other = max((_Model.of(whole, guess, rows, start, quick) for start in begins), key=lambda one: one.evidence)
+        arm_off = float(expit(other.evidence - nominal.evidence + np.log(ARM_OFF / (1 - ARM_OFF))))
+        eye = _sure(off := other.eye_off())
+        if arm_off <= 0.5 or len(eye) == len(off):
+            return guess, used, rows, nominal, other, arm_off
+
+
 def _weighed(
     whole: _Problem, guess: _Guess, used: NDArray[np.bool_], quick: bool, progress: Callable[[str], None]
 ) -> HandEye:
     """Settle, then weigh an arm that is as its model says against one that is not."""
-    progress("hand-eye: sources of the error")
-    guess, used, variances, most = _settled(whole, guess, used, quick)
-    rows = evenly(np.flatnonzero(used), most)
-    progress("hand-eye: an arm as its model")
-    best = nominal = _Model.of(whole, guess, rows, variances, (), quick)
-    arm_off, x, cov, likelihoods = 0.0, nominal.x, nominal.cov, {_said(nominal.linear.sources): nominal.density}
+    guess, used, rows, nominal, other, arm_off = _models(whole, guess, used, quick, progress)
+    best = other if arm_off > 0.5 and len(rows) >= MIN_SHARED else nominal
+    x, cov, likelihoods = nominal.x, nominal.cov, {_said(nominal.linear.sources): nominal.density}
     if not quick:
-        progress("hand-eye: an arm that is not")
-        other = _Model.of_arm(whole, guess, rows, variances)
-        arm_off = float(expit(other.evidence - nominal.evidence + np.log(ARM_OFF / (1 - ARM_OFF))))
-        best = other if arm_off > 0.5 and len(rows) >= MIN_SHARED else nominal
         likelihoods[_said(other.linear.sources)] = other.density
         for said, alone in (("robot", ("flange_m", "flange_rad")), ("camera", ("lateral_m", "depth_m", "seen_rad"))):
-            likelihoods[said] = _Model.of(whole, guess, rows, dict.fromkeys(alone, 0.0), (), True).density
+            likelihoods[said] = _Model.of(whole, guess, rows, dict.fromkeys(alone, 0.0), True).density
         # The arm is used by its model: where its links are not known, the mounting is the one that suits the model.
         suits, suits_left = _suiting(whole, guess, nominal)
         x = arm_off * other.x + (1 - arm_off) * nominal.x if whole.links is not None else suits
@@ -822,18 +837,10 @@ class _Model(Record):
     evidence: float
 
     @staticmethod
-    def of(
-        whole: _Problem,
-        guess: _Guess,
-        rows: NDArray[np.int64],
-        start: dict[str, float],
-        arm: tuple[str, ...],
-        quick: bool,
-    ) -> _Model:
-        """Weigh the sources of ``start`` and those of the arm, ``arm``; ``quick``: without integrating."""
+    def of(whole: _Problem, guess: _Guess, rows: NDArray[np.int64], start: dict[str, float], quick: bool) -> _Model:
+        """Weigh the sources of ``start``, at these variances first where they are not 0; ``quick``: without integrating."""
         few, part = whole.rows(evenly(rows, MAX_VARIANCE)), whole.rows(rows)
-        names = (*start, *arm)
-        estimated, linear = (p.linear(guess, bool(arm), not _CHOSEN.isdisjoint(names)).of(names) for p in (few, part))
+        estimated, linear = (p.linear(guess, start).of(start) for p in (few, part))
         means = few.means(estimated, guess)
         probable = most_probable(estimated, means, {name: v for name, v in start.items() if v > 0})
         solved, P = solve(linear, probable), linear.J.shape[2]
@@ -847,19 +854,6 @@ class _Model(Record):
     def density(self) -> float:
         """Mean logarithm of the probability density of a pose left out."""
         return float(log_density(*left_out(self.solved)).mean())
-
-    @staticmethod
-    def of_arm(whole: _Problem, guess: _Guess, rows: NDArray[np.int64], start: dict[str, float]) -> _Model:
-        """Weigh the sources of ``start`` and the arm's own, a few choices of them, and return the one of most evidence.
-
-        The arm's are its links where they are known, or those and a smooth error; what the eye seems to have may be its.
-        """
-        arms = (DRIFT,) if whole.links is None else (LINKS, (*LINKS, *DRIFT))
-        begins = (start, {name: start[name] for name in start if name not in EYE})[
-            : 1 + (not start.keys().isdisjoint(EYE))
-        ]
-        models = [_Model.of(whole, guess, rows, begin, arm, False) for begin in begins for arm in arms]
-        return max(models, key=lambda model: model.evidence)
 
     def eye_off(self) -> dict[str, tuple[float, float]]:
         """Return the error of each source that is one number of the eye, and its sigma."""

@@ -37,7 +37,7 @@ import numpy as np
 
 from armsight.data import Array
 from armsight.estimate.linear import factor, spread
-from armsight.geometry.pose import adjoint, inverse, small_adjoint
+from armsight.geometry.pose import adjoint, exp_se3, inverse, small_adjoint
 from armsight.geometry.rotation import skew
 from armsight.loop.handeye.poses import Poses
 
@@ -87,14 +87,16 @@ def error_maps(
     axes[:, :3] = np.swapaxes(poses.B[:, :3, :3], 1, 2)  # the rig's axes in the body's
     about = np.zeros((n, 6, 3))
     about[:, :3], about[:, 3:] = skew(poses.centre), np.eye(3)
+    # Where the flange says that it was seen: with the noise of what was, a share of -1 would explain that noise, too.
+    at = (poses.B @ exp_se3(-e if poses.in_hand else e))[:, :3, 3:]
     maps = {
         "flange_m": carry[..., :3],
         "flange_rad": carry[..., 3:],
         "lateral_m": axes[..., :2],
         "depth_m": axes[..., 2:],
         "seen_rad": about,
-        "size": np.concatenate([inverse(poses.B)[:, :3, 3:], np.zeros((n, 3, 1))], axis=1),
-        "focal": axes[..., 2:] * poses.B[:, 2, 3, None, None],
+        "size": axes @ at,
+        "focal": axes[..., 2:] * at[:, 2:],
     }
     if speed is not None:
         maps["time_s"] = carry @ speed[..., None]
