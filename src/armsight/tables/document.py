@@ -68,7 +68,7 @@ def read_document(path: str | Path) -> dict[str, Foreign]:
     """
     document = _only(documents_in(read_bytes(path), path), path)
     if not isinstance(document, Mapping):
-        kind = "nothing" if document is None else f"a {'list' if isinstance(document, list) else 'single value'}"
+        kind = "nothing" if document is None else "a list" if isinstance(document, list) else "text, or a table (CSV)"
         raise InputError(f"{path}: holds {kind}; expected names and values, as YAML, JSON, TOML or INI")
     with naming(path):
         return {str(key): _with_matrices(str(key), value) for key, value in document.items()}

@@ -41,6 +41,7 @@ def images(folder):
 
 
 CHESS = ("--target", "chessboard:9x6:25mm")
+DETECTED = ("--source", "detections:d.csv", "--target", "b.csv", "--cameras", "c.json")
 
 
 def test_the_rendered_rig_is_recovered(rendered):
@@ -279,18 +280,28 @@ def test_a_video_is_named_with_what_to_do(armsight, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "options",
+    ("options", "said"),
     [
-        (),
-        ("--target", "chessboard:9x6:25mm"),
-        ("--source", "pairs:a,b", "--target", "chessboard:9x6:25mm", "--cameras", "c.json"),
-        ("--source", "pairs:a,b", "--target", "chessboard:9x6:25mm", "--refine-body", "d.csv"),
-        ("--source", "detections:d.csv", "--target", "b.csv"),
-        ("--source", "s"),
+        ((), ""),
+        (CHESS, ""),
+        (("--source", "pairs:a,b", *CHESS, "--cameras", "c.json"), "images show the intrinsics"),
+        (("--source", "pairs:a,b", *CHESS, "--refine-body", "d.csv"), "--refine-body goes with detections"),
+        (("--source", "detections:d.csv", "--target", "b.csv"), "need --cameras CAMERAS.json"),
+        ((*DETECTED, "--lens-model", "fisheye"), "--lens-model goes with images"),
+        ((*DETECTED, "--flat-target"), "--flat-target goes with images"),
+        ((*DETECTED, "--alone", "a,b"), "--alone goes with images"),
+        (("--source", "s"), ""),
     ],
 )
-def test_options_that_do_not_go_together(armsight, tmp_path, options):
-    assert_rejected(armsight("calibrate", *options, "-o", tmp_path / "rig.json"))
+def test_options_that_do_not_go_together(armsight, tmp_path, options, said):
+    assert_rejected(armsight("calibrate", *options, "-o", tmp_path / "rig.json"), said)
+
+
+def test_a_table_given_as_cameras_is_named(armsight, tmp_path):
+    table = tmp_path / "joints.csv"
+    table.write_text("pose,q1,q2\n0,0.1,0.2\n")
+    said = armsight("calibrate", *DETECTED[:-1], table, "-o", tmp_path / "rig.json")
+    assert_rejected(said, f"--cameras: {table}: holds text, or a table (CSV)")
 
 
 # Where a real process, or a real file system, matters.

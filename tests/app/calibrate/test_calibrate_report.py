@@ -32,7 +32,9 @@ from armsight.errors import InputError
 from armsight.geometry.pose import inverse, pose, transform
 from armsight.geometry.rotation import exp_so3
 from armsight.vision.calibrate.boards import Pair, calibrate_boards
+from armsight.vision.calibrate.motion import CameraChange
 from armsight.vision.calibrate.result import RejectedPair
+from armsight.vision.calibrate.weak import weaknesses
 from armsight.vision.camera import Camera
 from armsight.vision.markers.board import open_board
 from armsight.vision.rig import StereoRig
@@ -217,6 +219,11 @@ def test_a_given_camera_and_an_unknown_uncertainty_are_said(calibration, tmp_pat
     assert "± " not in text["parameters"].replace("± one sigma", "").replace("± is", "")
     assert text["parameters"].count("given") == given.rig.parameter_count + 1  # and the baseline
     assert "uncertainty of this calibration is unknown" in text["volume"]
+    held = replace(given, deviation_m=0.0, change=CameraChange(3, "", np.zeros((2, 1)), 0.0))
+    assert any("Check the intrinsics that were given" in weak for weak in weaknesses(held))
+    assert any("another --lens-model" in weak for weak in weaknesses(replace(held, rig=calibration.rig)))
+    assert "the body differs" not in str(report_of(held).sections["printed"])
+    assert "the body differs" in str(report_of(calibration).sections["printed"])
 
 
 def test_a_hundred_pairs_and_a_hundred_rejected_ones_still_make_a_page(calibration, tmp_path, undrawn, capsys):

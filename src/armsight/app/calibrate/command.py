@@ -54,11 +54,13 @@ def command(o: CalibrateOptions) -> int:
     """
     images = not o.source.startswith(DETECTIONS)
     if images == (o.cameras is not None):
-        raise InputError("--cameras and --source detections:D.csv belong together; images show the intrinsics")
+        needed = "detections need --cameras CAMERAS.json, the intrinsics"
+        raise InputError("--cameras goes with detections; images show the intrinsics" if images else needed)
     if o.refine_body is not None and images:
         raise InputError("--refine-body goes with detections; a target in images is estimated without it")
-    if o.alone is not None and not images:
-        raise InputError("--alone goes with images of a board")
+    for name, chosen in (("--alone", o.alone), ("--lens-model", o.lens_model), ("--flat-target", o.flat_target)):
+        if chosen and not images:
+            raise InputError(f"{name} goes with images of a board; with detections, --cameras has the lenses")
 
     from armsight.app.calibrate.report import REPORT_FILES, calibration_report
     from armsight.app.calibrate.run import GivenDetections, GivenImages, provenance

@@ -14,6 +14,7 @@ import numpy as np
 from armsight.app.calibrate import figures
 from armsight.app.calibrate.assessment import (
     BEYOND,
+    HELD_M,
     SHARES,
     advice,
     assess,
@@ -268,12 +269,13 @@ def _printed(calibration: Calibration, output: Path, board_file: Path | None, pa
     use = "" if contradicted(c) else f"; to measure it: armsight measure {output} --target {board_file}"
     fit_px = f"{c.epipolar_rms_px:.3f} px" if np.isfinite(c.epipolar_rms_px) else "unknown"
     fitted = "" if c.motion is None else f" ({MOTION_FITTED[0].lower()}{MOTION_FITTED[1:].rstrip('.')})"
+    held, rms_mm = c.deviation_m < HELD_M, 1e3 * c.deviation_m
+    deviation = "" if held else f"; the body differs from its drawing by {rms_mm:.3f} mm RMS"
     lines = [
         plain_text(TextTable(title, ("", ""), rows)),
         f"fit: epipolar {fit_px}, reprojection {c.reprojection_rms_px:.3f} px RMS{fitted}; "
         f"{len(c.pairs)} of {c.pairs_found} pairs; distortion {c.rig.left.model}; corner noise {c.rig.sigma_px:.3f} px",
-        f"baseline {1e3 * c.rig.baseline_m:.2f} mm, convergence {c.rig.convergence_deg:.2f} deg; the body differs from its "
-        f"drawing by {1e3 * c.deviation_m:.3f} mm RMS",
+        f"baseline {1e3 * c.rig.baseline_m:.2f} mm, convergence {c.rig.convergence_deg:.2f} deg{deviation}",
         *([] if c.disc_radius_m is None else [f"radius of the board's discs: {1e3 * c.disc_radius_m:.3f} mm"]),
     ]
     for reason, (first, *more) in itertools.islice(rejected.items(), _LISTED):

@@ -20,7 +20,7 @@ from armsight.app.options import DETECTIONS, SIM
 from armsight.app.progress import bar, steps
 from armsight.app.record.recording import record
 from armsight.data import SIDES, Detections, Shot
-from armsight.errors import CalibrationError, InputError
+from armsight.errors import CalibrationError, InputError, naming
 from armsight.files import natural_key, unused
 from armsight.vision.calibrate import MODELS
 from armsight.vision.calibrate.boards import LEAST_PAIRS, Pair, calibrate_boards, calibrate_recording
@@ -68,7 +68,9 @@ class GivenDetections:
     def calibrated(self) -> Calibration:
         """Read the files, and calibrate."""
         detections, cameras, body = self.files
-        known, pair, refine = load_body_csv(body), read_cameras(cameras), self._options.refine_body is not None
+        with naming("--cameras"):
+            pair = read_cameras(cameras)
+        known, refine = load_body_csv(body), self._options.refine_body is not None
         with steps() as progress:
             shots, folds = read_detections(detections, known), self._options.folds
             return calibrate_bodies(known, shots, pair, refine_body=refine, folds=folds, progress=progress)

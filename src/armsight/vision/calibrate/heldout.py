@@ -223,7 +223,7 @@ def unfinished(solution: BundleSolution) -> tuple[str, ...]:
         return ()
     return (
         f"the adjustment stopped at its last step, {solution.steps}, while still improving: the detections hardly "
-        "determine some parameter; take more pairs, or fix --lens-model",
+        "determine some parameter; take more pairs, or of images fix --lens-model",
     )
 
 
@@ -372,5 +372,5 @@ def _misfits(calibration: Calibration) -> list[str]:
     return [
         f"most pairs fit the {body.name} as it was found worse than the noise of its points allows (a misfit of "
         f"{usual:.1f} is usual; armsight measure says it too, and enlarges its sigmas): images that are not sharp, a "
-        "board that bends between pairs, or lenses that the model cannot express (--lens-model)"
+        "board that bends between pairs, or lenses that the model cannot express (of images: --lens-model)"
     ]

@@ -90,9 +90,11 @@ def _changed(calibration: Calibration) -> str | None:
         return None
     before, after = calibration.pairs[change.row - 1 : change.row + 1]
     if not change.what:
+        given = calibration.rig.cov[0, 0] == 0
+        lens = "Check the intrinsics that were given" if given else "Try another --lens-model"
         return (
             f"the pairs up to {before} and those from {after} on fit other cameras, and their boards stand elsewhere: the "
-            "cameras changed, or the lens model does not fit. Try another --lens-model, and mix near, far, left and right"
+            f"cameras changed, or the lens model does not fit. {lens}, and mix near, far, left and right"
         )
     if change.what.startswith(SIZE):
         return (
