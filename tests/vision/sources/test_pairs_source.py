@@ -159,7 +159,9 @@ def test_files_that_hold_both_images_side_by_side(tmp_path):
         ("S 10", (30, 40), 10, 11),
     ]
     cv2.imwrite(str(tmp_path / "S 1.png"), np.zeros((30, 40), np.uint8))
-    with pytest.raises(InputError, match=r"S 1.png: is 40x30, which is not two images side by side; name the images"):
+    with pytest.raises(
+        InputError, match=r"S 1.png: is 40x30, which is not two images side by side; .* 'pairs:.*/LEFT\*.png,"
+    ):
         FolderSource.open(tmp_path)
 
 

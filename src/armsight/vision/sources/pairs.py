@@ -61,8 +61,8 @@ def halves(file: Path) -> tuple[Image, Image]:
     height, width = image.shape[:2]
     if width % 2 or width < 2 * height:
         raise InputError(
-            f"{file}: is {width}x{height}, which is not two images side by side; name the images of two cameras left* "
-            "and right*"
+            f"{file}: is {width}x{height}, which is not two images side by side; of two cameras name both: --source "
+            f"'pairs:{file.parent}/LEFT*{file.suffix},{file.parent}/RIGHT*{file.suffix}'"
         )
     return np.ascontiguousarray(image[:, : width // 2]), np.ascontiguousarray(image[:, width // 2 :])
 
