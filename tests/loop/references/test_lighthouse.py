@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from armsight.data import Array
-from armsight.errors import CalibrationError
+from armsight.errors import CalibrationError, InputError
 from armsight.geometry.pose import exp_se3
 from armsight.geometry.rotation import exp_so3
 from armsight.loop.references.lighthouse import SLANT, Lighthouse, Sweeps, beginning, follow, sweep_angle, triangulated
@@ -117,6 +117,17 @@ def test_acceleration_is_as_large_as_the_path_shows_and_a_rest_is_one(pace: floa
     e, cov = path.p[k] - _moving(pace * path.t_s[k])[0], path.covariance(k)[:, :3, :3]
     assert np.sqrt((e**2).sum(axis=1).mean()) < (3e-5 if pace < 0.1 else 2e-4)
     assert np.mean(np.einsum("ki,kij,kj->k", e, np.linalg.inv(cov), e)) / 3 < 3
+
+
+@pytest.mark.parametrize("seed", [40, 45])
+def test_three_knots_are_a_path_and_two_are_rejected(seed: int) -> None:
+    true, s, t = _beacons(), _sweeps(_beacons(), 4.0, seed, 0.0, 0.0), 1.0 + np.arange(3) / 40
+    known, s = replace(true, cov=0 * true.cov), s.rows((s.t_s >= t[0]) & (s.t_s <= t[-1]))
+    p, R = _moving(0.0 * t)
+    e = follow(known, s, t, p, R).p - p
+    assert np.abs(e).max() < 5e-4
+    with pytest.raises(InputError, match="lighthouse: 2 knots were given; a path needs three at least"):
+        follow(known, s, t[:2], p[:2], R[:2])
 
 
 def test_a_point_triangulated_from_beacons_has_an_honest_covariance() -> None:
