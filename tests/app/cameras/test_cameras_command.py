@@ -43,12 +43,9 @@ def test_structures_are_read_as_the_kernel_lays_them_out():
 
 def test_requests_carry_the_size_of_their_structure():
     """_IOC packs direction, size, 'V' and number: the size must be that of the buffer handed over."""
-    for request, size in (
-        (cameras.V4l2.QUERYCAP, 104),
-        (cameras.V4l2.ENUM_FMT, 64),
-        (cameras.V4l2.ENUM_FRAMESIZES, 44),
-        (cameras.V4l2.ENUM_FRAMEINTERVALS, 52),
-    ):
+    sizes = {"QUERYCAP": 104, "ENUM_FMT": 64, "QUERYCTRL": 68, "ENUM_FRAMESIZES": 44, "ENUM_FRAMEINTERVALS": 52}
+    assert sizes.keys() == {request.name for request in cameras.V4l2Request}
+    for request, size in ((cameras.V4l2Request[name], size) for name, size in sizes.items()):
         assert (request >> 16) & 0x3FFF == size
         assert (request >> 8) & 0xFF == ord("V")
 
@@ -62,11 +59,11 @@ class Driver:
     def __call__(self, device, request, asked):
         assert len(asked) == (request >> 16) & 0x3FFF
         answer = {
-            cameras.V4l2.QUERYCAP: self.query,
-            cameras.V4l2.ENUM_FMT: self.formats,
-            cameras.V4l2.ENUM_FRAMESIZES: self.sizes,
-            cameras.V4l2.ENUM_FRAMEINTERVALS: self.rates,
-            cameras.V4l2.QUERYCTRL: self.controls,
+            cameras.V4l2Request.QUERYCAP: self.query,
+            cameras.V4l2Request.ENUM_FMT: self.formats,
+            cameras.V4l2Request.ENUM_FRAMESIZES: self.sizes,
+            cameras.V4l2Request.ENUM_FRAMEINTERVALS: self.rates,
+            cameras.V4l2Request.QUERYCTRL: self.controls,
         }[request](asked)
         if answer is None:
             raise OSError(errno.EINVAL, os.strerror(errno.EINVAL))
@@ -120,7 +117,7 @@ def test_formats_sizes_and_rates_are_asked_for_one_by_one():
 
 def test_a_driver_without_lists_has_no_sizes():
     def poor(device, request, asked):
-        if request != cameras.V4l2.ENUM_FMT:
+        if request != cameras.V4l2Request.ENUM_FMT:
             raise OSError(errno.ENOTTY, "no such request")
         return Driver()(device, request, asked)
 

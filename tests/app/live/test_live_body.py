@@ -24,7 +24,7 @@ def test_the_board_in_view_is_used_unless_one_was_named(named, tmp_path):
     shared = Shared(SessionOptions(tmp_path, calibration_board=named), tmp_path, lambda level, text: said.append(text))
     step = BoardStep(shared, named or "chessboard:9x6:20mm", lambda rig, path: None)
     other, empty = chessboard(8, 5), np.full((360, 480), 200, np.uint8)
-    looks = iter(np.arange(20) * (body.AGAIN_S + 1e9))
+    looks = iter(np.arange(20) * (body._LOOK_S + 1e9))
 
     def look(left, right):
         for _ in range(2):  # one look alone may catch a board that is being moved

@@ -52,7 +52,7 @@ class Cable:
 
 @pytest.fixture
 def cable(monkeypatch):
-    monkeypatch.setattr(module, "AGAIN_S", 0.05)
+    monkeypatch.setattr(module, "_REOPEN_S", 0.05)
     return Cable()
 
 

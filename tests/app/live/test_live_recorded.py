@@ -12,7 +12,7 @@ from waiting import until
 
 def test_any_column_of_any_table_in_the_folder_is_drawn_and_any_row_shown(tmp_path, monkeypatch):
     said, count = [], 2 * MOST_POINTS + 100
-    monkeypatch.setattr(recorded, "AGAIN_S", 0.0)
+    monkeypatch.setattr(recorded, "_LOOK_S", 0.0)
     (tmp_path / "run").mkdir()
     rows = [f"{k},{k / 10},{'' if k == 3 else np.sin(k)},ok" for k in range(count)]
     (tmp_path / "run/vision.csv").write_text("\n".join(["shot,t_s,x_m,status", *rows]) + "\n")

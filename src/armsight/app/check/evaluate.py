@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from armsight.app.check import MANY
+from armsight.app.check import DRIFT_CYCLES
 from armsight.app.check.result import CheckResult, CircleResult, DistanceResult, DriftResult, Jump, WorkspaceResult
 from armsight.app.check.rows import SAME_M, TESTS, Attained, Reversal, Row, first_few, read_rows
 from armsight.app.check.run_folder import attained_in
@@ -23,6 +23,13 @@ from armsight.loop.iso9283.statistic import Metric
 
 #: An outlier is further from the median position than so many median distances; smaller names more rows.
 _OUTLIER_RATIO = 12.0
+#: Rows of a pose that is searched for outliers; half: the median of few names good rows, double: few tests are searched.
+_OUTLIER_ROWS = 10
+#: m; the median distance counts as this at least: rows that agree to the last digit make no other an outlier; half: one
+#: off by 0.06 mm is named, double: one off by 0.2 mm is not.
+_OUTLIER_LEAST_M = 1e-5
+#: Poses that give errors over the workspace without a repeatability; half: a corner passes for it, double: few tests do.
+_WIDE_POSES = 10
 
 
 def read_check(path: Path, *, closed: bool = False, columns: str | None = None) -> Attained:
@@ -60,7 +67,7 @@ def evaluate(attained: Attained) -> CheckResult:
 def _seldom(rows: list[Row]) -> tuple[str, WorkspaceResult | None]:
     """Return why rows of which none repeats are too few, or what many poses say of the workspace."""
     counts = Counter(row.pose for row in rows)
-    if len(counts) < MANY:
+    if len(counts) < _WIDE_POSES:
         most, few = max(counts.values()), iso9283.MIN_POSES
         return f"of {len(counts)} poses none was attained {few} times, the most {most}: no repeatability", None
     p, p_ref, cov, common = _stacked(rows)
@@ -107,7 +114,7 @@ def _drift(often: dict[str, list[Row]]) -> DriftResult | None:
     """Return the drift of the first pose; None where too few of its rows have a time."""
     name, rows = next(iter(often.items()), ("", []))
     timed = [row for row in rows if row.t_s is not None]
-    if len(timed) < MANY:
+    if len(timed) < DRIFT_CYCLES:
         return None
     return DriftResult(name, *iso9283.drift(np.array([row.t_s for row in timed]), _stacked(timed).p))
 
@@ -115,12 +122,12 @@ def _drift(often: dict[str, list[Row]]) -> DriftResult | None:
 def _outliers(rows: list[Row]) -> list[str]:
     p = _stacked(rows).p
     away = np.linalg.norm(p - np.median(p, axis=0), axis=1)
-    usual = max(float(np.median(away)), SAME_M)  # rows that agree to the last digit make no other an outlier
+    usual = max(float(np.median(away)), _OUTLIER_LEAST_M)
     return [
         f"{row.pose}, {f'cycle {row.cycle}' if row.cycle else f'row {n + 1} of it'}: {1e3 * off:.2f} mm from the middle of "
         f"them all, half of which are within {1e3 * usual:.2f} mm of it; it counts, unless you take it out"
         for n, (row, off) in enumerate(zip(rows, away, strict=True))
-        if len(rows) >= MANY and off > _OUTLIER_RATIO * usual
+        if len(rows) >= _OUTLIER_ROWS and off > _OUTLIER_RATIO * usual
     ]
 
 

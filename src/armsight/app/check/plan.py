@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from armsight.app.check import CYCLES, MANY, REQUIRED_CYCLES
+from armsight.app.check import CYCLES, DRIFT_CYCLES, REQUIRED_CYCLES
 from armsight.app.run.motion_file import motion_text, read_motions
 from armsight.data import Array
 from armsight.errors import InputError
@@ -56,7 +56,7 @@ class PlannedTest(NamedTuple):
             lost += "repeatability, distance and drift" if poses else "and no repeatability"
         else:
             lost = "the intervals of repeatability will be wide (docs/howto/iso9283.md)"
-            lost += f", and drift needs {MANY} cycles" if poses and self.cycles < MANY else ""
+            lost += f", and drift needs {DRIFT_CYCLES} cycles" if poses and self.cycles < DRIFT_CYCLES else ""
         return [f"{self.cycles} of the {required} cycles that ISO 9283 requires: {lost}"]
 
 

@@ -21,7 +21,6 @@ from typing import Any
 
 import numpy as np
 
-from armsight.app.check import MANY
 from armsight.app.check.rows import SAME_M, Attained, Reversal, Row, first_few
 from armsight.app.run.report import VERSION
 from armsight.app.run.tracks import ToolTrack, read_track
@@ -38,9 +37,13 @@ from armsight.tables.columns import Columns
 WINDOW_S = 0.3
 #: A rest is evaluated that was seen in this many shots, a path at so many path points.
 _REST_SHOTS, _PATH_POINTS = 3, 40
-#: Paths whose first, middle and last positions are this near to each other are one path, m; its direction is taken so far
-#: to either side.
+#: A path is evaluated that was seen in this many shots; half: its middle is interpolated, double: fast paths are left out.
+_PATH_SHOTS = 10
+#: Paths whose first, middle and last positions are this near to each other are one path, m; half: commands
+#: rounded to 0.1 mm part cycles of one path, double: paths 0.2 mm apart are one.
 _SAME_M = 1e-4
+#: m; a path's direction is taken so far to either side of a point; half, double: nothing.
+_AHEAD_M = 1e-4
 #: A circle is whole from this angle on, rad.
 _WHOLE_RAD = 2 * np.pi * 0.999
 #: Between two shots further apart than this many path points the path was not seen: the cycle is left out.
@@ -266,8 +269,8 @@ def _paths(segments: list[PathSegment], noise: Noise) -> tuple[list[Row], set[st
     for segment in segments:
         if segment.kind not in ("line", "circle"):
             continue
-        if len(segment.seen) < MANY:
-            notes.append(f"left out: {segment.name}, seen in {len(segment.seen)} shots; {MANY} are needed")
+        if len(segment.seen) < _PATH_SHOTS:
+            notes.append(f"left out: {segment.name}, seen in {len(segment.seen)} shots; {_PATH_SHOTS} are needed")
             continue
         ends = _ends(segment)
         same = (g for g in groups if g[0].kind == segment.kind and np.abs(_ends(g[0]) - ends).max() < _SAME_M)
@@ -311,7 +314,7 @@ def _path(name: str, group: list[PathSegment], noise: Noise, notes: list[str]) -
         was = segment.seen.Ts_base_tool[:, :3, 3]
         s = np.interp(segment.seen.t_s - segment.reference.t_s[0], since, gone)
         for _ in range(4):  # to the foot of the perpendicular: the time of the shot has no effect
-            ahead = on(s + _SAME_M) - on(s - _SAME_M)
+            ahead = on(s + _AHEAD_M) - on(s - _AHEAD_M)
             ahead /= np.maximum(np.linalg.norm(ahead, axis=1), 1e-12)[:, None]
             s = np.clip(s + ((was - on(s)) * ahead).sum(axis=1), 0.0, gone[-1])
         s, first = np.unique(s, return_index=True)

@@ -13,7 +13,7 @@ from armsight.app.body.check import assess
 from armsight.app.body.draw import draw_body, is_board_spec
 from armsight.app.body.text import body_report
 from armsight.app.live.calibration import CalibrationStep
-from armsight.app.live.capture import AGAIN_S, LiveShot
+from armsight.app.live.capture import LiveShot
 from armsight.app.live.measuring import MeasureStep
 from armsight.app.live.records import asked
 from armsight.app.live.step import PageStep, S, Shared
@@ -27,6 +27,7 @@ from armsight.vision.rig import StereoRig
 
 _DISTANCES_M = (0.6, 0.8, 1.2)
 _BAR_MM = 100.0  # the bar on a drawing
+_LOOK_S = 2.0  # between two searches for an unknown board; half: one core is busy with it, double: a person waits
 
 
 class _Drawn(PageStep[S]):
@@ -92,7 +93,7 @@ class BoardStep(_Drawn[BoardChoice]):
     def look(self, live: LiveShot) -> None:
         """Find out which board both cameras show, and use it where nobody named one. Called from one thread."""
         left, right = live.shot.left, live.shot.right
-        if left is None or right is None or live.arrived_s - self._looked_s < AGAIN_S:
+        if left is None or right is None or live.arrived_s - self._looked_s < _LOOK_S:
             return
         boards = [board_in_view(grey(image)) for image in (left, right)]
         self._looked_s = time.monotonic()

@@ -19,7 +19,7 @@ import numpy as np
 
 from armsight.app.calibrate.assessment import advice, assess, graded_metrics
 from armsight.app.calibrate.run import provenance
-from armsight.app.live.capture import AGAIN_S, LiveShot
+from armsight.app.live.capture import LiveShot
 from armsight.app.live.records import Drawn, asked, dots, polyline
 from armsight.app.live.step import Guided, GuidedState, Shared
 from armsight.app.record.recording import ShotFolder
@@ -56,6 +56,8 @@ _QUICK_MODELS = ("brown5",)
 CELLS = (8, 5)
 #: Longest side of the images in which a board is looked for quickly.
 _QUICK_SIDE_PX, _QUICKER_SIDE_PX = 640, 360
+#: s between two thorough searches for a board not seen quickly; half: shots are dropped, double: a far board waits.
+_THOROUGH_S = 2.0
 _SHOW, _GOOD = "Hold the board so that both cameras see all of it.", "Good."
 _ASKS = "Good enough. Finish, or go on?"
 Sizes = tuple[tuple[int, int], tuple[int, int]]
@@ -209,7 +211,7 @@ class CalibrationStep(Guided[CalibrationState]):
         if not self.shown.running or shot.left is None or shot.right is None:
             return
         images = grey(shot.left), grey(shot.right)
-        late = now_s - self._thorough_s > AGAIN_S
+        late = now_s - self._thorough_s > _THOROUGH_S
         self._thorough_s = now_s if late else self._thorough_s
         were = _sees(self._recent[-1][1]) if self._recent else (False, False)
         left, right = (quick_look(self.board, i, thorough=late or was) for i, was in zip(images, were, strict=True))

@@ -18,9 +18,8 @@ from armsight.errors import ArmsightError
 from armsight.vision.source import LIVE_S
 from armsight.vision.sources import Source
 
-#: s between two tries of what is slow or rarely changes: opening cameras, searching an unknown board; half: a core is busy,
-#: double: a person waits.
-AGAIN_S = 2.0
+#: s between two tries of opening cameras; half: a core is busy, double: a person waits.
+_REOPEN_S = 2.0
 _UNTIMED_S, _LONGEST_PAUSE_S = 0.1, 1.0  # between shots of a recording without times; at most
 
 
@@ -156,4 +155,4 @@ class CameraCapture:
         self.problem = problem
         self._intervals.clear()
         self._idle.set()
-        self._ended.wait(AGAIN_S)
+        self._ended.wait(_REOPEN_S)

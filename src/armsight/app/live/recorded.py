@@ -8,7 +8,6 @@ import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from armsight.app.live.capture import AGAIN_S
 from armsight.app.live.records import asked
 from armsight.app.live.step import PageStep, Shared
 from armsight.errors import InputError
@@ -17,6 +16,7 @@ from armsight.files import is_long, long_rows, read_table
 MOST_FILES = 60  # newest tables that are listed; half: of many runs the first are missing, double: a long list
 MOST_POINTS = 1000  # of a curve on the page; half: short events are missed, double: a slow page
 _MOST_ROWS = 20_000  # of a long table; half: the slider is coarse, double: twice the memory
+_LOOK_S = 2.0  # between two looks for new files; half, double: nothing
 TIMES = ("t_s", "time_s")  # columns that are times, s; the first there is goes across
 
 
@@ -73,7 +73,7 @@ class RecordedStep(PageStep[RecordedState]):
 
     def now(self) -> RecordedState:
         """Return what is shown, with the files that have come meanwhile."""
-        if time.monotonic() - self._looked_s > AGAIN_S:
+        if time.monotonic() - self._looked_s > _LOOK_S:
             self._looked_s = time.monotonic()
             self.show(files=self._files())
         shown = self.shown

@@ -32,7 +32,8 @@ PAPER, INK, MUTED, RED, _PALE = map(bgr, ("#ffffff", plotting.INK, plotting.MUTE
 BLANK = 200  # grey value where there is no image
 LINE = 24  # height of a line of text, px
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
-#: OpenCV takes coordinates in sixteenths of a pixel; points further away, px, are not drawn, nor residuals enlarged more.
+#: OpenCV takes coordinates in sixteenths of a pixel; points further away, px, are not drawn; half,
+#: double: nothing, no canvas is a tenth as large.
 _SHIFT, _FAR = 4, 1e5
 _SPELT = str.maketrans({"±": "+-", "…": "...", "°": " deg", "σ": "sigma", "µ": "u", "×": "x"})
 
@@ -48,6 +49,8 @@ _MIDDLE = np.full(2, (_TILE - 1) / 2)
 _ALL, _WORST = 12, 6
 #: Enlargement of a detail; less where its disc would not fit; arms of a cross in an image, px.
 _ZOOM, _CROSS_PX = 8.0, 3.0
+#: Enlargement of a residual at the most; half: residuals below 8e-4 px are drawn shorter, double: below 2e-4 px.
+_MOST = 1e5
 #: Length of the longest residual, px of the picture: in an enlarged detail, where sigma counts as well, and in the images.
 _REACH, _LONGEST = 0.42 * _TILE, 40.0
 _RIM, _CROSS, _ARROW, _SIGMA = (255, 200, 40), (70, 220, 70), (30, 110, 255), (235, 70, 225)
@@ -313,7 +316,7 @@ class _Panel:
 def _factor(lengths: Array, reach: float) -> float:
     """Return a round factor that makes the longest of lengths at most ``reach``; 1 where all are zero."""
     longest = float(np.nan_to_num(lengths).max(initial=0.0))
-    return nice(min(reach / longest, _FAR)) if longest > 0 else 1.0
+    return nice(min(reach / longest, _MOST)) if longest > 0 else 1.0
 
 
 def _details(marks: Marks, shown: list[int], panels: list[_Panel], in_images: float) -> list[Canvas]:

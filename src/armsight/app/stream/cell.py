@@ -30,7 +30,7 @@ from armsight.app.stream.datum import Published, json_text
 from armsight.app.stream.outbox import Outbox, state_folder
 from armsight.app.stream.sink import CLOSE_S, Sink
 from armsight.data import Array, PoseEstimate, Shot
-from armsight.errors import NAMED, InputError
+from armsight.errors import InputError
 from armsight.files import as_input_error
 from armsight.loop.running.data import Datum, NoteDatum, ShotDatum
 from armsight.vision.rig import StereoRig
@@ -52,6 +52,7 @@ _SIDE_PX, _JPEG = 480, 70
 #: s between two shots that are kept for who asks, how many are (7 kB each), and for how many s after a question; half:
 #: gaps where a page asks once a second, double: twice the work while somebody looks.
 _SHOT_S, _SHOTS, _ASKED_S = 0.2, 5, 10.0
+_FINDINGS = 5  # that a state names at most; half: less is seen at once, double: a state of 2 kB
 #: Times the rig's held-out error that is a limit; half: good cells are yellow, double: bad ones are not.
 _LIMIT = 3.0
 
@@ -183,7 +184,7 @@ class CellSink(Sink):
         state |= window.state()
         state["rate_hz"] = round(window.shots / max(now - self._state_at, 1e-3), 2)
         state["temperature_c"] = None if celsius is None else round(float(celsius.max()), 1)
-        state["health"] = [each[:300] for each in self._findings[:NAMED]]
+        state["health"] = [each[:300] for each in self._findings[:_FINDINGS]]
         self._window, self._state_at = _Window(), now
         if self._session is not None:
             # No declared publisher: with access control it would drop all (zenoh 1.10; findings/zenoh_acl_subscriber.sh).

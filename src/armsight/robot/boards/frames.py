@@ -11,7 +11,7 @@ from armsight.robot.boards import headers
 JOINTS, WIRE_BYTES = headers.number("JOINTS"), headers.number("FRAME_BYTES")  # most bytes either way in one tick
 REQUEST_MAGIC, ANSWER_MAGIC, VERSION = (headers.number(f"FRAME_{name}") for name in ("REQUEST", "ANSWER", "VERSION"))
 #: What a request may do before its tick.
-RESTART_POWER, RESTART_WATCHDOG = range(1, 3)
+RESTART_POWER, RESTART_WATCHDOG = 1, 2
 REQUEST, OUTPUTS, ANSWER = (headers.record(name) for name in ("pil_request", "core_outputs", "pil_answer"))
 
 

@@ -83,6 +83,9 @@ _LAYOUTS = (
 )
 #: Weights of the benchmark's third version: these of its training scenes count half, for they are very hard.
 _HALF = {"pianol", "playroom", "playtable", "shelves", "vintage"}
+#: Scale of the truth of the 2001 scenes, of Tsukuba, and by the width of a full-size image, px, of the others' layouts;
+#: half, double: wrong disparities.
+_SCALE_2001, _SCALE_TSUKUBA, _WIDTH_2003, _WIDTH_2006 = 8.0, 16.0, 1800, 1240
 _OF_2001 = {"sawtooth", "venus", "bull", "poster", "barn1", "barn2", "map"}
 
 
@@ -115,10 +118,10 @@ def _files(folder: Path) -> tuple[Path, Path, Path] | None:
 def _scale(name: str, truth: Path, width: int) -> float:
     """Return what an 8-bit truth is to be divided by: as often as an image is smaller than its layout has them."""
     if truth.stem == "disp3":
-        return 16.0
+        return _SCALE_TSUKUBA
     if name.lower() in _OF_2001:
-        return 8.0
-    return float(max(1, round((1240 if truth.stem == "disp1" else 1800) / width)))  # of 2005 and 2006, of 2003
+        return _SCALE_2001
+    return float(max(1, round((_WIDTH_2006 if truth.stem == "disp1" else _WIDTH_2003) / width)))
 
 
 def _read_truth(path: Path, name: str) -> Array:

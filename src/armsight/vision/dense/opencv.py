@@ -12,6 +12,8 @@ from armsight.vision.dense.method import Disparity, Search
 from armsight.vision.dense.postprocess import SigmaModel, finished
 from armsight.vision.dense.winner import Singles, Winners
 
+#: What OpenCV's samples recommend: a window, px; penalties of a slant and of a jump a pixel of it; a uniqueness, %.
+_WINDOW, _P1, _P2, _UNIQUENESS = 3, 8, 32, 10
 #: See postprocess.py.
 _SIGMA_MODEL = SigmaModel(0.36)
 
@@ -34,8 +36,7 @@ class OpenCV:
         """
         count = -(-search.count // 16) * 16
         wide = [cv2.copyMakeBorder(i, 0, 0, search.first + count, 0, cv2.BORDER_REPLICATE) for i in (left, right)]
-        # OpenCV's samples recommend penalties of 8 and 32 a pixel of the window, and a uniqueness of 10 %.
-        recommended = {"blockSize": 3, "P1": 8 * 3**2, "P2": 32 * 3**2, "disp12MaxDiff": 1, "uniquenessRatio": 10}
-        matcher = cv2.StereoSGBM.create(search.first, count, **recommended)
+        area = _WINDOW**2
+        matcher = cv2.StereoSGBM.create(search.first, count, _WINDOW, _P1 * area, _P2 * area, 1, 0, _UNIQUENESS)
         found = matcher.compute(*wide)[:, search.first + count :]
         return np.ascontiguousarray(found.astype(np.float32) / 16)

@@ -31,10 +31,12 @@ from armsight.vision.markers.marker import Target
 from armsight.vision.match import gate, join, match
 from armsight.vision.pose.assign import instances, plain
 from armsight.vision.pose.locate import locate
-from armsight.vision.pose.pnp import MIN_POINTS
 from armsight.vision.rig import StereoRig
 from armsight.vision.triangulate import triangulate
 
+#: Fewest common points with which exchanged cameras are distinguishable from bad detections; half: two fit by chance,
+#: double: small bodies are not checked.
+_EXCHANGED_POINTS = 4
 #: A given radius of a board's discs that differs from the images' by more than this share, and by more than so many px (a
 #: rim blurred by 1.5 px moves by 0.7 with sRGB's tone curve, by 0.6 in saturation), is a mistake. Half: true radii of discs
 #: of 5 px are rejected; double: a radius 30 % wrong passes for discs of 4 px.
@@ -162,7 +164,7 @@ def measure_detections(
 def _exchanged(rig: StereoRig, body: Body, left: Detections, right: Detections) -> bool:
     """Whether the detections fit the rig only with the cameras exchanged."""
     common = join(left, right)
-    if common.paired.sum() < MIN_POINTS:
+    if common.paired.sum() < _EXCHANGED_POINTS:
         return False
     exchanged = triangulate(rig, body, gate(rig, body, join(right, left)))
     return len(exchanged.ids) > 0.8 * int(common.paired.sum())

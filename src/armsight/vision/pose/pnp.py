@@ -16,7 +16,7 @@ from armsight.geometry.pose import pose, transform
 from armsight.vision.camera import Camera
 from armsight.vision.pose.posefit import PixelObservations, fit_pose
 
-#: Fewest points that have one pose, and with which exchanged cameras are distinguishable from bad detections.
+#: Fewest points that have one pose: three have up to four.
 MIN_POINTS = 4
 
 

@@ -28,7 +28,7 @@ from armsight.errors import DeviceError, InputError
 from armsight.vision.image import jpeg_in
 from armsight.vision.source import Source
 from armsight.vision.sources.capture import STALL_S, QuietCapture, Rhythm, allowed_skew, open_capture
-from armsight.vision.sources.v4l2 import EXPOSURE_UNIT_MS, V4l2
+from armsight.vision.sources.v4l2 import EXPOSURE_UNIT_MS, ExposureMode
 
 _QUEUE = 4  # frames OpenCV's V4L2 lets the driver queue
 _CATCH_UP = 30  # grabs after which two cameras that never come close in time are given up
@@ -207,11 +207,11 @@ def parsed_usb(rest: str) -> tuple[list[str], Settings]:
     if fps:
         settings[cv2.CAP_PROP_FPS] = (f"{fps} frames per second", float(fps))
     if exposure[1]:
-        settings[cv2.CAP_PROP_AUTO_EXPOSURE] = (f"manual exposure ({V4l2.EXPOSURE_MANUAL})", V4l2.EXPOSURE_MANUAL)
+        settings[cv2.CAP_PROP_AUTO_EXPOSURE] = (f"manual exposure ({ExposureMode.MANUAL})", ExposureMode.MANUAL)
         units = round(float(exposure[1]) / EXPOSURE_UNIT_MS)
         settings[cv2.CAP_PROP_EXPOSURE] = (f"exposure {units} (x {EXPOSURE_UNIT_MS} ms)", units)
     elif asked:
-        settings[cv2.CAP_PROP_AUTO_EXPOSURE] = (f"automatic exposure ({V4l2.EXPOSURE_AUTO})", V4l2.EXPOSURE_AUTO)
+        settings[cv2.CAP_PROP_AUTO_EXPOSURE] = (f"automatic exposure ({ExposureMode.AUTO})", ExposureMode.AUTO)
     if gain:
         settings[cv2.CAP_PROP_GAIN] = (f"gain {gain}", float(gain))
     return devices, settings

@@ -24,23 +24,44 @@ EXPOSURE_UNIT_MS = 0.1
 Ioctl = Callable[[int, int, bytes], bytes]
 
 
-class V4l2(enum.IntEnum):
-    """Numbers of videodev2.h and v4l2-controls.h; a request, _IOWR('V', n, struct ...), says how many bytes it takes."""
+@enum.unique
+class V4l2Request(enum.IntEnum):
+    """Requests of videodev2.h, _IOWR('V', n, struct ...); each says how many bytes it takes."""
 
     QUERYCAP = 0x80685600
     ENUM_FMT = 0xC0405602
     QUERYCTRL = 0xC0445624
     ENUM_FRAMESIZES = 0xC02C564A
     ENUM_FRAMEINTERVALS = 0xC034564B
+
+
+@enum.unique
+class Control(enum.IntEnum):
+    """Controls of v4l2-controls.h."""
+
     EXPOSURE = 0x009A0902
-    EXPOSURE_MANUAL = 1  # values of auto_exposure
-    EXPOSURE_AUTO = 3  # aperture priority mode
     GAIN = 0x00980913
-    DISABLED = 0x0001  # a flag of a control
+
+
+@enum.unique
+class ExposureMode(enum.IntEnum):
+    """Values of the control auto_exposure."""
+
+    MANUAL = 1
+    AUTO = 3  # aperture priority mode
+
+
+@enum.unique
+class Capability(enum.IntFlag):
+    """What a device can do; DEVICE_CAPS: its own capabilities are given beside the driver's."""
+
     CAPTURE = 0x00000001
     DEVICE_CAPS = 0x80000000
-    BUF_TYPE_VIDEO_CAPTURE = 1
-    DISCRETE = 1  # kind of a size and of an interval
+
+
+_DISABLED = 0x0001  # V4L2_CTRL_FLAG_DISABLED
+_BUF_TYPE_VIDEO_CAPTURE = 1
+_DISCRETE = 1  # V4L2_FRMSIZE_TYPE_DISCRETE, V4L2_FRMIVAL_TYPE_DISCRETE
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,8 +104,8 @@ class VideoDevice:
 def capability(buffer: bytes) -> tuple[str, str, str, bool]:
     """Read struct v4l2_capability: driver, card, bus, and whether this device delivers images."""
     driver, card, bus, _, capabilities, device = struct.unpack_from("=16s32s32sIII", buffer)
-    mine = device if capabilities & V4l2.DEVICE_CAPS else capabilities
-    return _text(driver), _text(card), _text(bus), bool(mine & V4l2.CAPTURE)
+    mine = device if capabilities & Capability.DEVICE_CAPS else capabilities
+    return _text(driver), _text(card), _text(bus), bool(mine & Capability.CAPTURE)
 
 
 def pixel_format(buffer: bytes) -> tuple[str, str]:
@@ -96,26 +117,28 @@ def pixel_format(buffer: bytes) -> tuple[str, str]:
 def frame_size(buffer: bytes) -> tuple[int, int, tuple[int, int] | None]:
     """Read struct v4l2_frmsizeenum: width and height, px, and where sizes go in steps the smallest."""
     kind, *n = struct.unpack_from("=8x7I", buffer)
-    return (n[0], n[1], None) if kind == V4l2.DISCRETE else (n[1], n[4], (n[0], n[3]))
+    return (n[0], n[1], None) if kind == _DISCRETE else (n[1], n[4], (n[0], n[3]))
 
 
 def frame_rates(buffer: bytes) -> tuple[float, ...]:
     """Read struct v4l2_frmivalenum: frames per second; where they go in steps the slowest and the fastest."""
     kind, *n = struct.unpack_from("=16x5I", buffer)
-    intervals = [n[0:2]] if kind == V4l2.DISCRETE else [n[2:4], n[0:2]]
+    intervals = [n[0:2]] if kind == _DISCRETE else [n[2:4], n[0:2]]
     return tuple(round(below / above, 3) for above, below in intervals if above)
 
 
 def describe(device: int, ioctl: Ioctl) -> tuple[Format, ...]:
     """Ask an open device for its formats, sizes and frame rates."""
     formats = []
-    for found in _each(device, ioctl, V4l2.ENUM_FMT, struct.Struct("=2I56x"), V4l2.BUF_TYPE_VIDEO_CAPTURE):
+    for found in _each(device, ioctl, V4l2Request.ENUM_FMT, struct.Struct("=2I56x"), _BUF_TYPE_VIDEO_CAPTURE):
         fourcc, description = pixel_format(found)
         code = fourcc.ljust(4).encode("latin1")
         sizes = []
-        for size in _each(device, ioctl, V4l2.ENUM_FRAMESIZES, struct.Struct("=I4s36x"), code):
+        for size in _each(device, ioctl, V4l2Request.ENUM_FRAMESIZES, struct.Struct("=I4s36x"), code):
             width, height, smallest = frame_size(size)
-            rates = _each(device, ioctl, V4l2.ENUM_FRAMEINTERVALS, struct.Struct("=I4s2I36x"), code, width, height)
+            rates = _each(
+                device, ioctl, V4l2Request.ENUM_FRAMEINTERVALS, struct.Struct("=I4s2I36x"), code, width, height
+            )
             sizes.append(Size(width, height, tuple(fps for rate in rates for fps in frame_rates(rate)), smallest))
         formats.append(Format(fourcc, description, tuple(sizes)))
     return tuple(formats)
@@ -124,11 +147,11 @@ def describe(device: int, ioctl: Ioctl) -> tuple[Format, ...]:
 def control_range(device: int, ioctl: Ioctl, control: int, unit: float = 1.0) -> tuple[float, float] | None:
     """Ask an open device for the smallest and the largest value of a control; None where it has none, or it is disabled."""
     try:
-        answer = ioctl(device, V4l2.QUERYCTRL, struct.pack("=I64x", control))
+        answer = ioctl(device, V4l2Request.QUERYCTRL, struct.pack("=I64x", control))
     except OSError:
         return None
     low, high, _, _, flags = struct.unpack_from("=40x4iI", answer)
-    return None if flags & V4l2.DISABLED else (round(low * unit, 6), round(high * unit, 6))
+    return None if flags & _DISABLED else (round(low * unit, 6), round(high * unit, 6))
 
 
 def find_cameras(sys: Path = Path("/sys/class/video4linux"), dev: Path = Path("/dev")) -> list[VideoDevice]:
@@ -146,11 +169,11 @@ def find_cameras(sys: Path = Path("/sys/class/video4linux"), dev: Path = Path("/
             cameras.append(dataclasses.replace(entry, problem=_why(error)))
             continue
         try:
-            driver, card, bus, captures = capability(_ioctl(handle, V4l2.QUERYCAP, bytes(104)))
+            driver, card, bus, captures = capability(_ioctl(handle, V4l2Request.QUERYCAP, bytes(104)))
             if captures:
                 entry = dataclasses.replace(entry, name=card, driver=driver, bus=bus, formats=describe(handle, _ioctl))
-                exposure_ms = control_range(handle, _ioctl, V4l2.EXPOSURE, EXPOSURE_UNIT_MS)
-                gain = control_range(handle, _ioctl, V4l2.GAIN)
+                exposure_ms = control_range(handle, _ioctl, Control.EXPOSURE, EXPOSURE_UNIT_MS)
+                gain = control_range(handle, _ioctl, Control.GAIN)
                 cameras.append(dataclasses.replace(entry, exposure_ms=exposure_ms, gain=gain))
         except OSError as error:
             cameras.append(dataclasses.replace(entry, problem=_why(error)))
