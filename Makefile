@@ -59,6 +59,7 @@ bench: $(VENV)/.armsight-test  ## every figure, peers beside, ends with 1 where 
 
 # The firmware is built with the package, with zig from PyPI; ARMSIGHT_FIRMWARE_COMPILER=gcc asks for arm-none-eabi-gcc.
 $(VENV)/.armsight: pyproject.toml setup.py $(shell find firmware -type f)
+	@echo "installs packages, compiles kernels and firmware: some minutes without a word"
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --compile --disable-pip-version-check -e ".[sim,record]"
 	touch $@
