@@ -1,6 +1,6 @@
 """The next process of a service: it has imported what ``armsight measure`` needs, and waits for a line with its arguments.
 
-Imports are most of what a start takes (0.6 of 0.7 s of processor time), and far more on a busy computer.
+Imports are most of what a start takes (0.65 of 1.1 s of processor time until the first shot), and more on a busy computer.
 """
 
 import json
