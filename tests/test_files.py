@@ -232,6 +232,7 @@ def test_a_file_that_says_no_size_and_has_no_end_is_rejected(tmp_path, monkeypat
         (read_json, '{"a": 1,\n}', "line [12]: not JSON"),
         (read_toml, "a = " + "1" * 10_000, "not TOML"),
         (read_toml, "a = " + "1" * 100_001, "more than 100000 digits"),  # tomllib takes 120 bytes for each
+        (read_toml, "# " + "_" * 100_001, "a run of more than 100000 digits or letters a to f"),  # may be no number
         (read_table, "1," * 600_000, "a line of more than 1000000 characters"),
         (read_table, "1\n" * 2_500_001, "more than 5000000 cells up to line 2500001"),
     ],

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 #: Largest documents (JSON, TOML, XML) and tables that are read: parsed they take 10 to 40 times as much memory.
 DOCUMENT_MB = 8  # half: a recording's truth of 10,000 shots is rejected; double: a hostile file takes 600 MB
-_TOML_DIGITS = 100_000  # of a number; half: nothing notable, double: it takes 24 MB
+_TOML_DIGITS = 100_000  # in a row, and letters a to f; half: nothing notable, double: it takes 24 MB
 _JSON_PARTS = (
     1_000_000  # lists, mappings and pairs of values of a JSON text; half: long tracks are rejected; double: 400 MB
 )
@@ -202,7 +202,7 @@ def parse_toml(text: str) -> dict[str, Any]:
     import tomllib
 
     if any(len(run[0]) > _TOML_DIGITS for run in re.finditer(r"[0-9A-Fa-f_]+", text)):
-        raise ValueError(f"a number of more than {_TOML_DIGITS} digits")
+        raise ValueError(f"a run of more than {_TOML_DIGITS} digits or letters a to f")
     return tomllib.loads(text)
 
 
