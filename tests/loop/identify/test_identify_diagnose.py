@@ -230,6 +230,23 @@ def test_one_joint_that_is_read_wrongly_is_named(name, joint, read, expected):
     assert re.search(expected, said(w, replace(measured, q=q)))
 
 
+@pytest.mark.parametrize("seed", range(971, 979))
+@pytest.mark.parametrize(("name", "joint"), [("six_r", 4), ("ur5", 3), ("puma560", 4)])
+def test_any_zero_of_an_inner_joint_is_named_with_its_size(name, joint, seed):
+    w, measured = made(name, seed)
+    rng = np.random.default_rng(seed)
+    sign, zero_deg, q = rng.choice((1, -1)), rng.choice((1, -1)) * rng.uniform(40, 150), measured.q.copy()
+    q[:, joint] = sign * (q[:, joint] - np.radians(zero_deg))
+    text = said(w, replace(measured, q=q))
+    assert f"joint {joint + 1} (" in text and ("change the sign" in text) == (sign < 0)
+    assert float(re.search(r"add (-?[\d.]+) deg", text)[1]) == pytest.approx(zero_deg, abs=2.5)
+
+
+def test_a_zero_that_can_be_fitted_is_not_refused():
+    w, measured = made("six_r", 904)
+    check_plausible(without_tool(w.nominal), replace(measured, q=measured.q - np.radians(10) * np.eye(6)[4]))
+
+
 @pytest.mark.parametrize("shift", [1, -2])
 def test_rows_that_are_shifted_are_reported(shift):
     w, measured = made("ur5", 1)

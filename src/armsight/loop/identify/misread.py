@@ -406,10 +406,16 @@ def _one_joint(arm: Arm, q: Array, off: Callable[[Array], float]) -> Iterator[tu
             def read_at(zero_deg: float, q: Array = q * (1 + (sign - 1) * one), one: Array = one) -> Array:
                 return np.asarray(q + np.radians(zero_deg) * one)
 
-            near = min(range(-180, 180, ZERO_DEG), key=lambda zero_deg: off(read_at(zero_deg)))
-            ends = near - ZERO_DEG, near + ZERO_DEG
-            best = minimize_scalar(lambda zero_deg: off(read_at(zero_deg)), bounds=ends, method="bounded")
-            zero = round(float(best.x), 1)
+            grid = [(off(read_at(zero_deg)), zero_deg) for zero_deg in range(-180, 180, ZERO_DEG)]
+            found = [
+                minimize_scalar(
+                    lambda zero_deg: off(read_at(zero_deg)), bounds=(near - ZERO_DEG, near + ZERO_DEG), method="bounded"
+                )
+                for k, (at, near) in enumerate(grid)
+                if at <= min(grid[k - 1][0], grid[(k + 1) % len(grid)][0])
+            ]
+            best = min(found, key=lambda each: each.fun)
+            zero = round(float((best.x + 180.0) % 360.0 - 180.0), 1)
             yield read_at(zero), f"{said} {way}has another zero than {arm.name}'s: {do}add {zero:g} deg to {column}"
 
 
@@ -693,14 +699,14 @@ def _proposal(arm: Arm, q: Array, p: Array, off: float) -> str:
     # Not the larger of the two, as for data as they are given: of thousands of ways some fit roughly by chance.
     limit = min(off / BETTER, BAD_M, BAD_SHARE * _span(p))
     alike = _search(arm, q, p, limit)
+
+    def right(q: Array) -> float:
+        return points_off(arm, q, p).right
+
+    least, said = min((right(read), said) for read, said in _one_joint(arm, q, right))
+    if least < limit and (not alike or CLEAR * least < alike[0].off):
+        return f"{said} (off by {1e3 * off:.0f} mm as they are, {1e3 * least:.1f} mm so)"
     if not alike:
-
-        def right(q: Array) -> float:
-            return points_off(arm, q, p).right
-
-        least, said = min((right(read), said) for read, said in _one_joint(arm, q, right))
-        if least < limit:
-            return f"{said} (off by {1e3 * off:.0f} mm as they are, {1e3 * least:.1f} mm so)"
         return (
             f"these data are not of this arm: with base and tool fitted it is off by {1e3 * off:.0f} mm; no unit, frame, "
             "order or sign of the joints corrects it. Is it the right model, with the table's right convention?"
@@ -781,19 +787,7 @@ def _check_rotations(arm: Arm, measured: Measured, rows: Rows) -> None:
     off = _rotations_off(arm, q, R)
     if off <= ALIKE_RAD:
         return
-    if measured.angles_deg is not None:
-        angles = measured.angles_deg[rows]
-        offs = {name: _rotations_off(arm, q, rotations_by(angles, name, Path())) for name in ROTATIONS}
-        reversed_off = _rotations_off(arm, q, rotations_by(angles[:, ::-1], "ZYZ", Path()))
-        offs["ZYZ"] = min(offs["ZYZ"], reversed_off)  # Doosan's A, B, C read as KUKA's
-        best = min(offs, key=lambda name: offs[name])
-        if max(offs[best], ALIKE_RAD) <= min(off / CLEAR, BAD_RAD):
-            same = [name for name in ROTATIONS if abs(offs[name] - offs[best]) < 1e-9]  # xyz and ZYX are one
-            raise InputError(
-                f"the rotations fit this arm if rx_deg, ry_deg, rz_deg are meant as {' or '.join(same)}, not as "
-                f"{measured.rotation} (off by {np.degrees(off):.2f} deg as they are, {np.degrees(offs[best]):.2f} deg so): "
-                f"give --columns rotation={same[0]}"
-            )
+    _check_convention(arm, measured, rows, off)
 
     def rotated(q: Array) -> float:
         return _rotations_off(arm, q, R)
@@ -802,24 +796,42 @@ def _check_rotations(arm: Arm, measured: Measured, rows: Rows) -> None:
     signs = itertools.product((1, -1), repeat=arm.joints)
     ways = [m for m in _tried(arm, q, p, ((tuple(range(arm.joints)), s) for s in signs)) if not m.left and m.off < near]
     fits = {m: rotated(q * m.signs) for m in ways}
-    least = max(min(fits.values(), default=np.inf), ALIKE_RAD)
-    if least <= min(off / BETTER, BAD_RAD):
+    least, limit = max(min(fits.values(), default=np.inf), ALIKE_RAD), min(off / BETTER, BAD_RAD)
+    if off > BAD_RAD:
+        one, said = min((max(rotated(read), ALIKE_RAD), said) for read, said in _one_joint(arm, q, rotated))
+        if one <= limit and CLEAR * one < least:
+            raise InputError(
+                f"the rotations fit if {said} (off by {np.degrees(off):.1f} deg as they are, {np.degrees(one):.2f} deg so)"
+            )
+    if least <= limit:
         simplest = min((m for m, at in fits.items() if at < CLEAR * least), key=lambda m: (m.number, fits[m]))
         raise InputError(
             f"the rotations fit this arm if {simplest.text} (off by {np.degrees(off):.1f} deg as they are, "
             f"{np.degrees(fits[simplest]):.2f} deg so): put the columns right"
         )
-    if off < BAD_RAD / BETTER:
+    if off <= BAD_RAD:
         return
-    read, said = min(_one_joint(arm, q, rotated), key=lambda one: rotated(one[0]))
-    if max(least := rotated(read), ALIKE_RAD) <= min(off / BETTER, BAD_RAD):
+    raise InputError(
+        f"these rotations are not of this arm, whose positions fit: they are off by {np.degrees(off):.0f} deg, and no "
+        "convention and no sign of a joint corrects it; leave them out, or put them right"
+    )
+
+
+def _check_convention(arm: Arm, measured: Measured, rows: Rows, off: float) -> None:
+    """Reject angles that fit by another convention."""
+    if measured.angles_deg is None:
+        return
+    q, angles = measured.q[rows], measured.angles_deg[rows]
+    offs = {name: _rotations_off(arm, q, rotations_by(angles, name, Path())) for name in ROTATIONS}
+    reversed_off = _rotations_off(arm, q, rotations_by(angles[:, ::-1], "ZYZ", Path()))
+    offs["ZYZ"] = min(offs["ZYZ"], reversed_off)  # Doosan's A, B, C read as KUKA's
+    best = min(offs, key=lambda name: offs[name])
+    if max(offs[best], ALIKE_RAD) <= min(off / CLEAR, BAD_RAD):
+        same = [name for name in ROTATIONS if abs(offs[name] - offs[best]) < 1e-9]  # xyz and ZYX are one
         raise InputError(
-            f"the rotations fit if {said} (off by {np.degrees(off):.1f} deg as they are, {np.degrees(least):.2f} deg so)"
-        )
-    if off > BAD_RAD:
-        raise InputError(
-            f"these rotations are not of this arm, whose positions fit: they are off by {np.degrees(off):.0f} deg, and no "
-            "convention and no sign of a joint corrects it; leave them out, or put them right"
+            f"the rotations fit this arm if rx_deg, ry_deg, rz_deg are meant as {' or '.join(same)}, not as "
+            f"{measured.rotation} (off by {np.degrees(off):.2f} deg as they are, {np.degrees(offs[best]):.2f} deg so): "
+            f"give --columns rotation={same[0]}"
         )
 
 
