@@ -473,6 +473,13 @@ def test_files_of_one_pose_each_are_one_table(tmp_path):
     np.savetxt(tmp_path / "frame-001.txt", A[:2].reshape(-1, 4))
     with pytest.raises(InputError, match=r"frame-001.txt: holds 2 rows .* expected one pose"):
         read_pose_table(tmp_path / "frame-*.txt")
+    for k, row in enumerate(np.hstack([VECTOR, P])):
+        np.savetxt(tmp_path / f"pos{k}.txt", row[:, None])  # a number a line
+    table = read_pose_table(tmp_path / "pos*.txt", columns="rx,ry,rz,x_m,y_m,z_m", rotation="rotvec")
+    np.testing.assert_allclose(table.Ts, A, atol=1e-12)
+    np.savetxt(tmp_path / "pos0.txt", [[0.0], [1.0]])
+    with pytest.raises(InputError, match=r"pos1.txt: holds 1 rows of x.*; expected one pose of 2 numbers, as pos0.txt"):
+        read_pose_table(tmp_path / "pos*.txt")
     with pytest.raises(InputError, match="no such file; quote a glob"):
         read_pose_table(tmp_path / "none*.txt")
 

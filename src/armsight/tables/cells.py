@@ -137,6 +137,8 @@ def read_cells(path: Path, columns: Mapping[str, str] | Sequence[str] = (), side
     names = {k: v for k, v in columns.items() if k != "pose"} if isinstance(columns, Mapping) else columns
     if any(mark in path.name for mark in "*?") and not path.exists():
         cells = _of_files(path, side, whose)
+        if names and not isinstance(names, Mapping) and len(names) == len(cells.head) - 1:
+            names = ["name", *names]  # a file's name is no column of it
     else:
         cells = _of_file(path, side, whose, names)
     if names:
@@ -159,12 +161,17 @@ def _of_files(path: Path, side: str, whose: str | None) -> Cells:
     if not files:
         raise InputError(f"{path}: no such file; quote a glob such as 'poses/pose_*.yaml'")
     each = [_of_file(file, side, whose) for file in files]
+    for k, cells in enumerate(each):
+        if cells.head == ["_0"]:  # a number a line
+            each[k] = _without_names(files[k], [(1, [row[0] for _, row in cells.rows])])
     for file, cells in zip(files, each, strict=True):
         if len(cells.rows) != 1 or cells.head != each[0].head:
-            raise InputError(
-                f"{file}: holds {len(cells.rows)} rows of {', '.join(cells.head)}; expected one pose of "
-                f"{', '.join(each[0].head)}, as {files[0].name}"
+            held, first = (
+                f"{len(head)} numbers" if head[0].startswith("_") else ", ".join(head)
+                for head in (cells.head, each[0].head)
             )
+            as_first = f", as {files[0].name}" if file != files[0] else ""
+            raise InputError(f"{file}: holds {len(cells.rows)} rows of {held}; expected one pose of {first}{as_first}")
     if "name" in each[0].head:
         return each[0]._replace(rows=[(k, cells.rows[0][1]) for k, cells in enumerate(each, 1)])
     rows = [(k, [file.stem, *cells.rows[0][1]]) for k, (file, cells) in enumerate(zip(files, each, strict=True), 1)]

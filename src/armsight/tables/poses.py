@@ -121,7 +121,7 @@ def read_pose_table(
             their order.
         arm: the model whose joints the table has.
         only_joints: whether positions are passed over: the poses are then those of the joints.
-        side: "robot" or "seen": whose poses are read where a file holds both.
+        side: "robot" or "seen": whose poses are read where a file holds both; "tool": the robot's, never of joints.
         keep_missed: whether rows without a pose stay, marked by ``missed``, so that rows of another table fit; else they
             are left out, with a note.
 
@@ -129,7 +129,7 @@ def read_pose_table(
         InputError: the file, the line and what was expected.
     """
     path = Path(path)
-    rotation_given = rotation
+    rotation_given, whose, side = rotation, side, side.replace("tool", "robot")
     table, rotation, notes = _table(path, rotation, unit, columns, arm, side)
     names = table.joint_names(*((len(arm.joint_names), arm.name) if arm is not None else (None, "")))
     q = table.joints(names) if names else None
@@ -147,7 +147,7 @@ def read_pose_table(
         written = np.hstack([p / unit_m, written]) if written.shape[1] else written
         Ts = pose(R, p)
     else:
-        Ts, of_joints = _of_joints(path, q, arm, side), True
+        Ts, of_joints = _of_joints(path, q, arm, whose), True
     t_s, row_names, lines = table.times(), table.names(), np.array([line for line, _ in table.rows])
     passed = table.used | {"_0", "_1", "_2", "_3"}
     unused = tuple(table.given[k] for name, k in table.at.items() if name not in passed)
@@ -164,12 +164,13 @@ def read_pose_table(
 
 def _of_joints(path: Path, q: Array, arm: ArmJoints | None, side: str) -> Array:
     """Return the arm's poses (N, 4, 4) at joints (N, n), rad; InputError without an arm, or where cameras' are needed."""
+    if side != "robot":
+        of = {"seen": "that cameras saw", "tool": "of the tool"}[side]
+        raise InputError(
+            f"{path}: holds joint angles alone, no poses {of}: x_m y_m z_m or x_mm y_mm z_mm are needed, and rotations"
+        )
     if arm is None:
         raise InputError(f"{path}: joint angles need the arm: give --model, a name (armsight arm list) or a .urdf file")
-    if side == "seen":
-        raise InputError(
-            f"{path}: holds joint angles alone, no poses that cameras saw: x_m y_m z_m or x_mm y_mm z_mm are needed"
-        )
     return np.asarray(arm.forward(q))
 
 

@@ -264,6 +264,8 @@ def test_a_range_is_checked_and_calibrated_and_what_is_wrong_with_it_is_named(ca
         return said_of(capsys, "references", "calibrate", tmp_path / f"{name}.toml", *given, "--json", kind="range")
 
     assert said_of(capsys, "references", "check", tmp_path / "wire.toml", "--json", kind="range").code == 0
+    (tmp_path / "joints.csv").write_text("t_s,q1_deg,q2_deg\n0,1,2\n1,2,3\n")
+    assert "holds joint angles alone, no poses of the tool" in calibrate("wire", "joints").err
     for name in ("wire", "other"):
         said = calibrate(name, **{"-o": tmp_path / f"{name}_found.toml"}).done()
         (found,) = said.lines[0]["references"]

@@ -246,7 +246,7 @@ def _noise(entry: Entry, rest: Array, rate_hz: float) -> tuple[dict[str, Any], l
 
 def calibrated(entries: list[Entry], poses: Path) -> tuple[Report, list[Entry]]:
     """Return what poses show of each reference, and the entries as calibrated; an InputError names what it cannot use."""
-    table = read_pose_table(poses)
+    table = read_pose_table(poses, side="tool")
     if table.t_s is None:
         raise InputError(f"{poses}: line 1: a column t_s is needed")
     path = PosePath(table.t_s, table.Ts)
