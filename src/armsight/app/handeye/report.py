@@ -131,6 +131,10 @@ def assess(run: HandEyeAnswer, why: list[str], *, weak: bool = False) -> tuple[G
         return "poor", "Do not use this calibration; do what is said above, and calibrate again."
     said = f"{used} poses, those left out are off by {1e3 * position_m:.2f} mm, {names(run)[0]} is known to"
     said += f" {1e3 * worst_m:.2f} mm"
+    if found.held_out_geometry is not None and "link_m" in found.sigmas and position_m > GOOD_M:
+        corrected_m = found.held_out_geometry.rms()[0]
+        only = "Usable only once armsight identify has corrected the arm's model, and not with the nominal one"
+        return "fair", f"{only}: {said} along its worst axis; with the geometry found, {1e3 * corrected_m:.2f} mm."
     if worst_m > position_m or used < ADVISED:
         return "fair", f"Usable: {said} along its worst axis; more poses lower that: --plan {MORE} chooses them."
     if weak:
@@ -230,8 +234,8 @@ def _of_the_geometry(run: HandEyeAnswer) -> list[str]:
     ]
     if "link_m" in found.sigmas:
         lines.append(
-            f"the transforms go with the true arm: with the arm's nominal model they leave {plain:.2f} mm; with the "
-            f"mounting that suits the arm's nominal model: {nominal:.2f} mm"
+            f"the transforms go with the true arm: with its nominal model poses left out are off by {plain:.2f} mm, or by "
+            f"{nominal:.2f} mm where the mounting is fitted to that model"
         )
     return lines
 
