@@ -54,6 +54,8 @@ _OTHER_LENSES = ("omni", "mei", "ds", "doublesphere", "ucm", "eucm", "fov", "cah
 _PINHOLES = ("pinhole", "perspective", "opencv", "brown", "brownconrady", *FISHEYES)
 #: The principal point is within the image, and nearer to its middle than this share of its sides.
 _FAR_OFF = 0.1  # half: good webcams are remarked; double: width and height exchanged at 4:3 are not
+#: A model named by its coefficients, in OpenCV's order.
+_IN_ORDER = re.compile("^(opencv)?k1k2p1p2(k3(k4k5k6)?)?(opencv(order)?)?$")
 _PARAMETERS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 
 
@@ -217,7 +219,7 @@ def _kind(entry: Mapping[str, Any]) -> str:
         name, word = "distortionmodel", str(other)
     if not isinstance(word, str):
         word = "fisheye" if word else ""
-    kind = plain(word)
+    kind = _IN_ORDER.sub("opencv", plain(word))
     if kind not in FISHEYES + BROWNS + _OTHER_LENSES and name in (
         "model",
         "type",

@@ -281,6 +281,17 @@ def test_a_whole_size_that_is_twice_the_principal_point_must_agree():
         camera_of(entry, (1920, 1080))
 
 
+@pytest.mark.parametrize("order", ["k1 k2 p1 p2 k3 (OpenCV order)", "k1, k2, p1, p2, k3", "k1 k2 k3 p1 p2"])
+def test_a_model_that_is_named_by_its_coefficients_is_opencvs_in_its_order_alone(order):
+    K = [[800, 0, 640], [0, 800, 360], [0, 0, 1]]
+    entry = {"size": [1280, 720], "K": K, "distortion_model": order, "distortion": [0.1, 0.0, 1e-3, 0.0, 0.02]}
+    if "p2 k3" in order.replace(",", ""):
+        assert camera_of(entry)[0].model == "brown5"
+    else:
+        with pytest.raises(InputError, match="k1 k2 k3 p1 p2' is not supported"):
+            camera_of(entry)
+
+
 @pytest.mark.parametrize(("name", "some", "said"), COUNTS)
 def test_counts_of_files(tmp_path, name, some, said):
     paths = write(tmp_path, PROGRAMS[name][2])[some]
