@@ -1,6 +1,7 @@
 """An arm whose base or body was displaced while its poses were taken: it is named, and the sigmas hold both states."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -55,6 +56,8 @@ def test_of_several_points_the_largest_shift_is_named():
     model, change = placed_change(w.nominal, Measured(q, p))
     assert (change.way, change.row) == ("tool", 20)
     assert "was displaced by 17.3 mm" in change_text(model, change)
+    small = SimpleNamespace(way=change.way, step=1e-3 * change.step)
+    assert "was displaced by 0.017 mm" in change_text(model, small)
 
 
 def test_nothing_is_named_where_nothing_was_displaced():

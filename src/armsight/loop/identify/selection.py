@@ -333,8 +333,9 @@ def change_text(model: Model, change: StateChange) -> str:
         return said + (", or the base was rotated" if joint == "1" else "")
     whose = "the base, or the instrument," if change.way == "base" else "the tool, or what is seen of it,"
     points = step[:3] if model.full or change.way == "base" else step  # of several points the largest shift
-    size = f"{1e3 * np.linalg.norm(points.reshape(-1, 3), axis=1).max():.1f} mm"
-    size += f" and {np.degrees(np.linalg.norm(step[3:])):.2f} deg" if model.full or change.way == "base" else ""
+    mm = 1e3 * np.linalg.norm(points.reshape(-1, 3), axis=1).max()
+    size = f"{mm:.{1 if mm >= 1 else 3}f} mm"
+    size += f" and {np.degrees(np.linalg.norm(step[3:])):.3f} deg" if model.full or change.way == "base" else ""
     return f"{whose} was displaced by {size}"
 
 
