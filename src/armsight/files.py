@@ -168,7 +168,7 @@ def parsed_json(text: str, path: str | Path, what: str = "") -> Any:  # noqa: AN
     try:
         return json.loads(text, parse_int=_integer)
     except json.JSONDecodeError as error:
-        raise InputError(f"{path}: line {error.lineno}: not JSON ({error.msg}){expected}") from None
+        raise InputError(f"{path}: line {error.lineno}: not JSON{expected} ({error.msg})") from None
     except RecursionError:
         raise InputError(f"{path}: not JSON that can be read: nested too deep{expected}") from None
 

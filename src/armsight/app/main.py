@@ -253,7 +253,7 @@ def _usage_text(error: click.ClickException) -> str:
     """Return what click found wrong with the command line, as one line that ends with what to do."""
     text = " ".join(error.format_message().split()).replace("'. (", "' (").rstrip(".")
     text = text[:1].lower() + text[1:]
-    text = text.replace("a valid integer range", "a whole number").replace("a valid float range", "a number")
+    text = re.sub("a valid float( range)?", "a number", re.sub("a valid integer( range)?", "a whole number", text))
     context = error.ctx if isinstance(error, click.UsageError) else None
     if context is not None and isinstance(error, click.NoSuchOption):
         text = f"no such option: {error.option_name}{_meant_option(error.option_name, context)}"

@@ -308,7 +308,8 @@ def test_a_range_is_fused_and_recorded_and_said_to_agree_or_not(armsight, run, t
 
 def test_what_a_run_does_not_hold_is_named(armsight, run, tmp_path):
     assert_rejected(armsight("replay", run, "--rig", "r.json"), "needs the images of every shot")
-    assert_rejected(armsight("replay", tmp_path), "give --target")
+    assert_rejected(armsight("replay", tmp_path), "holds no shots")
+    assert_rejected(armsight("export", tmp_path / "no", "--to", "csv", "-o", tmp_path / "o"), "no such file or folder")
     assert_rejected(
         armsight("replay", tmp_path / "none.bag", "--target", "chessboard:9x6:25mm"), "no such file or folder"
     )

@@ -62,7 +62,7 @@ def command(
         alternatives = best(asked, progress) if optimise else ()
         found = chosen(alternatives) if alternatives else RigBudget(asked, planned(asked))
         found.check()
-        progress("what would change it")
+        progress("computing what would change it")
         report = budget_report(found, alternatives, Path(run) if run else None)
     written = None
     if output is not None:

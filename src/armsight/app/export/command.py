@@ -41,7 +41,8 @@ def command(
         raise InputError(f"{output}: is there already; give a new name")
     file = run_file(run)
     if file is None:
-        raise InputError(f"{run}: no run.mcap there; give the folder of a run, or a file .mcap")
+        what = "no run.mcap there" if Path(run).expanduser().exists() else "no such file or folder"
+        raise InputError(f"{run}: {what}; give the folder of a run, or a file .mcap")
     if form in ("mcap", "ros2"):
         files = {"mcap": write_mcap, "ros2": write_ros2}[form](file, output)
     else:

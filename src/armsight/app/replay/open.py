@@ -111,6 +111,8 @@ def _of_source(request: Request, recorded: RecordedRun | None, say: Callable[[st
     if request.references is not None:
         raise InputError(f"{request.recording}: --references needs a run with its joints; this holds none")
     if request.target is None:
+        if bag is None:
+            open_source(path)  # what holds no images needs no target
         raise InputError(f"{request.recording}: what is to be measured in it? give --target, a board or a body file")
     if bag is None:
         return _of_images(request, open_source(path), None, say)

@@ -83,7 +83,7 @@ class Composite(Record, Target):
 def read_layout(path: str | Path) -> Composite:
     """Read a body file; InputError names file and entry, also of a body that no command accepts (``check_points``)."""
     if Path(path).suffix.lower() != ".toml":
-        raise InputError(f"{path}: expected a TOML body file, which describes its markers (docs/howto/targets.md)")
+        raise InputError(f"{path}: expected a TOML body file of markers, not a board or points (docs/howto/targets.md)")
     name, markers = read_body_file(path, (*MARKERS, DISC))
     of_kind = {kind: [m for m in markers if m.kind == kind] for kind in (*MARKERS, DISC)}
     parts = tuple(make(name, of_kind[kind]) for kind, make in MARKERS.items() if of_kind[kind])
