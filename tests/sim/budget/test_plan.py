@@ -284,7 +284,9 @@ def test_the_objective_is_the_worst_or_the_mean_position():
         {"camera": "webcam-720p", "speed": "0.5m/s", **_LATE},
         {"camera": "webcam-720p", "speed": "1m/s", "objective": "mean"} | _LATE,
         # Few are lost, the fastest: what is left moves less than all.
-        {"camera": "webcam-720p", "speed": "0.2m/s", "distance": "0.6m"} | _LATE | {"start_ms": 1.0, "exposure_ms": 0.5},
+        {"camera": "webcam-720p", "speed": "0.2m/s", "distance": "0.6m"}
+        | _LATE
+        | {"start_ms": 1.0, "exposure_ms": 0.5},
     ],
 )
 def test_what_takes_long_is_left_out_of_a_bound_below_the_loss(given):
