@@ -326,6 +326,9 @@ def test_what_is_not_the_body_is_missed_and_a_bad_print_is_reported():
         doubled = located(rig, 2 * points, shot)
         assert isinstance(doubled, Missed)
         assert "0.50 times as far apart as its points" in doubled.reason
+        tenfold = located(rig, 10 * points, shot)
+        assert isinstance(tenfold, Missed)
+        assert "0.10 times as far apart as its points (is its size right, and its unit?)" in tenfold.reason
         scaled = located(rig, 1.01 * points, shot)
         # A hundredth of an apparent size of about 60 px is three times the noise, and the covariance says so.
         assert scaled.misfit > 1.5

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import re
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
@@ -149,6 +150,8 @@ class MeasureRun:
     first: ShotPose | None = None
     file: RowFile | None = None
     unwritten: int = 0
+    why: str = ""  #: why the last shot was missed, without figures
+    alike: list[str] = field(default_factory=list)  #: shots since, missed for that reason
 
     def __post_init__(self) -> None:
         self.records = deque(maxlen=_KEPT if self.view is None else None)
@@ -178,10 +181,24 @@ class MeasureRun:
                     if record.ok and not headed:
                         headed = True
                         self._print(f"{'shot':<{width}}" + "".join(f"{name:>{wide}}" for name, wide, _ in _TABLE))
-                    self._print(_line(record, width))
+                    self._report(record, width)
                 if self.view is not None:
                     self.view.add(shot, result, record)
                 advance()
+        self._report(None, width)
+
+    def _report(self, record: ShotPose | None, width: int) -> None:
+        """Print a shot's line; shots missed alike one after the other are reported together, once that has ended."""
+        why = re.sub(r"[\d.]+", "", (record and record.reason) or "")
+        if record is not None and why and why == self.why:
+            self.alike.append(record.shot)
+            return
+        if self.alike:
+            which = " to ".join(dict.fromkeys((self.alike[0], self.alike[-1])))
+            self._print(f"{which}: missed: for the same reason ({len(self.alike)} in all)")
+        self.why, self.alike = why, []
+        if record is not None:
+            self._print(_line(record, width))
 
     def _print(self, line: str) -> None:
         """Print a line; where nobody reads on (``| head``), go on for what is written and sent elsewhere."""

@@ -52,8 +52,8 @@ def implausible(
     count = np.bincount(used.point, minlength=len(body.points))
     if not everything and collinear(body.points[count > 0]):
         return "the points that agree with one pose of the body lie on one line"
-    if fit.cost > misfit_limit(2 * len(used.point) - 6) and (reason := _unlike(body, points, fit, used)) is not None:
-        return reason
+    if fit.cost > misfit_limit(2 * len(used.point) - 6) and _unlike(fit, used):
+        return _another(body, points)
     if everything:
         return _wrong_size(rig, body, points, rigid)
     both = count[points.ids] == 2
@@ -68,17 +68,18 @@ def implausible(
     return _wrong_size(rig, body, Points(*arrays, points.seen), fit_rigid(body.points[arrays[0]], arrays[1]))
 
 
-def _unlike(body: Body, points: Points, fit: PoseFit, used: PixelObservations) -> str | None:
-    """Report that the fitted detections are further off the pose than those of a bent body would be, or None."""
+def _unlike(fit: PoseFit, used: PixelObservations) -> bool:
+    """Whether the fitted detections are further off the pose than those of a bent body would be."""
     sides = [used.uv[used.camera == c] for c in (0, 1)]
     size = np.sqrt(np.mean(np.concatenate([((uv - uv.mean(axis=0)) ** 2).sum(axis=1) for uv in sides if len(uv)])))
-    off = np.sqrt((fit.residuals_px**2).sum(axis=1).mean())
-    if off <= _ALIKE * size:
-        return None
+    return bool(np.sqrt((fit.residuals_px**2).sum(axis=1).mean()) > _ALIKE * size)
+
+
+def _another(body: Body, points: Points) -> str:
     scale = fit_scale(body.points[points.ids], points.p_left)
     return (
-        f"the detections are not those of the body: {off:.1f} px off at an apparent size of {size:.0f} px, and "
-        f"{scale:.2f} times as far apart as its points"
+        f"the detections are not those of the body: no pose fits, and they lie {scale:.2f} times as far apart as its points"
+        " (is its size right, and its unit?)"
     )
 
 
@@ -168,7 +169,7 @@ def locate(rig: StereoRig, body: Body, points: Points) -> PoseEstimate | Missed:
     if best is None or _median(best.distance2) > _SUSPECT * _MEDIAN:
         best = _best(rig, body, observations, _agreed_starts(body, points), best)
     if best is None:
-        return Missed("no pose of the body fits the detections")
+        return Missed(_another(body, points))
     good, fit = _without_outliers(rig, body, best, observations)
     if fit is None:
         return Missed(f"only {good.sum()} of {len(good)} detections agree with one pose of the body")
