@@ -238,7 +238,8 @@ def test_any_zero_of_an_inner_joint_is_named_with_its_size(name, joint, seed):
     sign, zero_deg, q = rng.choice((1, -1)), rng.choice((1, -1)) * rng.uniform(40, 150), measured.q.copy()
     q[:, joint] = sign * (q[:, joint] - np.radians(zero_deg))
     text = said(w, replace(measured, q=q))
-    assert f"joint {joint + 1} (" in text and ("change the sign" in text) == (sign < 0)
+    assert f"joint {joint + 1} (" in text
+    assert ("change the sign" in text) == (sign < 0)
     assert float(re.search(r"add (-?[\d.]+) deg", text)[1]) == pytest.approx(zero_deg, abs=2.5)
 
 
