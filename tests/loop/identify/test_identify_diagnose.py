@@ -243,7 +243,7 @@ def test_any_zero_of_an_inner_joint_is_named_with_its_size(name, joint, seed):
     assert float(re.search(r"add (-?[\d.]+) deg", text)[1]) == pytest.approx(zero_deg, abs=2.5)
 
 
-def test_a_zero_that_can_be_fitted_is_not_refused():
+def test_a_zero_that_can_be_fitted_is_not_rejected():
     w, measured = made("six_r", 904)
     check_plausible(without_tool(w.nominal), replace(measured, q=measured.q - np.radians(10) * np.eye(6)[4]))
 
