@@ -68,6 +68,7 @@ def person(monkeypatch):
 @pytest.mark.parametrize("arm", PAGES)
 def test_the_page_of_an_arm_has_these_commands(arm):
     text = (DOCS / f"{PAGES[arm]}.md").read_text(encoding="utf-8")
+    text = text.partition("$ pip install")[2] or text  # before it some pages try it without an arm
     on_page = re.findall(r"^\$ armsight (.*?)(?: +#.*)?$", text, re.MULTILINE)
     table = [step.command for step in ARMS[arm]]
     starts = [k for k in range(len(on_page)) if on_page[k : k + len(table)] == table]
