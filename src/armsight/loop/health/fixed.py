@@ -221,7 +221,7 @@ _LEAST = 8
 #: Half: a jump counts for as long as a window does, double: shaking is found after twice the time.
 _NEWEST, _ODD, _FEWEST = 20, 0.25, 4
 
-#: Length of a window, s; half: shaking below 1 Hz is taken for the arm, double: the arm for shaking.
+#: Length of a window, s; half: shaking below 4 Hz (2 at rest) is taken for the arm, double: the arm for shaking.
 _WINDOW_S = 1.0
 #: A window ends where the arm may have wandered by so many sigmas of a shot; half: an arm that creeps is not watched,
 #: double: its wandering hides what shakes.
